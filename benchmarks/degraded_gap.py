@@ -43,8 +43,9 @@ from tofcorr.diagnosis.sums.observations import Observations, distance_images, e
 from tofcorr.diagnosis.sums.observations import observe as observe_pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import radial_distance_from_z_depth, ray_directions
-from tofcorr.observables import measure_dropouts, measure_noise
-from tofcorr.observables.read import pose_groups
+from tofcorr.observables.dropouts import dropouts_of
+from tofcorr.observables.noise import noise_of
+from tofcorr.observables.read import observe, pose_groups
 from tofcorr.options import resolve_options
 from tofcorr.sensor.degrade import degrade
 from tofcorr.sensor.model import SensorModel
@@ -267,13 +268,14 @@ def degraded_gap(
         covered = _covered(model, observations, depth)
         gap = FramesGap(observations, sigma, factor, covered)
         remains = gap.of(expected)
+        both = [observe(each) for each in (rest, degraded)]
         return DegradedGap(
             ideal=gap.of(depth),
             degraded=remains,
             degraded_interval=gap.interval(expected, seed),
             with_effects=found.gap.after,
-            noise=(measure_noise(rest).temporal_m, measure_noise(degraded).temporal_m),
-            dropouts=(measure_dropouts(rest).share, measure_dropouts(degraded).share),
+            noise=(noise_of(both[0]).temporal_m, noise_of(both[1]).temporal_m),
+            dropouts=(dropouts_of(both[0]).share, dropouts_of(both[1]).share),
             sensor=sensor,
             diagnosis=found,
             poses=observations.num_units,

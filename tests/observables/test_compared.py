@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from numpy_camera import Camera, record
 
-from tofcorr.observables import Observables, compare_observables
-from tofcorr.observables.by_pose import PoseSums, Sums, permutation_p, sign_flip_p
+from tofcorr.observables.compare import Observables, compare_observables
 from tofcorr.observables.figures import WIDTH, drawings
+from tofcorr.observables.pairs import PoseSums, permutation_p, sign_flip_p
 
 REAL = Camera(times=2.0, threshold=120.0, filter_px=0.7, base_share=0.003, gain=0.93)
+ONES = np.ones((20, 1))
 FOUND = {"edge-preserving filter of the camera", "amplitude threshold"}
 
 
@@ -102,8 +103,8 @@ def test_the_interval_of_a_ratio_holds_where_few_poses_have_most_of_the_variance
     inside = []
     for _ in range(300):
         noises = level * random.chisquare(30, (2, 20, 1)) / 30
-        drawn = [Sums(total=noise, count=np.ones((20, 1))) for noise in noises]
-        low, high = PoseSums(real=drawn[0], sim=drawn[1], paired=True).ratio_interval() or (0, 0)
+        sums = PoseSums(total=tuple(noises), count=(ONES, ONES), paired=True)
+        low, high = sums.ratio_interval() or (0, 0)
         inside.append(low <= 1.0 <= high)
     # 300 draws at 95 %: fewer than 92 % happen once in 100 times.
     assert np.mean(inside) >= 0.92
@@ -123,9 +124,9 @@ def test_the_interval_of_a_ratio_holds_where_all_poses_share_an_estimated_factor
             parts = random.chisquare(30, 20) / 30
             factor = parts.mean()
             others = (parts.sum() - parts) / 19
-            left_out = -np.log(others / factor)
-            sums.append(Sums(total=seen / factor, count=np.ones((20, 1)), left_out=left_out))
-        pair = PoseSums(real=sums[0], sim=sums[1], paired=True)
+            sums.append((seen / factor, -np.log(others / factor)))
+        total, left_out = zip(*sums, strict=True)
+        pair = PoseSums(total=total, count=(ONES, ONES), left_out=left_out, paired=True)
         low, high = pair.ratio_interval() or (0, 0)
         inside.append(low <= 1.0 <= high)
         rejected.append((pair.ratio_p(random) or 0.0) < 0.05)

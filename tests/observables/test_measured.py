@@ -12,10 +12,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
-from tofcorr.estimation.noise import filter_width, neighbour_correlation
-from tofcorr.observables import DropoutModel, NoiseModel, measure_dropouts, measure_noise
-from tofcorr.observables.noise import level_of_repeats
-from tofcorr.observables.read import pose_groups
+from tofcorr.estimation.noise import NoiseModel, filter_width, neighbour_correlation
+from tofcorr.observables.dropouts import DropoutModel, dropouts_of
+from tofcorr.observables.noise import level_of_repeats, noise_of
+from tofcorr.observables.read import observe, pose_groups
 
 AMPLITUDES = np.array([300.0, 1000.0, 2000.0])
 
@@ -24,7 +24,7 @@ AMPLITUDES = np.array([300.0, 1000.0, 2000.0])
 def test_noise_curve_follows_the_camera_at_every_amplitude(repeats: int, tmp_path: Path) -> None:
     camera = Camera(times=1.7)
     recording = record(tmp_path / "wall", camera, 1, repeats=repeats).recording
-    noise = measure_noise(recording)
+    noise = noise_of(observe(recording))
     assert noise.source == ("neighbours" if repeats == 1 else "repeats")
     measured = noise.curve.temporal_sigma(np.ones(3), AMPLITUDES)
     # 24 x 1280 pixels in 24 bins: 2 % of each, and the curve's shape.
@@ -34,7 +34,7 @@ def test_noise_curve_follows_the_camera_at_every_amplitude(repeats: int, tmp_pat
 def test_noise_at_the_edges_of_squares_is_measured_not_extrapolated(tmp_path: Path) -> None:
     """A third of these pixels, the darker ones, has no second difference: 9 % were lost here."""
     truth = record(tmp_path / "one", Camera(), 0)
-    found = measure_noise(truth.recording)
+    found = noise_of(observe(truth.recording))
     assert found.temporal_m == pytest.approx(truth.noise, rel=0.03)
     assert np.isfinite(found.variance).mean() > 0.99
 
@@ -66,17 +66,17 @@ def test_a_camera_that_mixes_frames_is_known_and_its_single_frame_too(
     """By two poses, too: fewer than three were taken to show none, and noise was too small."""
     camera = Camera(mixed_frames=0.6)
     mixing = record(tmp_path / "mixed", camera, 5, repeats=repeats, poses=poses)
-    found = measure_noise(mixing.recording)
+    found = noise_of(observe(mixing.recording))
     assert found.frame_correlation == pytest.approx(0.6, abs=within)
     assert found.temporal_m == pytest.approx(mixing.noise, rel=within)
     fresh = record(tmp_path / "fresh", Camera(), 5, repeats=repeats, poses=poses)
-    assert measure_noise(fresh.recording).frame_correlation == 0.0
+    assert noise_of(observe(fresh.recording)).frame_correlation == 0.0
 
 
 @pytest.mark.parametrize("repeats", [1, 4])
 def test_filtered_noise_and_fixed_pattern_are_told_apart(repeats: int, tmp_path: Path) -> None:
     camera = Camera(filter_px=0.8, pattern=1e-3)
-    noise = measure_noise(record(tmp_path / "wall", camera, 2, repeats=repeats).recording)
+    noise = noise_of(observe(record(tmp_path / "wall", camera, 2, repeats=repeats).recording))
     assert noise.pattern_m == pytest.approx(1e-3, rel=0.1)
     assert noise.curve.correlation_px == pytest.approx(0.8, abs=0.08)
     measured = noise.curve.temporal_sigma(np.ones(3), AMPLITUDES)
@@ -87,7 +87,7 @@ def test_filtered_noise_and_fixed_pattern_are_told_apart(repeats: int, tmp_path:
 def test_a_pattern_without_noise_is_all_of_the_noise(seed: int, tmp_path: Path) -> None:
     """Less the pattern, neighbours leave a little more than nothing, or less (3): it stopped."""
     truth = record(tmp_path / "still", Camera(times=0.0, pattern=4e-3), seed)
-    noise = measure_noise(truth.recording)
+    noise = noise_of(observe(truth.recording))
     assert noise.temporal_m < 1e-6
     whole = noise.curve.sigma(np.ones(3), AMPLITUDES)
     np.testing.assert_allclose(whole, noise.pattern_m, rtol=1e-3)
@@ -100,7 +100,7 @@ def test_missing_pixels_give_share_threshold_and_base_share(
 ) -> None:
     """Of a camera that loses few pixels, too: bins of equal count were 13 % off there."""
     truth = record(tmp_path / "wall", Camera(threshold=threshold, base_share=base), 3)
-    dropouts = measure_dropouts(truth.recording)
+    dropouts = dropouts_of(observe(truth.recording))
     assert dropouts.share == pytest.approx(truth.missing_share, abs=1e-6)
     assert dropouts.model.amplitude_at_half == pytest.approx(threshold, rel=0.03)
     assert dropouts.model.base_share == pytest.approx(base, abs=0.003)
@@ -167,7 +167,7 @@ def test_the_amplitude_of_a_missing_pixel_that_states_none_follows_from_its_neig
         depth=depth,
         amplitude=stated,
     )
-    found = measure_dropouts(Recording.open(tmp_path / "stated"))
+    found = dropouts_of(observe(Recording.open(tmp_path / "stated")))
     assert not found.amplitude_recorded
     table = found.observed.table
     # A pose with hardly a distance shows no wall, and so no angle.
@@ -183,7 +183,7 @@ def test_the_amplitude_of_a_missing_pixel_that_states_none_follows_from_its_neig
 def test_many_pixels_that_share_the_largest_amplitude_are_saturated(tmp_path: Path) -> None:
     truth = record(tmp_path / "wall", Camera(saturation=1200.0), 4)
     assert truth.recording.saturation_amplitude is None
-    found = measure_dropouts(truth.recording)
+    found = dropouts_of(observe(truth.recording))
     assert found.model.saturation_amplitude == 1200.0
     assert found.saturated_share == pytest.approx(truth.missing_share)
     assert found.saturated_missing == pytest.approx(truth.missing_share)

@@ -93,6 +93,16 @@ class NoiseModel(Options):
         """f, s and r, metres."""
         return self.floor_m, self.shot_m, self.read_m
 
+    def brightness(self, distance: ArrayT, amplitude: ArrayT | None = None) -> ArrayT:
+        """Return A / A0, or (D0 / D)^2 without a reference amplitude, as `sigma` takes them."""
+        if self.reference_amplitude is None:
+            relative = (self.reference_distance_m / distance) ** 2
+        elif amplitude is None:
+            raise ValueError("This noise curve depends on the amplitude; none is given.")
+        else:
+            relative = amplitude / self.reference_amplitude
+        return relative.clip(min=self.least_brightness)
+
     def sigma(
         self,
         distance: ArrayT,
@@ -112,13 +122,7 @@ class NoiseModel(Options):
         Raises:
             ValueError: The noise depends on the amplitude, and none is given.
         """
-        if self.reference_amplitude is None:
-            brightness = (self.reference_distance_m / distance) ** 2
-        elif amplitude is None:
-            raise ValueError("This noise curve depends on the amplitude; none is given.")
-        else:
-            brightness = amplitude / self.reference_amplitude
-        darkness = 1.0 / brightness.clip(min=self.least_brightness)
+        darkness = 1.0 / self.brightness(distance, amplitude)
         floor, shot, read = self.deviations if deviations is None else deviations
         return (floor**2 + darkness * (shot**2 + read**2 * darkness)) ** 0.5
 

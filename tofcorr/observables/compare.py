@@ -4,23 +4,25 @@ Each comparison is a block of `diagnosis.json`; its `explained_by` says what of 
 simulator lacks or exaggerates, and is empty where nothing is significant and material.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from tofcorr.data.recording import Recording
-from tofcorr.observables.by_pose import bootstrap, permutation_p, sign_flip_p
 from tofcorr.observables.dropouts import DropoutMeasurement, border_of, dropouts_of
-from tofcorr.observables.matching import Matched, matched
 from tofcorr.observables.noise import NoiseMeasurement, noise_of, noise_source
+from tofcorr.observables.pairs import (
+    Matched,
+    Random,
+    bootstrap,
+    matched,
+    permutation_p,
+    sign_flip_p,
+)
 from tofcorr.observables.read import Observed, observe, quotient
 
 Block = dict[str, Any]
-Random = np.random.Generator
-Noises = tuple[NoiseMeasurement, NoiseMeasurement]
-Lost = tuple[DropoutMeasurement, DropoutMeasurement]
 # Smallest deviation that is reported: of a ratio from one, and of a correlation; and of the shares
 # of missing pixels. Chosen: what trains a network on simulated depth does not notice less; one
 # pixel in 500 is what the check of simulated pairs measures the share to.
@@ -49,7 +51,7 @@ class Observables:
     seen: Observed
     real_noise: NoiseMeasurement
     real_dropouts: DropoutMeasurement
-    noises: Noises | None = None
+    noises: tuple[NoiseMeasurement, NoiseMeasurement] | None = None
     sim_dropouts: DropoutMeasurement | None = None
     noise: Block | None = None
     dropouts: Block | None = None
@@ -90,13 +92,10 @@ def compare_observables(
     if sim is None:
         return Observables(seen=seen, real_noise=noise, real_dropouts=dropouts)
     simulated = observe(sim)
-    lost = dropouts_of(simulated)
-    amplitudes = (dropouts.amplitude, lost.amplitude)
-    both = matched(seen, simulated, amplitudes)
+    lost = dropouts, dropouts_of(simulated)
+    both = matched(seen, simulated, (lost[0].amplitude, lost[1].amplitude))
     alike = both if both.paired else matched(seen, simulated, None)
-    source = noise_source(seen)
-    if source != noise_source(simulated):
-        source = "neighbours"
+    source = noise.source if noise_source(simulated) == noise.source else "neighbours"
     noises = (
         noise if source == noise.source else noise_of(seen, source),
         noise_of(simulated, source),
@@ -107,52 +106,71 @@ def compare_observables(
         real_noise=noise,
         real_dropouts=dropouts,
         noises=noises,
-        sim_dropouts=lost,
-        noise=_compare_noise(both, noises, random, level),
-        dropouts=_compare_dropouts(both, (dropouts, lost), random, level),
-        amplitude=_compare_amplitude(alike, amplitudes, dropouts.map.shape, random, level),
+        sim_dropouts=lost[1],
+        noise=_compare_noise(both, *noises, random, level),
+        dropouts=_compare_dropouts(both, *lost, random, level),
+        amplitude=_compare_amplitude(alike, *lost, random, level),
         both=both,
     )
 
 
-def _compare_noise(both: Matched, noises: Noises, random: Random, level: float) -> Block:
+def _causes(level: float, *found: tuple[str, float | None, float | None, float]) -> list[str]:
+    """Return the causes of what is significant and material, each once.
+
+    Args:
+        level: Significance level.
+        found: Cause, deviation, its p-value, and the least deviation that matters; None: unknown.
+    """
+    causes = [
+        cause
+        for cause, deviation, p_value, least in found
+        if deviation is not None and abs(deviation) > least
+        if p_value is not None and p_value < level
+    ]
+    return list(dict.fromkeys(causes))
+
+
+def _compare_noise(
+    both: Matched, real: NoiseMeasurement, sim: NoiseMeasurement, random: Random, level: float
+) -> Block:
     """Compare the temporal noise; return the block `noise`, lengths in millimetres."""
-    real, sim = noises
     variances = real.variance[both.rows], sim.variance[both.columns]
     sums = both.sums(*variances, left_out=(real.left_out, sim.left_out))
     means = [max(mean, 0.0) ** 0.5 for mean in np.nan_to_num(sums.means()).tolist()]
-    ratio = squares = correlation_p = frames_p = None
+    ratio = squares = None
+    p_values: list[float | None] = [None, None]
     if means[1] > _NO_NOISE:
         ratio, squares = means[0] / means[1], sums.ratio_interval()
         p_value = sums.ratio_p(random)
-        near = real.pose_correlation, sim.pose_correlation
-        correlation_p = _correlation_p(both, *near, random)
-        later = real.pose_frame_correlation, sim.pose_frame_correlation
-        frames_p = _correlation_p(both, *later, random)
+        p_values = [
+            _correlation_p(both, getattr(real, name), getattr(sim, name), random)
+            for name in ("pose_correlation", "pose_frame_correlation")
+        ]
     else:
         p_value = sums.difference_p(random)
-    causes = []
-    if ratio is None or abs(ratio - 1.0) > _MATERIAL:
-        parts = contributions(real) - contributions(sim)
-        largest = int(np.argmax(parts if ratio is None or ratio > 1.0 else -parts))
-        causes.append((p_value, ("noise floor", "shot noise", "read noise")[largest]))
-    if abs(real.correlation[:, 0].mean() - sim.correlation[:, 0].mean()) > _MATERIAL:
-        causes.append((correlation_p, "edge-preserving filter of the camera"))
-    if abs(real.frame_correlation - sim.frame_correlation) > _MATERIAL:
-        causes.append((frames_p, "filter of the camera in time"))
+    more = np.inf if ratio is None else ratio - 1.0
+    parts = ("noise floor", "shot noise", "read noise")
+    largest = parts[np.argmax(np.sign(more) * (contributions(real) - contributions(sim)))]
+    near = float(real.correlation[:, 0].mean() - sim.correlation[:, 0].mean())
+    later = real.frame_correlation - sim.frame_correlation
     return {
         "real_mm": _mm(means[0]),
         "sim_mm": _mm(means[1]),
         "ratio": None if ratio is None else round(ratio, 4),
         "ratio_ci": squares and [round(max(end, 0.0) ** 0.5, 4) for end in squares],
         "p_value": p_value,
-        "correlation_p_value": correlation_p,
-        "frame_correlation_p_value": frames_p,
+        "correlation_p_value": p_values[0],
+        "frame_correlation_p_value": p_values[1],
         "source": real.source,
         "same_poses": both.paired,
         "real": _noise_alone(real),
         "sim": _noise_alone(sim),
-        "explained_by": [cause for p, cause in causes if p is not None and p < level],
+        "explained_by": _causes(
+            level,
+            (largest, more, p_value, _MATERIAL),
+            ("edge-preserving filter of the camera", near, p_values[0], _MATERIAL),
+            ("filter of the camera in time", later, p_values[1], _MATERIAL),
+        ),
     }
 
 
@@ -168,11 +186,8 @@ def _correlation_p(
 def contributions(noise: NoiseMeasurement) -> np.ndarray:
     """Return the mean temporal variances of floor, shot noise and read noise, (3,), m^2."""
     curve, table = noise.curve, noise.observed.table
-    darkness = (table.distance / curve.reference_distance_m) ** 2
-    if curve.reference_amplitude is not None:
-        with np.errstate(divide="ignore"):
-            darkness = curve.reference_amplitude / table.amplitude
-    darkness = darkness[np.isfinite(darkness)].clip(max=1.0 / curve.least_brightness)
+    darkness = 1.0 / curve.brightness(table.distance, table.amplitude)
+    darkness = darkness[np.isfinite(darkness)]
     mean = [part**2 * np.mean(darkness**k) for k, part in enumerate(curve.deviations)]
     return np.array(mean) * (1.0 - curve.fixed_share)
 
@@ -183,60 +198,54 @@ def _noise_alone(noise: NoiseMeasurement) -> Block:
         [round(value, 4) if np.isfinite(value) else None for value in along]
         for along in noise.correlation.tolist()
     )
+    repeats = noise.observed.repeats
     return {
         "temporal_mm": _mm(noise.temporal_m),
-        "temporal_ci": [_mm(end) if np.isfinite(end) else None for end in noise.temporal_interval],
+        "temporal_ci": [_mm(end) for end in noise.temporal_interval],
         "pattern_mm": _mm(noise.pattern_m),
-        "scene_mm": None if noise.scene_m is None else _mm(noise.scene_m),
+        "scene_mm": _mm(noise.scene_m),
         "correlation_row": rows,
         "correlation_column": columns,
         "frame_correlation": round(noise.frame_correlation, 4),
         "correlation_px": round(noise.curve.correlation_px, 3),
         "curve": noise.curve.model_dump(exclude={"fixed_seed"}),
-        "poses": noise.num_poses,
-        "repeated_poses": noise.repeated_poses,
+        "poses": len(repeats),
+        "repeated_poses": int((repeats > 1).sum()),
     }
 
 
-def _mm(metres: float) -> float:
-    return round(metres * 1e3, 4)
+def _mm(metres: float | None) -> float | None:
+    return None if metres is None or not np.isfinite(metres) else round(metres * 1e3, 4)
 
 
-def _compare_dropouts(both: Matched, lost: Lost, random: Random, level: float) -> Block:
+def _compare_dropouts(
+    both: Matched, real: DropoutMeasurement, sim: DropoutMeasurement, random: Random, level: float
+) -> Block:
     """Compare the shares of missing and of saturated pixels; return the block `dropouts`."""
-    (real, sim), frames = lost, (both.real.frames, both.sim.frames)
+    frames = both.real.frames, both.sim.frames
     missing, saturated = (
-        both.sums(counts[0] / frames[0], counts[1] / frames[1], frames)
-        for counts in (
-            (both.real.missing, both.sim.missing),
-            (both.real.saturated, both.sim.saturated),
-        )
+        both.sums(both.real[name] / frames[0], both.sim[name] / frames[1], frames)
+        for name in ("missing", "saturated")
     )
-    shares, of_saturated = (np.nan_to_num(sums.means()).tolist() for sums in (missing, saturated))
+    (lost, lost_by_sim), full = np.nan_to_num([missing.means(), saturated.means()]).tolist()
     p_value, saturated_p = missing.difference_p(random), saturated.difference_p(random)
-    causes: list[str] = []
-    if _matters(shares[0] - shares[1], p_value, level, _MATERIAL_SHARE):
-        causes.append(_cause_of_missing(real if shares[0] > shares[1] else sim))
-    if _matters(of_saturated[0] - of_saturated[1], saturated_p, level, _MATERIAL_SHARE):
-        causes.append("saturation")
+    cause = _cause_of_missing(real if lost > lost_by_sim else sim)
     ends = missing.difference_interval(random)
     return {
-        "real_share": round(shares[0], 5),
-        "sim_share": round(shares[1], 5),
+        "real_share": round(lost, 5),
+        "sim_share": round(lost_by_sim, 5),
         "p_value": p_value,
         "difference_ci": ends and [round(end, 5) for end in ends],
         "same_poses": both.paired,
         "saturated_p_value": saturated_p,
         "real": _dropouts_alone(real),
         "sim": _dropouts_alone(sim),
-        "explained_by": list(dict.fromkeys(causes)),
+        "explained_by": _causes(
+            level,
+            (cause, lost - lost_by_sim, p_value, _MATERIAL_SHARE),
+            ("saturation", full[0] - full[1], saturated_p, _MATERIAL_SHARE),
+        ),
     }
-
-
-def _matters(deviation: float | None, p_value: float | None, level: float, least: float) -> bool:
-    if deviation is None or p_value is None:
-        return False
-    return p_value < level and abs(deviation) > least
 
 
 def _cause_of_missing(dropouts: DropoutMeasurement) -> str:
@@ -261,11 +270,7 @@ def _dropouts_alone(dropouts: DropoutMeasurement) -> Block:
 
 
 def _compare_amplitude(
-    both: Matched,
-    amplitudes: tuple[np.ndarray, np.ndarray],
-    shape: tuple[int, ...],
-    random: Random,
-    level: float,
+    both: Matched, real: DropoutMeasurement, sim: DropoutMeasurement, random: Random, level: float
 ) -> Block | None:
     """Compare the amplitudes: real over simulated, in the same pixels or relative to cos / d^2.
 
@@ -274,21 +279,21 @@ def _compare_amplitude(
 
     Args:
         both: The pixels to compare; those of other poses matched by cos / d^2.
-        amplitudes: Amplitude of each row of both tables, also of missing pixels, counts.
-        shape: Height and width of the images.
+        real: Holds the amplitude of each row of the recording's table, also of missing pixels.
+        sim: Of the simulated one.
         random: Of resamples and permutations.
         level: Significance level.
 
     Returns:
         The block `amplitude`; None where one of the recordings has none at the pixels compared.
     """
-    logs = [_log(amplitudes[0][both.rows]), _log(amplitudes[1][both.columns])]
+    logs = [_log(real.amplitude[both.rows]), _log(sim.amplitude[both.columns])]
     if not both.paired:
-        logs = [log - _log(t.signal) for log, t in zip(logs, (both.real, both.sim), strict=True)]
+        logs = [logs[0] - _log(both.real.signal), logs[1] - _log(both.sim.signal)]
     sums = both.sums(logs[0], logs[1])
-    if not len(sums.real.total) or not len(sums.sim.total):
+    if not all(map(len, sums.total)):
         return None
-    real, sim = sums.means()
+    means = sums.means()
     interval = sums.difference_interval(random)
     slope = ends = border = border_p = None
     if both.paired:
@@ -296,18 +301,12 @@ def _compare_amplitude(
         poses = len(products)
         slope = _slope(products)
         ends = bootstrap(lambda r: _slope(products[r.integers(poses, size=poses)]), poses, random)
-        contrast = _border_contrast(both, logs[0] - logs[1], border_of(shape))
+        contrast = _border_contrast(both, logs[0] - logs[1], border_of(real.map.shape))
         if len(contrast):
             border, border_p = float(np.exp(contrast.mean())), sign_flip_p(contrast, random)
-    ratio, p_value = float(np.exp(real - sim)), sums.difference_p(random)
-    causes = []
-    if _matters(ratio - 1.0, p_value, level, _MATERIAL):
-        causes.append("light source or unit of the amplitude")
-    beyond = ends is not None and not ends[0] <= 1.0 <= ends[1]
-    if beyond and slope is not None and abs(slope - 1.0) > _MATERIAL:
-        causes.append("response that is not linear")
-    if border is not None and _matters(border - 1.0, border_p, level, _MATERIAL):
-        causes.append("vignetting of lens and light source")
+    ratio, p_value = float(np.exp(means[0] - means[1])), sums.difference_p(random)
+    # An interval without 1 is significant at its own 95 %, whatever level is asked for.
+    beyond = None if ends is None or ends[0] <= 1.0 <= ends[1] else 0.0
     return {
         "ratio": _significant(ratio),
         "ratio_ci": interval and [_significant(end) for end in np.exp(interval).tolist()],
@@ -317,7 +316,12 @@ def _compare_amplitude(
         "border_ratio": _significant(border),
         "border_p_value": border_p,
         "same_poses": both.paired,
-        "explained_by": causes,
+        "explained_by": _causes(
+            level,
+            ("light source or unit of the amplitude", ratio - 1.0, p_value, _MATERIAL),
+            ("response that is not linear", slope and slope - 1.0, beyond, _MATERIAL),
+            ("vignetting of lens and light source", border and border - 1.0, border_p, _MATERIAL),
+        ),
     }
 
 
@@ -345,14 +349,12 @@ def _border_contrast(both: Matched, ratio: np.ndarray, border: np.ndarray) -> np
         ratio: Ln of real over simulated amplitude in each, shape (M,).
         border: Where the border is, shape (H, W), bool.
     """
-    pose, size = both.real.pose, int(both.real.pose.max()) + 1
-    at_border = border.ravel()[both.real.pixel]
-    means: Sequence[np.ndarray] = []
-    for side in (at_border, ~at_border):
-        use = side & np.isfinite(ratio)
-        sums = np.bincount(pose[use], ratio[use], minlength=size)
-        means = [*means, quotient(sums, np.bincount(pose[use], minlength=size))]
-    contrast = means[0] - means[1]
+    side = border.ravel()[both.real.pixel]
+    known = np.isfinite(ratio)
+    place = (2 * both.real.pose + side)[known]
+    size = 2 * int(both.real.pose.max()) + 2
+    means = quotient(np.bincount(place, ratio[known], size), np.bincount(place, minlength=size))
+    contrast = means[1::2] - means[::2]
     return contrast[np.isfinite(contrast)]
 
 

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import ArrayT
-from tofcorr.observables.read import Observed, observe, quotient
+from tofcorr.observables.read import Observed, quotient
 from tofcorr.options import Options, PositiveNumber, Share
 
 # Bins of ln amplitude that the model is fitted to: of equal count, and finer ones of the darkest
@@ -70,7 +69,6 @@ class DropoutMeasurement:
         share: Share without a distance.
         saturated_share: Share at or above the saturation amplitude.
         saturated_missing: Share that is saturated and has no distance.
-        pose_share: Share without a distance in each pose, shape (P,); NaN without a pixel.
         map: Share of each pixel, shape (H, W); NaN where it never looked at the target.
         border_share: Share in the outer eighth of the image on each side.
         centre_share: Share in the rest.
@@ -85,7 +83,6 @@ class DropoutMeasurement:
     share: float
     saturated_share: float
     saturated_missing: float
-    pose_share: np.ndarray
     map: np.ndarray
     border_share: float
     centre_share: float
@@ -94,28 +91,18 @@ class DropoutMeasurement:
     observed: Observed
 
 
-def measure_dropouts(recording: Recording) -> DropoutMeasurement:
-    """Measure the missing and saturated pixels of a recording.
-
-    Args:
-        recording: Any recording, real or simulated. Without a mask, every pixel counts as on the
-            target.
-
-    Raises:
-        CalibrationDataError: No image has 100 usable pixels, or a frame breaks the format.
-    """
-    return dropouts_of(observe(recording))
-
-
 def dropouts_of(observed: Observed) -> DropoutMeasurement:
-    """Measure the missing and saturated pixels of a recording that was read."""
+    """Measure the missing and saturated pixels of a recording that was read.
+
+    Without a mask, every pixel counts as on the target.
+    """
     amplitude, recorded = _amplitude_everywhere(observed)
-    saturation = _saturation(observed, amplitude)
-    table, pixels = observed.table, observed.pose_pixels
+    saturation, stated = _saturation(observed, amplitude)
+    table, pixels = observed.table, max(observed.pose_pixels.sum(), 1)
     beyond = amplitude >= (np.inf if saturation is None else saturation)
-    saturated = observed.pose_saturated.sum() / max(pixels.sum(), 1)
-    if saturation is not None and observed.recording.saturation_amplitude is None:
-        saturated = table.frames[beyond].sum() / table.frames.sum()
+    saturated = observed.pose_saturated.sum() / pixels
+    if not stated:
+        saturated = table.frames[beyond].sum() / max(table.frames.sum(), 1)
     border = border_of(observed.map_frames.shape)
     border_share, centre_share = (
         float(observed.map_missing[where].sum() / max(observed.map_frames[where].sum(), 1))
@@ -123,10 +110,9 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
     )
     return DropoutMeasurement(
         model=_fitted(observed, amplitude, saturation),
-        share=float(observed.pose_missing.sum() / max(pixels.sum(), 1)),
+        share=float(observed.pose_missing.sum() / pixels),
         saturated_share=float(saturated),
         saturated_missing=float(table.missing[beyond].sum() / max(table.frames.sum(), 1)),
-        pose_share=quotient(observed.pose_missing, pixels),
         map=quotient(observed.map_missing, observed.map_frames),
         border_share=border_share,
         centre_share=centre_share,
@@ -144,16 +130,16 @@ def border_of(shape: tuple[int, ...]) -> np.ndarray:
     return border
 
 
-def _saturation(observed: Observed, amplitude: np.ndarray) -> float | None:
-    """Return the saturation amplitude: as recorded, or where many pixels share the largest."""
+def _saturation(observed: Observed, amplitude: np.ndarray) -> tuple[float | None, bool]:
+    """Return the saturation amplitude, and whether the recording states it.
+
+    If not, it is where many pixels share the largest amplitude: random ones hardly ever agree.
+    """
     if observed.recording.saturation_amplitude is not None:
-        return observed.recording.saturation_amplitude
+        return observed.recording.saturation_amplitude, True
     known = amplitude[np.isfinite(amplitude)]
-    if not len(known):
-        return None
-    # Random amplitudes hardly ever agree.
-    piled = int((known == known.max()).sum())
-    return float(known.max()) if piled >= max(20, len(known) / 10_000) else None
+    piled = int((known == known.max()).sum()) if len(known) else 0
+    return (float(known.max()) if piled >= max(20, len(known) / 10_000) else None), False
 
 
 def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None) -> DropoutModel:
@@ -162,61 +148,51 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
     from scipy.special import expit, logit
 
     table, level = observed.table, np.inf if saturation is None else saturation
-    use = np.isfinite(amplitude) & (amplitude > 0) & (amplitude < level)
-    missing, frames = table.missing[use], table.frames[use]
     other = np.nan_to_num(amplitude) < level  # Saturated pixels are missing for another reason.
     total = table.frames[other].sum()
     plain = DropoutModel(
         base_share=float(table.missing[other].sum() / total) if total else 0.0,
         saturation_amplitude=saturation,
     )
+    use = other & (np.nan_to_num(amplitude) > 0)
+    missing, frames, at = table.missing[use], table.frames[use], np.log(amplitude[use])
     if not missing.sum():
         return plain
-    at = np.log(amplitude[use])
     levels = np.linspace(0.0, 1.0, _BINS + 1)
     if len(at) > _BINS:
         levels = np.union1d(levels, np.geomspace(1.0 / len(at), 1.0 / _BINS, _DARK_BINS))
     edges = np.unique(np.quantile(at, levels))
     place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, max(len(edges) - 2, 0))
-    count = np.bincount(place, frames)
-    lost = np.bincount(place, missing)
-    centre = np.bincount(place, frames * at) / np.maximum(count, 1)
-    base = float(missing.sum() / frames.sum())
-    flat = _deviance(np.full(len(count), base), lost, count)
-    best, at_best = flat, None
-    for start in np.quantile(centre, (0.02, 0.1, 0.3)):
-        found = minimize(
-            lambda x: _deviance(_probability(x, centre), lost, count),
+    count, lost, sums = (np.bincount(place, each) for each in (frames, missing, frames * at))
+    centre = sums / np.maximum(count, 1)
+
+    def model(x: np.ndarray) -> DropoutModel:
+        """Return the model of the logit of the base, ln threshold and ln width."""
+        base, width = float(expit(x[0])), float(np.exp(x[2]).clip(*_WIDTHS))
+        changes = {"base_share": base, "amplitude_at_half": float(np.exp(x[1])), "width": width}
+        return plain.model_copy(update=changes)
+
+    def unlikely(probability: np.ndarray | float) -> float:
+        """Return the negative log likelihood."""
+        sure = np.clip(probability, 1e-9, 1.0 - 1e-9)
+        return float(-(lost * np.log(sure) + (count - lost) * np.log1p(-sure)).sum())
+
+    base = missing.sum() / frames.sum()
+    tried = [
+        minimize(
+            lambda x: unlikely(model(x).probability(np.exp(centre))),
             np.array([logit(np.clip(base / 2, 1e-6, 1.0)), start, np.log(0.1)]),
             method="Nelder-Mead",
             options={"maxiter": 2000, "xatol": 1e-4, "fatol": 1e-3},
         )
-        if found.fun < best:
-            best, at_best = float(found.fun), found.x
+        for start in np.quantile(centre, (0.02, 0.1, 0.3))
+    ]
+    best = min(tried, key=lambda found: found.fun)
     # Half the 95 % quantile of chi-square with two degrees of freedom, for each pose with any.
-    if at_best is None or flat - best < 3 * max((observed.pose_missing > 0).sum(), 1):
+    if unlikely(base) - best.fun < 3 * max((observed.pose_missing > 0).sum(), 1):
         return plain
-    base = float(expit(at_best[0]))
-    return DropoutModel(
-        base_share=base if base * total >= 1 else 0.0,
-        amplitude_at_half=float(np.exp(at_best[1])),
-        width=float(np.clip(np.exp(at_best[2]), *_WIDTHS)),
-        saturation_amplitude=saturation,
-    )
-
-
-def _probability(x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the probability; x holds the logit of the base, ln threshold, ln width."""
-    from scipy.special import expit
-
-    base = expit(x[0])
-    return base + (1.0 - base) * expit((x[1] - at) / np.clip(np.exp(x[2]), *_WIDTHS))
-
-
-def _deviance(probability: np.ndarray, lost: np.ndarray, count: np.ndarray) -> float:
-    """Return the negative log likelihood."""
-    sure = np.clip(probability, 1e-9, 1.0 - 1e-9)
-    return float(-(lost * np.log(sure) + (count - lost) * np.log1p(-sure)).sum())
+    found = model(best.x)
+    return found if found.base_share * total >= 1 else found.model_copy(update={"base_share": 0.0})
 
 
 def _amplitude_everywhere(observed: Observed) -> tuple[np.ndarray, bool]:

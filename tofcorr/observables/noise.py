@@ -1,24 +1,19 @@
-r"""Measures the noise of a recording: how much, on what it depends, and how pixels share it.
+"""Measures the noise of a recording: how much, on what it depends, and how pixels share it.
 
 It comes from frames taken without moving, or from differences of pixels in one image.
-
-A camera that averages frames filters in time. Its frame is
-:math:`n_t = \rho n_{t-1} + \sqrt{1 - \rho^2}\, e_t`. Frames k apart differ by
-:math:`\sigma^2 (1 - \rho^k)` in half squares, so that those of two steps are :math:`1 + \rho` times
-those of one, whatever the noise is.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import (
     SECOND_DIFFERENCE,
     SPACING,
     WIDEST_PX,
     NoiseModel,
+    Source,
+    brightness_bins,
     filter_width,
     fit_law,
     frame_correlation,
@@ -26,30 +21,17 @@ from tofcorr.estimation.noise import (
     neighbour_correlation,
 )
 from tofcorr.estimation.robust import student_quantile
-from tofcorr.observables.read import (
-    AXES,
-    LAGS,
-    Observed,
-    PixelTable,
-    observe,
-    quotient,
-)
+from tofcorr.observables.read import LAGS, Observed, quotient
 
 LEAST_VARIANCE = 1e-14
 """Square metres, (0.1 um)^2: less counts as free of noise. Chosen: float32 depth of 1 m is rounded
 to 0.06 um."""
 
-NoiseSource = Literal["repeats", "neighbours"]
-"""`repeats`: frames taken without moving; `neighbours`: differences of pixels in one image, less
-what images of different poses share, corrected for the correlation of the pixels compared, and to
-the level of repeated frames, which count where there are any."""
-
 # Noise comes from repeats if at least this share of the poses, or this many, was repeated: a level
 # from fewer says little of the others. Chosen.
 _REPEATED_SHARE, _REPEATED_POSES = 0.5, 8
-# Most bins of brightness, of equal count, in which a variance is taken, and fewest pixels of one:
-# as in `tofcorr.estimation.noise`; with 100 pixels a variance is known to 14 %.
-_BINS, _FEWEST_PER_BIN = 24, 100
+# Fewest pixels of a bin of brightness: with 100 pixels a variance is known to 14 %.
+_FEWEST_PER_BIN = 100
 # Standard errors that the correlation of frames must exceed to be counted, and the largest
 # considered (no unit): the variance of a frame is corrected by the inverse of what is left. Chosen:
 # one camera in 700 without a filter gets one.
@@ -62,7 +44,9 @@ class NoiseMeasurement:
 
     Attributes:
         curve: Noise as a function of brightness.
-        source: Where the temporal noise comes from.
+        source: Where the temporal noise comes from. From `neighbours` it is less what images of
+            different poses share, corrected for the correlation of the pixels compared, and to the
+            level of repeated frames, which count where there are any.
         temporal_m: Of what changes from frame to frame, in one frame.
         temporal_interval: Its 95 % interval, with poses as the unit.
         pattern_m: Of the pattern that is the same in all poses, pixel by pixel.
@@ -72,8 +56,6 @@ class NoiseMeasurement:
             lags 1 and 2.
         frame_correlation: Of successive frames of a pose, 0 if not significant: a filter in time.
         pose_frame_correlation: The same in each pose, shape (P,); NaN: fewer than three frames.
-        num_poses: Number of poses.
-        repeated_poses: How many of them have more than one frame.
         variance: Temporal variance of each row of the pixel table, m^2; NaN where unknown.
         pose_correlation: Correlation of nearest neighbours in each pose, shape (P,); NaN: unknown.
         left_out: Change of the logarithm of the mean variance, shape (P,), when a pose is left out
@@ -82,7 +64,7 @@ class NoiseMeasurement:
     """
 
     curve: NoiseModel
-    source: NoiseSource
+    source: Source
     temporal_m: float
     temporal_interval: tuple[float, float]
     pattern_m: float
@@ -90,34 +72,20 @@ class NoiseMeasurement:
     correlation: np.ndarray
     frame_correlation: float
     pose_frame_correlation: np.ndarray
-    num_poses: int
-    repeated_poses: int
     variance: np.ndarray
     pose_correlation: np.ndarray
     left_out: np.ndarray
     observed: Observed
 
 
-def measure_noise(recording: Recording) -> NoiseMeasurement:
-    """Measure the noise of a recording.
-
-    Args:
-        recording: Any recording, real or simulated.
-
-    Raises:
-        CalibrationDataError: No image has 100 usable pixels, or a frame breaks the format.
-    """
-    return noise_of(observe(recording))
-
-
-def noise_source(observed: Observed) -> NoiseSource:
+def noise_source(observed: Observed) -> Source:
     """Return where the noise of a recording can come from."""
-    repeated = int((observed.repeats > 1).sum())
-    enough = repeated >= min(_REPEATED_POSES, _REPEATED_SHARE * observed.num_poses)
+    repeated = (observed.repeats > 1).sum()
+    enough = repeated >= min(_REPEATED_POSES, _REPEATED_SHARE * len(observed.repeats))
     return "repeats" if enough else "neighbours"
 
 
-def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeasurement:
+def noise_of(observed: Observed, source: Source | None = None) -> NoiseMeasurement:
     """Measure the noise of a recording that was read.
 
     Args:
@@ -125,31 +93,33 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         source: Where the temporal noise comes from; None: from repeats, if there are enough.
     """
     source = source or noise_source(observed)
-    table, repeated = observed.table, observed.repeats > 1
+    table = observed.table
     found, error = frame_correlation(np.concatenate(observed.between_frames, axis=1))
     of_frames = min(found, _MOST_CORRELATED) if found > _LEAST_ERRORS * error else 0.0
-    counts = range(int(observed.repeats.max(initial=0)) + 1)
-    shown = 1.0 - np.array([mean_correlation(of_frames, count) for count in counts])
-    repeats = table.of_repeats / shown[observed.repeats][table.pose]
+    shown = np.array(
+        [1.0 - mean_correlation(of_frames, count) for count in observed.repeats.tolist()]
+    )
+    repeats = table.of_repeats / shown[table.pose]
     if source == "repeats":
         products, squares, _ = observed.temporal.sum(0)
         correlation, variance = quotient(products, squares), repeats
         by_pose = quotient(observed.temporal[:, 0], observed.temporal[:, 1])[..., 0].mean(-1)
-        left_out = np.zeros(observed.num_poses)
+        left_out = np.zeros(len(observed.repeats))
     else:
         variance, correlation, by_pose, left_out = _noise_of_neighbours(observed)
         variance = variance * level_of_repeats(_brightness(table), repeats, variance)
         variance = np.where(np.isfinite(repeats), repeats, variance)
     temporal, interval = _level_of_poses(table.pose, variance)
-    curve = fit_curve(table, variance, filter_width(correlation.mean(0).tolist()))
+    curve = _fitted(table, variance, filter_width(correlation.mean(0).tolist()))
     if source == "neighbours":
         # Single pixels between edges have no difference; the curve covers them too. It has a least
         # noise where differences, less those of the pattern, leave none.
-        everywhere = _mean_of_curve(table, curve)
-        if temporal > 0:
-            more = (everywhere / temporal) ** 0.5
-            interval = interval[0] * more, interval[1] * more
-        temporal = everywhere
+        at = table.amplitude if curve.needs_amplitude else table.distance
+        lit = table[np.isfinite(at) & (at > 0) & (table.missing < table.frames)]
+        squares = curve.sigma(lit.distance, lit.amplitude) ** 2
+        everywhere = float(squares.mean()) if len(lit) else 0.0
+        more = (everywhere / temporal) ** 0.5 if temporal > 0 else 1.0
+        temporal, interval = everywhere, (interval[0] * more, interval[1] * more)
     pattern, scene = _fixed(observed)
     share = pattern / (pattern + temporal) if pattern > 0 and temporal > 0 else 0.0
     return NoiseMeasurement(
@@ -162,8 +132,6 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         correlation=correlation,
         frame_correlation=of_frames,
         pose_frame_correlation=np.array([frame_correlation(k)[0] for k in observed.between_frames]),
-        num_poses=observed.num_poses,
-        repeated_poses=int(repeated.sum()),
         variance=variance,
         pose_correlation=by_pose,
         left_out=left_out,
@@ -186,23 +154,22 @@ def _noise_of_neighbours(
         each pose, (P,); the change of the logarithm of the mean variance, (P,), when a pose is left
         out of the factors that all poses share.
     """
-    total = observed.within.sum(0)
-    shared = np.array([[observed.shared[axis, lag] for lag in (0, *LAGS)] for axis in AXES])
-    of_second = float(shared[:, 0].mean())
+    total, table = observed.within.sum(0), observed.table
+    of_second, of_nearest = (float(observed.shared[:, lag].mean()) for lag in (0, 1))
 
     def ratio_of(sums: np.ndarray) -> np.ndarray:
         """Return mean squares of differences over those of second differences (..., 2, 2)."""
         near, wide, counts = np.moveaxis(sums, -3, 0)
         wide = wide - of_second * counts
         wide = np.where(wide > LEAST_VARIANCE * counts, wide, 0.0)
-        return quotient(near - shared[:, 1:] * counts, wide)
+        return quotient(near - observed.shared[:, 1:] * counts, wide)
 
     ratio, without = ratio_of(total), ratio_of(total - observed.within)
     share, *shares = _second_difference_share(np.concatenate([ratio[None], without])).tolist()
-    raw = observed.table.of_neighbours - of_second
+    raw = table.of_neighbours - of_second
     # In the images of small squares most pixels have a neighbour of their brightness, but no second
     # difference: half the squared difference is that much smaller.
-    nearest = (observed.table.of_nearest - float(shared[:, 1].mean())) / ratio[:, 0].mean()
+    nearest = (table.of_nearest - of_nearest) / ratio[:, 0].mean()
     at_edges = ~np.isfinite(raw) & np.isfinite(nearest)
     variance = np.where(at_edges, nearest, raw) / share
     edges = float(variance[at_edges].sum() / np.nansum(variance)) if at_edges.any() else 0.0
@@ -219,21 +186,20 @@ def _second_difference_share(ratio: np.ndarray) -> np.ndarray:
     """
     # A step changes the level by less than 2 %, and a parabola finds the width between them.
     widths = np.arange(0.0, WIDEST_PX, 0.02)
-    far = [[neighbour_correlation(w, k * SPACING) for k in (1, 2)] for w in widths]
-    share = 1.0 - (np.array(far) @ [2.0, -0.5]) / SECOND_DIFFERENCE
-    near = np.array([[1.0 - neighbour_correlation(w, lag) for lag in LAGS] for w in widths])
-    wanted = ratio.mean(-2)
-    misfit = ((near / share[:, None] - wanted[..., None, :]) ** 2).sum(-1)
-    known = np.isfinite(misfit).all(-1)
-    least = np.where(known[..., None], misfit, 0.0).argmin(-1)
-    middle = least.clip(1, len(widths) - 2)
-    low, here, high = (
-        np.take_along_axis(misfit, (middle + step)[..., None], -1)[..., 0] for step in (-1, 0, 1)
-    )
-    bend = low - 2.0 * here + high
-    step = np.divide(low - high, 2.0 * bend, out=np.zeros_like(bend), where=bend > 0)
-    place = np.where(least == middle, middle + step.clip(-0.5, 0.5), least)
-    return np.where(known, np.interp(place, np.arange(len(widths)), share), 1.0)
+    lags = (*LAGS, SPACING, 2 * SPACING)
+    correlation = np.array([[neighbour_correlation(w, lag) for lag in lags] for w in widths])
+    share = 1.0 - correlation[:, 2:] @ [2.0, -0.5] / SECOND_DIFFERENCE
+    near = (1.0 - correlation[:, :2]) / share[:, None]
+    shares = []
+    for wanted in ratio.mean(-2):
+        misfit = ((near - wanted) ** 2).sum(-1)
+        place = float(misfit.argmin())
+        if 0 < place < len(widths) - 1:
+            low, here, high = misfit[int(place) - 1 : int(place) + 2]
+            place += (low - high) / (2.0 * (low - 2.0 * here + high))
+        known = np.isfinite(misfit).all()
+        shares.append(np.interp(place, np.arange(len(widths)), share) if known else 1.0)
+    return np.array(shares)
 
 
 def level_of_repeats(
@@ -255,20 +221,14 @@ def level_of_repeats(
     lit = np.nan_to_num(brightness) > 0
     both = np.flatnonzero(np.isfinite(repeats) & np.isfinite(neighbours) & lit)
     # Three frames of a pose leave two degrees of freedom: five bins' pixels are known to 5 %.
-    parts = _bins(brightness, both, 5 * _FEWEST_PER_BIN) if len(both) >= _FEWEST_PER_BIN else []
-    parts = [part for part in parts if neighbours[part].sum() > 0]
-    if not parts:
+    bins = brightness_bins(brightness[both], 5 * _FEWEST_PER_BIN)
+    parts = [both[part] for part in bins if neighbours[both[part]].sum() > 0]
+    if len(both) < _FEWEST_PER_BIN or not parts:
         return np.ones_like(neighbours)
     levels = [float(repeats[part].sum() / neighbours[part].sum()) for part in parts]
     at = [float(np.median(np.log(brightness[part]))) for part in parts]
     here = np.log(np.where(lit, brightness, np.exp(at[0])))
     return np.interp(here, at, levels)
-
-
-def _bins(brightness: np.ndarray, use: np.ndarray, wanted: int) -> list[np.ndarray]:
-    """Return the numbers of some pixels in bins of like brightness, the darkest first."""
-    order = use[np.argsort(brightness[use], kind="stable")]
-    return np.array_split(order, int(np.clip(len(order) // wanted, 1, _BINS)))
 
 
 def _level_of_poses(pose: np.ndarray, variance: np.ndarray) -> tuple[float, tuple[float, float]]:
@@ -293,20 +253,12 @@ def _fixed(observed: Observed) -> tuple[float, float | None]:
     if not len(repeated):
         return observed.pattern, None
     within = max(float(repeated.mean()), 0.0)
-    if observed.num_poses == 1:
+    if len(observed.repeats) == 1:
         return within, 0.0
     return observed.pattern, max(within - observed.pattern, 0.0)
 
 
-def _mean_of_curve(table: PixelTable, curve: NoiseModel) -> float:
-    """Return the mean variance that the curve gives the pixels with a distance, m^2."""
-    at = table.amplitude if curve.needs_amplitude else table.distance
-    use = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
-    sigma = curve.sigma(table.distance[use], table.amplitude[use])
-    return float((sigma**2).mean()) if use.any() else 0.0
-
-
-def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) -> NoiseModel:
+def _fitted(table: np.recarray, variance: np.ndarray, correlation_px: float) -> NoiseModel:
     """Fit the noise curve to the variances of single pixels.
 
     Args:
@@ -321,14 +273,15 @@ def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) ->
     reference = float(np.nanmedian(table.amplitude)) if lit else None
     distance = float(np.nanmedian(table.distance))
     brightness = _brightness(table) * (distance**2 if reference is None else 1.0 / reference)
-    use = np.flatnonzero(np.isfinite(variance) & (np.nan_to_num(brightness) > 0))
+    use = np.isfinite(variance) & (np.nan_to_num(brightness) > 0)
+    brightness, variance = brightness[use], variance[use]
     coefficients, least = np.zeros(3), 1.0
-    if len(use):
-        parts = _bins(brightness, use, _FEWEST_PER_BIN)
+    if len(variance):
+        parts = brightness_bins(brightness, _FEWEST_PER_BIN)
         columns = np.array([[np.mean(brightness[p] ** -k) for k in range(3)] for p in parts])
         means = np.array([max(float(variance[p].mean()), LEAST_VARIANCE) for p in parts])
         coefficients = fit_law(columns, means)
-        least = float(np.quantile(brightness[use], 1 / 1000))  # Darker pixels are extrapolated.
+        least = float(np.quantile(brightness, 1 / 1000))  # Darker pixels are extrapolated.
     floor, shot, read = np.sqrt(coefficients).tolist()
     return NoiseModel(
         floor_m=floor,
@@ -341,7 +294,7 @@ def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) ->
     )
 
 
-def _brightness(table: PixelTable) -> np.ndarray:
+def _brightness(table: np.recarray) -> np.ndarray:
     """Return what the noise depends on, shape (M,): amplitude, or 1 / distance^2 without any."""
     lit = np.isfinite(table.amplitude).any()
     return table.amplitude if lit else 1.0 / table.distance**2

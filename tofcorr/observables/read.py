@@ -1,9 +1,8 @@
 """Reads a recording once and keeps what noise, missing pixels and amplitude are measured from."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from itertools import product
-from typing import Self
 
 import numpy as np
 import torch
@@ -19,8 +18,6 @@ LAGS, AXES = (1, 2), (1, 0)
 """Distances of the neighbours whose correlation is estimated, pixels: two tell how fast it falls,
 and with it the width of a filter. Axes of an image (H, W): along a row, and along a column."""
 
-# Powers of x and y of the smooth surface: a plane first, then what smooth errors add to it.
-_POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 # Images with fewer valid pixels get no surface: ten coefficients would follow their noise. Chosen.
 _LEAST_PIXELS = 100
 # Deviations beyond this many robust standard deviations of pixels of their brightness are no noise:
@@ -44,74 +41,34 @@ def pose_groups(recording: Recording) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PixelTable:
-    """Columns of equal length (M,), one row for each sampled pixel of each pose.
-
-    Attributes:
-        pose: Number of the pose.
-        pixel: Flat index in the image.
-        distance: To the plane of the images, metres; NaN where unknown.
-        cosine: Of the angle of incidence; NaN where unknown.
-        target: Number of the target's name, in alphabetical order of all names.
-        amplitude: Mean over frames with a distance, counts; NaN where there is none.
-        raw_amplitude: Mean over all frames, as recorded; NaN without amplitudes.
-        of_repeats: Variance over repeated frames, m^2; NaN where fewer than two are valid.
-        of_neighbours: Mean square of scaled second differences, m^2; NaN where there is none.
-        of_nearest: Mean half square of the differences to nearest pixels of about the same
-            brightness, m^2; NaN where there is none.
-        frames: In how many frames the pixel looks at the target.
-        missing: In how many of them it has no distance.
-        saturated: In how many of them it is saturated.
-    """
-
-    pose: np.ndarray
-    pixel: np.ndarray
-    distance: np.ndarray
-    cosine: np.ndarray
-    target: np.ndarray
-    amplitude: np.ndarray
-    raw_amplitude: np.ndarray
-    of_repeats: np.ndarray
-    of_neighbours: np.ndarray
-    of_nearest: np.ndarray
-    frames: np.ndarray
-    missing: np.ndarray
-    saturated: np.ndarray
-
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return len(self.pose)
-
-    @property
-    def signal(self) -> np.ndarray:
-        """Light returned relative to the same target at 1 m, seen head-on: cos / d^2."""
-        return self.cosine / self.distance**2
-
-    def select(self, rows: np.ndarray) -> Self:
-        """Return some rows, by number or as a bool for each."""
-        return replace(self, **{each.name: getattr(self, each.name)[rows] for each in fields(self)})
-
-    @classmethod
-    def join(cls, parts: list[Self]) -> Self:
-        """Return the rows of all parts."""
-        names = [each.name for each in fields(cls)]
-        return cls(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Observed:
     """What was read of one recording.
 
     Attributes:
         recording: Where it comes from.
-        table: The sample of pixels.
+        table: The sample of pixels: one row for each of them in each pose, with the fields
+
+            pose, pixel: number of the pose; flat index in the image;
+            distance, cosine: to the plane of the images, metres, and of the angle of incidence;
+            signal: light returned relative to the same target at 1 m, seen head-on: cos / d^2;
+            target: number of the target's name, in alphabetical order of all names;
+            amplitude: mean over frames with a distance, counts;
+            raw_amplitude: mean over all frames, as recorded;
+            of_repeats: variance over repeated frames, m^2;
+            of_neighbours: mean square of scaled second differences, m^2;
+            of_nearest: mean half square of the differences to nearest pixels of like brightness;
+            frames, missing, saturated: in how many frames the pixel looks at the target, has no
+            distance, is saturated.
+
+            A field is NaN where it is unknown.
         repeats: Number of frames of each pose, shape (P,).
         temporal: Of deviations from the mean of repeated frames: sums of products of neighbours,
             their squares, and numbers, in each pose, along `AXES` at `LAGS`: shape (P, 3, 2, 2).
         within: Half squares of differences of neighbours in one image, squares of second
             differences there, and numbers, likewise.
         pattern: Variance of what the residuals of different poses share, m^2.
-        shared: The same of the differences in `within`, by axis and lag; lag 0: of the second ones.
+        shared: The same of second differences, then of the differences in `within` by lag; by axis,
+            shape (2, 3).
         between_frames: Half the squared differences of frames one and two apart, of each pose,
             summed over tiles of the image, shape (2, T), m^2.
         repeated: Variance of the mean residual of each pose less that of its noise, shape (P,),
@@ -124,12 +81,12 @@ class Observed:
     """
 
     recording: Recording
-    table: PixelTable
+    table: np.recarray
     repeats: np.ndarray
     temporal: np.ndarray
     within: np.ndarray
     pattern: float
-    shared: dict[tuple[int, int], float]
+    shared: np.ndarray
     between_frames: list[np.ndarray]
     repeated: np.ndarray
     map_missing: np.ndarray
@@ -137,11 +94,6 @@ class Observed:
     pose_missing: np.ndarray
     pose_saturated: np.ndarray
     pose_pixels: np.ndarray
-
-    @property
-    def num_poses(self) -> int:
-        """Number of poses."""
-        return len(self.repeats)
 
 
 def observe(recording: Recording) -> Observed:
@@ -155,8 +107,9 @@ def observe(recording: Recording) -> Observed:
     """
     names = sorted(set(recording.frames.target.tolist()))
     shape = (recording.camera.height, recording.camera.width)
-    patterns = {(axis, lag): _BetweenPoses(shape) for axis in AXES for lag in (0, *LAGS)}
-    whole = _BetweenPoses(shape)
+    # What poses share: of residuals; of second differences and of those at each lag, by axis.
+    whole, *patterns = (_BetweenPoses(shape) for _ in range(1 + len(AXES) * (1 + len(LAGS))))
+    shared = {key: patterns.pop(0) for key in product(AXES, (0, *LAGS))}
     maps = np.zeros((2, *shape))
     tables, temporal, within, repeated, between, counts = ([] for _ in range(6))
     for number, images in enumerate(_iterate_poses(recording)):
@@ -165,15 +118,14 @@ def observe(recording: Recording) -> Observed:
         whole.add(mean, weight, images.place)
         temporal.append(_products(residual - mean, images.amplitude))
         second = {axis: second_differences(residual, images.amplitude, axis) for axis in AXES}
-        within.append(_differences_within(images, residual, weight, second, patterns))
+        within.append(_differences_within(images, residual, weight, second, shared))
         repeated.append(_repeated_variance(residual))
         between.append(_frame_differences(residual))
-        target = names.index(images.target)
-        tables.append(_rows(images, residual, second, number, target, shape[0]))
-        maps[:, *images.place] += images.missing.sum(0), images.on_target.sum(0)
+        tables.append(_rows(images, residual, second, (number, names.index(images.target)), shape))
         sums = (images.missing, images.saturated, images.on_target)
+        maps[:, *images.place] += sums[0].sum(0), sums[2].sum(0)
         counts.append([len(residual), *(each.sum() for each in sums)])
-    table = PixelTable.join(tables)
+    table = np.concatenate(tables).view(np.recarray)
     if not np.isfinite(table.distance).any():
         raise CalibrationDataError(
             f"{recording.path}: no image has 100 usable pixels on the target, as noise needs."
@@ -186,7 +138,7 @@ def observe(recording: Recording) -> Observed:
         temporal=np.array(temporal),
         within=np.array(within),
         pattern=whole.variance(),
-        shared={key: between_poses.variance() for key, between_poses in patterns.items()},
+        shared=np.reshape([each.variance() for each in shared.values()], (len(AXES), -1)),
         between_frames=between,
         repeated=np.array(repeated),
         map_missing=maps[0],
@@ -212,7 +164,6 @@ class _PoseImages:
         cosine: Of the angle of incidence on that plane, shape (h, w); NaN where unknown.
         target: Name of the target.
         place: Rows and columns of the rectangle.
-        width: Of the whole image.
     """
 
     residual: np.ndarray
@@ -224,7 +175,6 @@ class _PoseImages:
     cosine: np.ndarray
     target: str
     place: tuple[slice, slice]
-    width: int
 
 
 def _iterate_poses(recording: Recording) -> Iterator[_PoseImages]:
@@ -268,7 +218,6 @@ def _iterate_poses(recording: Recording) -> Iterator[_PoseImages]:
             cosine=cosine,
             target=str(recording.frames.target[frames[0]]),
             place=(rows, columns),
-            width=valid.shape[2],
         )
 
 
@@ -288,7 +237,9 @@ class _SurfaceFit:
         x, y = (self._rays[..., axis] / self._z for axis in (0, 1))
         self._scale = max(float(np.abs(x).max()), float(np.abs(y).max()), 1e-6)
         x, y = x / self._scale, y / self._scale
-        self._basis = np.stack([x**a * y**b for a, b in _POWERS])
+        # A plane first, then what smooth errors add to it.
+        powers = [(total - k, k) for total in range(4) for k in range(total + 1)]
+        self._basis = np.stack([x**a * y**b for a, b in powers])
 
     def __call__(
         self, distance: np.ndarray, place: tuple[slice, slice]
@@ -311,35 +262,29 @@ class _SurfaceFit:
         z, basis = self._z[place], np.ascontiguousarray(self._basis[:, *place])
         measured = np.where(valid, distance, 1.0)
         inverse, metres = 1.0 / (measured * z), measured**2 * z
+
+        def fitted(functions: np.ndarray) -> np.ndarray:
+            """Return the factors of functions (K, h, w) whose sum is the nearest, in metres."""
+            columns = functions.reshape(len(functions), -1)
+            weighted = columns * np.where(use, metres**2, 0.0).ravel()
+            return np.linalg.solve(weighted @ columns.T, weighted @ inverse.ravel())
+
         use, left = valid, unknown
         for _ in range(3):
-            smooth = _fitted(basis, inverse, metres, use)
-            left = -(inverse - np.tensordot(smooth, basis, 1)) * metres
+            left = -(inverse - np.tensordot(fitted(basis), basis, 1)) * metres
             around = np.abs(left - np.median(left[use]))
             limit = _CLIP * sigma_from_mad(float(np.median(around[use])))
             kept = valid & (around <= limit) if limit > 0 else use
             if kept.sum() < _LEAST_PIXELS or np.array_equal(kept, use):
                 break
             use = kept
-        plane = _fitted(basis[:3], inverse, metres, use)  # 1/z = plane . (1, x, y)
+        plane = fitted(basis[:3])  # 1/z = plane . (1, x, y)
         predicted = np.tensordot(plane, basis[:3], 1)
-        meets = predicted > 0
         normal = np.array([plane[1] / self._scale, plane[2] / self._scale, plane[0]])
         cosine = self._rays[place] @ (normal / np.linalg.norm(normal))
-        return (
-            np.where(valid, left, np.nan),
-            1.0 / (np.where(meets, predicted, np.nan) * z),
-            np.where(meets, cosine, np.nan),
-        )
-
-
-def _fitted(
-    basis: np.ndarray, inverse: np.ndarray, metres: np.ndarray, use: np.ndarray
-) -> np.ndarray:
-    """Return the coefficients of the columns (K, h, w), weighted to metres."""
-    columns = basis.reshape(len(basis), -1)
-    weighted = columns * np.where(use, metres**2, 0.0).ravel()
-    return np.linalg.solve(weighted @ columns.T, weighted @ inverse.ravel())
+        left[~valid] = np.nan
+        cosine[predicted <= 0] = predicted[predicted <= 0] = np.nan
+        return left, 1.0 / (predicted * z), cosine
 
 
 def _clipped(residual: np.ndarray, amplitude: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -355,10 +300,9 @@ def _clipped(residual: np.ndarray, amplitude: np.ndarray | None) -> tuple[np.nda
         order = np.argsort(amplitude.ravel()[known], kind="stable")
     spread = np.full(len(known), np.inf)
     # Noise differs little within an eighth; an image of 32 x 25 pixels still has 100 in each.
-    for part in np.array_split(order, 8):
-        if len(part):
-            around = np.abs(values[part] - np.median(values[part]))
-            spread[part] = sigma_from_mad(float(np.median(around))) or np.inf
+    for part in np.array_split(order, min(8, len(order))) if len(order) else ():
+        around = np.abs(values[part] - np.median(values[part]))
+        spread[part] = sigma_from_mad(float(np.median(around))) or np.inf
     clipped, weight = np.full((2, residual.size), np.nan)
     clipped[known] = np.clip(values, -_CLIP * spread, _CLIP * spread)
     # A group that repeats exactly has the rounding of float32 depth, 0.1 um.
@@ -376,13 +320,6 @@ def known_mean(images: np.ndarray) -> np.ndarray:
 def quotient(over: np.ndarray, under: np.ndarray) -> np.ndarray:
     """Return one array divided by another; NaN where that is not positive."""
     return np.divide(over, under, out=np.full(np.shape(under), np.nan), where=under > 0)
-
-
-def _known_variance(values: np.ndarray) -> np.ndarray:
-    """Return the unbiased variance of the known values of each column of (R, M); NaN below two."""
-    count = np.isfinite(values).sum(0)
-    around = np.nan_to_num(values - known_mean(values))
-    return np.where(count > 1, (around**2).sum(0) / np.maximum(count - 1, 1), np.nan)
 
 
 def _repeated_variance(residual: np.ndarray) -> float:
@@ -456,9 +393,7 @@ def _differences(
 ) -> np.ndarray:
     """Return differences of pixels `lag` apart; NaN if one is unknown, or differs in brightness."""
     first, second = _shifted_pair(images, axis, lag)
-    if amplitude is None:
-        return second - first
-    return np.where(_alike(amplitude, axis, lag), second - first, np.nan)
+    return np.where(amplitude is None or _alike(amplitude, axis, lag), second - first, np.nan)
 
 
 def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: int) -> np.ndarray:
@@ -484,7 +419,7 @@ def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: i
 
 def _products(deviation: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:
     """Sum products of neighbouring deviations (R, H, W) from the mean of the repeats, (3, 2, 2)."""
-    sums = np.zeros((3, 2, 2))
+    sums = np.zeros((3, len(AXES), len(LAGS)))
     if len(deviation) < 2:
         return sums
     for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
@@ -503,23 +438,23 @@ def _differences_within(
     residual: np.ndarray,
     weight: np.ndarray,
     second: dict[int, np.ndarray],
-    patterns: dict[tuple[int, int], _BetweenPoses],
+    shared: dict[tuple[int, int], _BetweenPoses],
 ) -> np.ndarray:
     """Sum half squares of differences of neighbours, where there is a second difference too.
 
     Returns:
-        Shape (3, 2, 2); what poses share of both kinds of differences is added to `patterns`.
+        Shape (3, 2, 2); what poses share of both kinds of differences is added to `shared`.
     """
-    sums = np.zeros((3, 2, 2))
+    sums = np.zeros((3, len(AXES), len(LAGS)))
     for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
         found = _differences(residual, images.amplitude, axis, lag) / 2**0.5
         at, _ = _shifted_pair(second[axis], axis, lag)
         both = np.isfinite(found) & np.isfinite(at)
         sums[:, row, column] = (found[both] ** 2).sum(), (at[both] ** 2).sum(), both.sum()
         mean = known_mean(np.where(both, found, np.nan))
-        patterns[axis, lag].add(mean, _shifted_pair(weight, axis, lag)[0], images.place)
+        shared[axis, lag].add(mean, _shifted_pair(weight, axis, lag)[0], images.place)
     for axis in AXES:
-        patterns[axis, 0].add(known_mean(second[axis]), weight, images.place)
+        shared[axis, 0].add(known_mean(second[axis]), weight, images.place)
     return sums
 
 
@@ -527,46 +462,49 @@ def _rows(
     images: _PoseImages,
     residual: np.ndarray,
     second: dict[int, np.ndarray],
-    pose: int,
-    target: int,
-    height: int,
-) -> PixelTable:
+    numbers: tuple[int, int],
+    shape: tuple[int, int],
+) -> np.recarray:
     """Return the rows of the sampled pixels of a pose that look at the target.
 
     The sample is the same in every image, so that two recordings can be compared pixel by pixel.
+    `numbers` are those of pose and target, `shape` is that of the image.
     """
-    size = height * images.width
-    pixel = np.arange(size)
-    if size > _MOST_OF_POSE:
-        pixel = (np.arange(_MOST_OF_POSE) * (size / _MOST_OF_POSE)).astype(np.int64)
-    seen = np.zeros((height, images.width), dtype=bool)
+    seen = np.zeros(shape, dtype=bool)
     seen[images.place] = images.on_target.any(0)
+    step = max(seen.size / _MOST_OF_POSE, 1.0)
+    pixel = (np.arange(min(seen.size, _MOST_OF_POSE)) * step).astype(np.int64)
     pixel = pixel[seen.ravel()[pixel]]
-    row, column = np.divmod(pixel, images.width)
-    at = row - images.place[0].start, column - images.place[1].start
+    at = tuple(
+        each - side.start for each, side in zip(divmod(pixel, shape[1]), images.place, strict=True)
+    )
     chosen = (slice(None), *at)
-    values = residual[chosen]
+    values, on_target = residual[chosen], images.on_target[chosen]
     known = np.isfinite(values)
     amplitude = raw = np.full(len(pixel), np.nan)
     if images.amplitude is not None:
         strength = images.amplitude[chosen]
         amplitude = known_mean(np.where(known, strength, np.nan))
-        raw = known_mean(np.where(images.on_target[chosen], strength, np.nan))
-    return PixelTable(
-        pose=np.full(len(pixel), pose),
-        pixel=pixel,
-        distance=images.distance[at],
-        cosine=images.cosine[at],
-        target=np.full(len(pixel), target),
-        amplitude=amplitude,
-        raw_amplitude=raw,
-        of_repeats=_known_variance(values),
-        of_neighbours=known_mean(np.stack([known_mean(second[axis] ** 2)[at] for axis in AXES])),
-        of_nearest=_of_nearest(residual, images.amplitude)[at],
-        frames=images.on_target[chosen].sum(0),
-        missing=images.missing[chosen].sum(0),
-        saturated=images.saturated[chosen].sum(0),
-    )
+        raw = known_mean(np.where(on_target, strength, np.nan))
+    squares = np.nansum((values - known_mean(values)) ** 2, axis=0)
+    distance, cosine = images.distance[at], images.cosine[at]
+    columns = {
+        "pose": np.full(len(pixel), numbers[0]),
+        "pixel": pixel,
+        "distance": distance,
+        "cosine": cosine,
+        "signal": cosine / distance**2,
+        "target": np.full(len(pixel), numbers[1]),
+        "amplitude": amplitude,
+        "raw_amplitude": raw,
+        "of_repeats": quotient(squares, known.sum(0) - 1),
+        "of_neighbours": known_mean(np.stack([known_mean(second[k] ** 2)[at] for k in AXES])),
+        "of_nearest": _of_nearest(residual, images.amplitude)[at],
+        "frames": on_target.sum(0),
+        "missing": images.missing[chosen].sum(0),
+        "saturated": images.saturated[chosen].sum(0),
+    }
+    return np.rec.fromarrays(list(columns.values()), names=list(columns))
 
 
 def _of_nearest(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:

@@ -22,7 +22,7 @@ from tofcorr.diagnosis.report.words import (
 )
 from tofcorr.diagnosis.rerun.sensor import sensor_of
 from tofcorr.digits import decimals, known, known_interval
-from tofcorr.observables.by_pose import LEAST_P
+from tofcorr.observables.pairs import LEAST_P
 from tofcorr.options import dump_yaml
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 from tofcorr.simulation.effects import CATALOGUE

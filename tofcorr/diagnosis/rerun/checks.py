@@ -26,7 +26,7 @@ from tofcorr.files import scratch_folder
 from tofcorr.fit.fitting import fit_hand_eye, fit_model
 from tofcorr.fit.problem import FitOptions
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
-from tofcorr.observables import Observables, compare_observables
+from tofcorr.observables.compare import Observables, compare_observables
 from tofcorr.pixels.dataset import Dataset, HandEyeOptions, covered_domain
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.twin import Reflectivity, twin_frames

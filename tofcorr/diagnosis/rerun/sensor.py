@@ -27,7 +27,7 @@ from tofcorr.diagnosis.sums.observations import Observations, distance_images, p
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.observables import Observables, compare_observables
+from tofcorr.observables.compare import Observables, compare_observables
 from tofcorr.sensor.degrade import conditions_of_frames
 from tofcorr.sensor.model import SensorModel, SensorWarning
 from tofcorr.sensor.parts import section_of

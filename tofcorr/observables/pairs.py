@@ -1,0 +1,411 @@
+"""Pixels of a recording and of a simulated one that can be compared, and tests of their means.
+
+Poses are the unit of every interval and p-value: pixels of an image are no independent samples.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofcorr.estimation.robust import student_quantile
+from tofcorr.observables.read import Observed, pose_groups, quotient
+
+Interval = tuple[float, float]
+Random = np.random.Generator
+Pair = tuple[np.ndarray, np.ndarray]
+"""One array of the recording, one of the simulated one."""
+
+# Poses and planes agree if no entry differs by more than this, metres or no unit; so do entries of
+# K, pixels. Chosen: 0.1 mm and 0.1 mrad are what files in text keep, and less than robots repeat.
+_SAME_POSE, _SAME_K = 1e-4, 1e-3
+# Recordings are compared pose by pose if at least this share of the real poses has a partner, and
+# pixel by pixel then; otherwise as two samples. Chosen: the rest would be lost.
+_LEAST_SHARED = 0.8
+# Groups of brightness, of equal count in both recordings together, and the fewest pixels of one in
+# either. Chosen: noise changes by less than a tenth within one; fewer say too little of its mean.
+_GROUPS, _FEWEST = 20, 50
+# Resamples of the poses for an interval, and permutations for a p-value: they resolve 1/1000. As
+# many as are usual.
+_DRAWS = 999
+LEAST_P = 1 / (_DRAWS + 1)
+"""The smallest p-value that the draws can give. Derived: the data count as one draw more."""
+# Fewest poses for which anything is tested: five signs allow 32 flips, p-values of 0.06.
+_LEAST_POSES = 6
+
+
+def bootstrap(draw: Callable[[Random], float], num_poses: int, random: Random) -> Interval | None:
+    """Return the 95 % percentile interval of a statistic of resampled poses.
+
+    Args:
+        draw: Resamples the poses and returns the statistic.
+        num_poses: Number of poses of the smaller recording.
+        random: Source of the resamples.
+
+    Returns:
+        None with fewer than six poses, or where the statistic is not finite in most resamples.
+    """
+    if num_poses < _LEAST_POSES:
+        return None
+    drawn = np.array([draw(random) for _ in range(_DRAWS)])
+    if np.isfinite(drawn).mean() < 0.5:
+        return None
+    low, high = np.quantile(drawn[np.isfinite(drawn)], (0.025, 0.975)).tolist()
+    return low, high
+
+
+def sign_flip_p(differences: np.ndarray, random: Random) -> float | None:
+    """Return the two-sided p-value of paired differences having a mean of zero.
+
+    Under the null, real and simulated could be swapped in every pose.
+
+    Args:
+        differences: Of each pose, shape (P,); NaN is left out.
+        random: Source of the signs.
+    """
+    known = differences[np.isfinite(differences)]
+    if len(known) < _LEAST_POSES:
+        return None
+    signs = random.choice((-1.0, 1.0), size=(_DRAWS, len(known)))
+    return _share_beyond(signs @ known, known.sum())
+
+
+def permutation_p(real: np.ndarray, sim: np.ndarray, random: Random) -> float | None:
+    """Return the two-sided p-value of two samples of poses having the same mean.
+
+    Args:
+        real: Of each real pose, shape (P,); NaN is left out.
+        sim: Of each simulated pose, shape (Q,); NaN is left out.
+        random: Source of the permutations.
+    """
+    real, sim = real[np.isfinite(real)], sim[np.isfinite(sim)]
+    if min(len(real), len(sim)) < _LEAST_POSES:
+        return None
+    # Weights of both samples whose sum is the difference of the means.
+    weights = np.repeat([1 / len(real), -1 / len(sim)], [len(real), len(sim)])
+    both = np.concatenate([real, sim])
+    drawn = random.permuted(np.tile(weights, (_DRAWS, 1)), axis=1) @ both
+    return _share_beyond(drawn, weights @ both)
+
+
+def _share_beyond(drawn: np.ndarray, observed: float) -> float:
+    # The observed order is one of the possible ones. Equal values differ by rounding.
+    beyond = np.abs(drawn) >= abs(observed) * (1 - 1e-9)
+    return float((1 + beyond.sum()) / (len(drawn) + 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseSums:
+    """Sums of a quantity over the pixels of the poses of both recordings, in S groups.
+
+    Attributes:
+        total: Shapes (P, S) and (Q, S), in the unit of the quantity.
+        count: Number of pixels, of the same shapes.
+        left_out: Change of the logarithm of the quantity, shapes (P,) and (Q,), when a pose is left
+            out of factors that were estimated from all poses; 0: there are none.
+        paired: Whether row k of both is the same pose, and both hold the same pixels of it.
+    """
+
+    total: Pair
+    count: Pair
+    left_out: tuple[np.ndarray | float, np.ndarray | float] = (0.0, 0.0)
+    paired: bool
+
+    def means(self, *poses: np.ndarray | slice) -> Interval:
+        """Return the means of both at the real distribution over the groups that both have.
+
+        Args:
+            poses: Which poses count, of both, repeats allowed; all if they are not given.
+        """
+        poses = poses or (slice(None), slice(None))
+        (real, sim), (in_real, in_sim) = (
+            [each[chosen].sum(0) for each, chosen in zip(sums, poses, strict=True)]
+            for sums in (self.total, self.count)
+        )
+        both = (in_real > 0) & (in_sim > 0)
+        if not both.any():
+            return float("nan"), float("nan")
+        weight = in_real[both] / in_real[both].sum()
+        ratios = real[both] / in_real[both], sim[both] / in_sim[both]
+        return float(weight @ ratios[0]), float(weight @ ratios[1])
+
+    @property
+    def _num_poses(self) -> int:
+        return min(map(len, self.total))
+
+    def ratio_interval(self) -> Interval | None:
+        """Return the 95 % interval of the ratio of the means.
+
+        A jackknife over poses of the logarithm. Dark poses hold most of the variance, so that few
+        of many poses count: the degrees of freedom are those of Satterthwaite (1946), for poses
+        whose parts of the logarithm are as uncertain as their shares w of the sum are large,
+        (sum w^2)^2 / sum w^4 - 1. A percentile of resampled poses was too narrow there.
+
+        Returns:
+            None with fewer than six poses, or where the sum without one pose is not positive.
+        """
+        if self._num_poses < _LEAST_POSES:
+            return None
+        variance = below = 0.0
+        for sides in ([0, 1],) if self.paired else ([0], [1]):
+            logs, shares = self._without_each(sides)
+            part = (len(logs) - 1) * float(logs.var())
+            freedom = float((shares**2).sum() ** 2 / (shares**4).sum()) - 1.0
+            variance, below = variance + part, below + part**2 / max(freedom, 1.0)
+        real, sim = self.means()
+        if not (np.isfinite(variance) and real > 0 and sim > 0):
+            return None
+        freedom = variance**2 / below if below > 0 else np.inf
+        reach = np.exp(student_quantile(0.975, freedom) * variance**0.5)
+        return float(real / sim / reach), float(real / sim * reach)
+
+    def _without_each(self, sides: list[int]) -> Pair:
+        """Return the log ratio without each pose, and the poses' shares of the sum, both (P,).
+
+        Args:
+            sides: Which poses are left out: real ones, 0, simulated ones, 1, or both at once.
+        """
+        count = len(self.total[sides[0]])
+        logs = np.full(count, np.nan)
+        for pose in range(count):
+            rest = np.delete(np.arange(count), pose)
+            means = self.means(*(rest if side in sides else slice(None) for side in (0, 1)))
+            if min(means) > 0:
+                logs[pose] = np.log(means[0] / means[1])
+        own = np.zeros(count)
+        for side in sides:
+            logs += (1 - 2 * side) * np.asarray(self.left_out[side])
+            own += self.total[side].sum(1).clip(min=0) / self.total[side].sum()
+        return logs, own / own.sum()
+
+    def difference_interval(self, random: Random) -> Interval | None:
+        """Return the 95 % interval of the difference of the means, real less simulated."""
+
+        def difference(random: Random) -> float:
+            counts = list(map(len, self.total))
+            chosen = other = random.integers(counts[0], size=counts[0])
+            if not self.paired:
+                other = random.integers(counts[1], size=counts[1])
+            real, sim = self.means(chosen, other)
+            return real - sim
+
+        return bootstrap(difference, self._num_poses, random)
+
+    def ratio_p(self, random: Random) -> float | None:
+        """Return the p-value of the poses' ratios to what is expected being alike."""
+        logs = []
+        for total, expected, left_out in zip(
+            self.total, self._expected(), self.left_out, strict=True
+        ):
+            seen = total.sum(1)
+            share = np.where(seen > 0, quotient(seen, expected), np.nan)
+            # Pseudo-values of a jackknife: a factor that all poses share moves them together, and
+            # without this term they would seem to agree.
+            logs.append(np.log(share) - (len(seen) - 1) * (left_out - np.mean(left_out)))
+        return self._p(logs, random)
+
+    def difference_p(self, random: Random) -> float | None:
+        """Return the p-value of the poses' means, less what is expected, being alike."""
+        parts = zip(self.total, self._expected(), self.count, strict=True)
+        return self._p([quotient(t.sum(1) - e, count.sum(1)) for t, e, count in parts], random)
+
+    def _expected(self) -> Iterator[np.ndarray]:
+        """Yield the sum of each pose if every pixel had the mean of its group in both."""
+        total, count = (sum(part.sum(0) for part in each) for each in (self.total, self.count))
+        mean = np.nan_to_num(quotient(np.asarray(total), np.asarray(count)))
+        return (own @ mean for own in self.count)
+
+    def _p(self, values: list[np.ndarray], random: Random) -> float | None:
+        real, sim = values
+        return sign_flip_p(real - sim, random) if self.paired else permutation_p(real, sim, random)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Matched:
+    """What is compared: the same pixels of the same poses, or pixels of like brightness.
+
+    Attributes:
+        real: Pixels of the recording.
+        sim: Pixels of the simulated one; row by row the same if `paired`.
+        rows: Which rows of the recording's table they are.
+        columns: Which rows of the simulated one's.
+        groups: Group of each pixel of both; -1: not compared.
+        size: Number of groups.
+        poses: Simulated poses by the real ones that they equal; None: other poses.
+    """
+
+    real: np.recarray
+    sim: np.recarray
+    rows: np.ndarray
+    columns: np.ndarray
+    groups: Pair
+    size: int
+    poses: dict[int, int] | None
+
+    @property
+    def paired(self) -> bool:
+        """Whether both show the same poses."""
+        return self.poses is not None
+
+    def sums(
+        self,
+        real: np.ndarray,
+        sim: np.ndarray,
+        weights: Pair | None = None,
+        left_out: Pair | None = None,
+    ) -> PoseSums:
+        """Return the sums of a quantity by pose.
+
+        Args:
+            real: The quantity in each pixel of `real`, shape (M,); NaN: unknown.
+            sim: The same of `sim`.
+            weights: What each pixel counts in both; None: one.
+            left_out: Change of the logarithm of both when a pose is left out of factors estimated
+                from all poses, by their numbers; None: there are none.
+        """
+        counts = (np.ones(len(real)), np.ones(len(sim))) if weights is None else weights
+        changes, poses = left_out, (self.real.pose, self.sim.pose)
+        if self.poses is not None:
+            unknown = ~(np.isfinite(real) & np.isfinite(sim))
+            real, sim = np.where(unknown, np.nan, (real, sim))
+            poses = self.real.pose, self.real.pose
+            if left_out is not None:  # By the numbers that the sums have: those of real poses.
+                of_sim = np.zeros(len(left_out[0]))
+                of_sim[list(self.poses)] = left_out[1][list(self.poses.values())]
+                changes = left_out[0], of_sim
+        parts = []
+        for k, values in enumerate((real, sim)):
+            use = np.isfinite(values) & (self.groups[k] >= 0)
+            numbers, row = np.unique(poses[k][use], return_inverse=True)
+            place, shape = row * self.size + self.groups[k][use], (len(numbers), self.size)
+            weight = counts[k][use]
+            total, count = (
+                np.bincount(place, each, minlength=shape[0] * shape[1]).reshape(shape)
+                for each in (weight * values[use], weight)
+            )
+            parts.append((total, count, 0.0 if changes is None else changes[k][numbers]))
+        total, count, changed = zip(*parts, strict=True)
+        return PoseSums(total=total, count=count, left_out=changed, paired=self.paired)
+
+
+def matched(real: Observed, sim: Observed, amplitudes: Pair | None) -> Matched:
+    """Match the pixels of two recordings.
+
+    Args:
+        real: The recording.
+        sim: The simulated one.
+        amplitudes: Amplitude of each row of both tables, also of missing pixels, counts. None:
+            pixels of other poses are matched by cos / d^2, as amplitudes themselves must be.
+    """
+    tables = (real.table, sim.table)
+    poses = _shared_poses(real, sim)
+    if poses is not None:
+        rows, columns = _shared_pixels(*tables, poses)
+        alike = np.zeros(len(rows), dtype=np.int64)
+        groups, size = (alike, alike), 1
+    else:
+        rows, columns = (np.arange(len(table)) for table in tables)
+        names = [sorted(set(each.recording.frames.target.tolist())) for each in (real, sim)]
+        groups, size = _strata(tables, names, _relative_brightness(tables, amplitudes))
+    chosen = tables[0][rows], tables[1][columns]
+    return Matched(
+        real=chosen[0],
+        sim=chosen[1],
+        rows=rows,
+        columns=columns,
+        groups=groups,
+        size=size,
+        poses=poses,
+    )
+
+
+def _shared_poses(real: Observed, sim: Observed) -> dict[int, int] | None:
+    """Return the numbers of the simulated poses that equal real ones, by those of the real.
+
+    Returns:
+        None if the cameras differ or fewer than four fifths of the real poses were simulated.
+    """
+    cameras = [each.recording.camera for each in (real, sim)]
+    lenses = np.array([camera.matrix for camera in cameras])
+    same_size = real.map_frames.shape == sim.map_frames.shape
+    if not same_size or np.abs(np.diff(lenses, axis=0)).max() > _SAME_K:
+        return None
+    places = []  # Pose and plane of the first frame of each pose, (P, 20).
+    for recording in (real.recording, sim.recording):
+        first, table = [frames[0] for frames in pose_groups(recording)], recording.frames
+        poses = table.world_from_tool.reshape(len(table), 16)
+        every = np.column_stack([poses, table.normal_world, table.offset])
+        places.append(every[first])
+    found, free = {}, np.ones(len(places[1]), dtype=bool)
+    for number, place in enumerate(places[0]):
+        same = np.flatnonzero(free & (np.abs(places[1] - place).max(axis=1) <= _SAME_POSE))
+        if len(same):
+            found[number] = int(same[0])
+            free[same[0]] = False
+    return found if len(found) >= _LEAST_SHARED * len(places[0]) else None
+
+
+def _shared_pixels(real: np.recarray, sim: np.recarray, poses: dict[int, int]) -> Pair:
+    """Return the rows of the same pixels of the same poses in both tables, in the same order."""
+    renamed = np.full(max(int(sim.pose.max()), *poses.values()) + 1, -1)
+    renamed[list(poses.values())] = list(poses)
+    size = max(int(real.pixel.max()), int(sim.pixel.max())) + 1
+    keys = (real.pose * size + real.pixel, renamed[sim.pose] * size + sim.pixel)
+    _, rows, columns = np.intersect1d(*keys, return_indices=True)
+    return rows, columns
+
+
+def _relative_brightness(
+    tables: tuple[np.recarray, np.recarray], amplitudes: Pair | None
+) -> list[np.ndarray]:
+    """Return the brightness of pixels in a unit that two recordings share.
+
+    It is the amplitude over that of the same target, seen head-on at 1 m by the same camera: units
+    of amplitude differ between simulators. Without amplitudes in either it is cos / d^2.
+
+    Args:
+        tables: The pixels of both.
+        amplitudes: Of the pixels of both, counts; NaN where unknown; None: not to be used.
+    """
+    signals = [table.signal for table in tables]
+    if amplitudes is None or not all(np.isfinite(each).any() for each in amplitudes):
+        return signals
+    scaled = []
+    for signal, amplitude in zip(signals, amplitudes, strict=True):
+        known = np.isfinite(amplitude) & np.isfinite(signal)
+        # The brighter half: there a threshold takes no pixel away.
+        known &= signal >= np.median(signal[known]) if known.any() else False
+        scale = float(np.median(amplitude[known] / signal[known])) if known.any() else np.nan
+        scaled.append(amplitude / scale)
+    return scaled
+
+
+def _strata(
+    tables: tuple[np.recarray, np.recarray], names: list[list[str]], brightness: list[np.ndarray]
+) -> tuple[Pair, int]:
+    """Return the group of each pixel of both recordings, by brightness and target.
+
+    Args:
+        tables: The pixels of both.
+        names: Names of the targets of both, in alphabetical order.
+        brightness: Of the pixels of both, in one unit.
+
+    Returns:
+        Group numbers, shapes (M,), -1 for pixels without brightness, of a target that only one
+        recording has, or of a group with fewer than 50 pixels in either; and how many there are.
+    """
+    number = {name: k for k, name in enumerate(sorted(set(names[0]) & set(names[1])))}
+    size = _GROUPS * max(len(number), 1)
+    groups, counts = [], []
+    known = np.concatenate([values[np.isfinite(values)] for values in brightness])
+    edges = np.quantile(known, np.linspace(0, 1, _GROUPS + 1)[1:-1]) if len(known) else []
+    for table, own, values in zip(tables, names, brightness, strict=True):
+        place = np.searchsorted(edges, values)
+        if number:
+            of_target = np.array([number.get(name, -1) for name in own])[table.target]
+            place = np.where(of_target >= 0, of_target * _GROUPS + place, -1)
+        groups.append(np.where(np.isfinite(values), place, -1))
+        counts.append(np.bincount(groups[-1][groups[-1] >= 0], minlength=size))
+    enough = np.append((counts[0] >= _FEWEST) & (counts[1] >= _FEWEST), False)
+    first, second = (np.where(enough[group], group, -1) for group in groups)
+    return (first, second), size
