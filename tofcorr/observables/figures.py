@@ -42,11 +42,15 @@ def panels(
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     found = figure.subplots(rows, columns, squeeze=False, sharey=same_rows).ravel().tolist()
     for axes in found:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=8)
-        for words in (axes.xaxis.label, axes.yaxis.label):
-            words.set_fontsize(9)
+        _plain_look(axes)
     return figure, found
+
+
+def _plain_look(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8)
+    for words in (axes.xaxis.label, axes.yaxis.label):
+        words.set_fontsize(9)
 
 
 def line_across(axes: Axes, *, at: float = 0.0, vertical: bool = False) -> None:
@@ -70,19 +74,16 @@ def noise_figure(observables: Observables) -> Figure:
 
     At the same poses, both are drawn over the amplitude of the recording, pixel by pixel.
     """
-    both, compared = observables.both, observables.noise
+    both, compared = observables.both, observables.noise or {"ratio": None}
     real, sim = observables.noises or (observables.real_noise, None)
-    # A simulator without noise has no ratio.
-    ratio = None if compared is None else compared["ratio"]
-    with_ratio = ratio is not None
-    figure, found = panels(5 if with_ratio else 4, 2 if with_ratio else 1)
+    ratio = compared["ratio"]  # A simulator without noise has none.
+    figure, found = panels(4 if ratio is None else 5, 1 if ratio is None else 2)
     at = _brightness(real)
     seen = at[np.isfinite(at) & (at > 0)]
-    low, high = np.quantile(seen, (1 / 500, 1 - 1 / 500)) if len(seen) else (0.5, 2.0)
-    edges = np.geomspace(low, high if high > low else 2 * low, _POINTS + 1)
+    edges = _edges(seen, 1 / 500) if len(seen) else np.geomspace(0.5, 2.0, _POINTS + 1)
     sigma = _noise_points(found[0], at, real.variance, edges, (RED, "recording"))
     _noise_curve(found[0], real, edges, 1.0, RED)
-    if sim is not None and both is not None and compared is not None:
+    if sim is not None and both is not None:
         place, variance, scale = _brightness(sim), sim.variance, 1.0
         if both.paired:
             place, variance = at[both.rows], sim.variance[both.columns]
@@ -91,8 +92,7 @@ def noise_figure(observables: Observables) -> Figure:
         if sim.curve.needs_amplitude == real.curve.needs_amplitude:
             _noise_curve(found[0], sim, edges, scale, BLUE)
         if ratio is not None:
-            found[1].plot(_centres(edges), sigma / simulated, "o", color=GREY)
-            found[1].set_xscale("log")
+            found[1].semilogx(_centres(edges), sigma / simulated, "o", color=GREY)
             line_across(found[1], at=1.0)
             found[1].axhline(ratio, color=RED, linewidth=1)
             if compared["ratio_ci"] is not None:
@@ -101,8 +101,7 @@ def noise_figure(observables: Observables) -> Figure:
             found[1].set_ylim(bottom=0.0)
             found[1].set_xlim(found[0].get_xlim())
     found[0].set_ylabel("noise of a pixel, mm")
-    unit = "amplitude, counts" if real.curve.needs_amplitude else "distance, m"
-    found[-1].set_xlabel(unit)
+    found[-1].set_xlabel("amplitude, counts" if real.curve.needs_amplitude else "distance, m")
     found[0].legend(frameon=False)
     for axis in (found[0].yaxis, *(axes.xaxis for axes in found)):
         _plain_numbers(axis)
@@ -113,10 +112,8 @@ def _noise_points(
     axes: Axes, at: np.ndarray, variance: np.ndarray, edges: np.ndarray, look: tuple[str, str]
 ) -> np.ndarray:
     """Draw the noise in bins; return it in mm, NaN in bins of too few pixels or without noise."""
-    use = np.isfinite(at) & np.isfinite(variance)
-    mean, count = _binned(at[use], variance[use], edges)
-    enough = (count >= _FEWEST) & (np.nan_to_num(mean) > LEAST_VARIANCE)
-    sigma = 1e3 * np.sqrt(np.where(enough, mean, np.nan))
+    mean = _binned(at, variance, edges)
+    sigma = 1e3 * np.sqrt(np.where(mean > LEAST_VARIANCE, mean, np.nan))
     axes.loglog(_centres(edges), sigma, "o", color=look[0], markersize=5, label=look[1])
     return sigma
 
@@ -138,31 +135,29 @@ def _brightness(noise: NoiseMeasurement) -> np.ndarray:
 
 def dropout_figure(observables: Observables) -> Figure:
     """Draw the share of missing pixels over the amplitude, and over the image."""
-    compared = observables.dropouts
-    shown = [("recording", observables.real_dropouts, RED)]
-    shares = [observables.real_dropouts.share]
-    if observables.sim_dropouts is not None and compared is not None:
-        shown.append(("simulator", observables.sim_dropouts, BLUE))
+    real, sim = observables.real_dropouts, observables.sim_dropouts
+    shown = [("recording", real, RED, real.share)]
+    if sim is not None and observables.dropouts is not None:
         # Two recordings are compared over the pixels of both: the shares that the report states.
-        shares = [compared["real_share"], compared["sim_share"]]
-    with_amplitude = any(np.isfinite(each.amplitude).any() for _, each, _ in shown)
+        shares = observables.dropouts["real_share"], observables.dropouts["sim_share"]
+        shown = [("recording", real, RED, shares[0]), ("simulator", sim, BLUE, shares[1])]
+    with_amplitude = any(np.isfinite(each.amplitude).any() for _, each, *_ in shown)
     # The maps stand below the curves, so that the words can be read on a narrow page too.
     figure = Figure(figsize=(WIDTH, 5 if with_amplitude else 2), layout="constrained")
     parts = figure.subfigures(1 + with_amplitude, 1, squeeze=False).ravel().tolist()
     if with_amplitude:
         axes = parts[0].subplots()
-        for name, dropouts, colour in shown:
+        _plain_look(axes)
+        for name, dropouts, colour, _ in shown:
             _dropout_curve(axes, dropouts, colour, name)
-        axes.set_ylabel("pixels without distance, %", fontsize=9)
-        axes.set_xlabel("amplitude, counts", fontsize=9)
-        axes.tick_params(labelsize=8)
-        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_ylabel("pixels without distance, %")
+        axes.set_xlabel("amplitude, counts")
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False)
         _plain_numbers(axes.xaxis)
-    highest = max(100 * float(np.nanmax(each.map)) for _, each, _ in shown) or 1.0
+    highest = max(100 * float(np.nanmax(each.map)) for _, each, *_ in shown) or 1.0
     maps = parts[-1].subplots(1, len(shown), squeeze=False)[0]
-    for axes, (name, dropouts, _), share in zip(maps, shown, shares, strict=True):
+    for axes, (name, dropouts, _, share) in zip(maps, shown, strict=True):
         axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
         axes.set_title(f"{name}: {100 * share:.2f} % missing", fontsize=9)
         axes.set_axis_off()
@@ -172,17 +167,12 @@ def dropout_figure(observables: Observables) -> Figure:
 
 
 def _dropout_curve(axes: Axes, dropouts: DropoutMeasurement, colour: str, name: str) -> None:
-    table = dropouts.observed.table
-    use = np.isfinite(dropouts.amplitude) & (dropouts.amplitude > 0)
-    if not use.any():
+    table, lit = dropouts.observed.table, np.nan_to_num(dropouts.amplitude) > 0
+    if not lit.any():
         return
-    at = dropouts.amplitude[use]
-    low, high = np.quantile(at, (1 / 2000, 1 - 1 / 2000))
-    edges = np.geomspace(low, high, _POINTS + 1)
-    mean, count = _binned(at, table.missing[use] / table.frames[use], edges)
-    enough = count >= _FEWEST
-    shown = 100 * mean[enough]
-    axes.semilogx(_centres(edges)[enough], shown, "o", color=colour, markersize=4, label=name)
+    edges = _edges(dropouts.amplitude[lit], 1 / 2000)
+    share = 100 * _binned(dropouts.amplitude, table.missing / table.frames, edges)
+    axes.semilogx(_centres(edges), share, "o", color=colour, markersize=4, label=name)
     line = np.geomspace(edges[0], edges[-1], 200)
     axes.plot(line, 100 * dropouts.model.probability(line), color=colour)
 
@@ -192,24 +182,20 @@ def amplitude_figure(observables: Observables) -> Figure:
     both, compared = observables.both, observables.amplitude
     assert both is not None
     assert compared is not None
-    real, sim = both.real.amplitude, both.sim.amplitude
-    use = np.isfinite(real) & np.isfinite(sim) & (real > 0) & (sim > 0)
+    lit = (np.nan_to_num(both.real.amplitude) > 0) & (np.nan_to_num(both.sim.amplitude) > 0)
+    real, sim, ratio = both.real.amplitude[lit], both.sim.amplitude[lit], compared["ratio"]
     figure, (upper, lower) = panels(6, 2)
-    upper.hexbin(
-        *(sim[use], real[use]), xscale="log", yscale="log", gridsize=45, cmap="Greys", bins="log"
-    )
-    ends = np.array([sim[use].min(), sim[use].max()])
+    upper.hexbin(sim, real, xscale="log", yscale="log", gridsize=45, cmap="Greys", bins="log")
+    ends = np.array([sim.min(), sim.max()])
     upper.plot(ends, ends, color="black", linewidth=1, label="equal")
-    label = f"ratio {compared['ratio']:.3g}"
-    upper.plot(ends, compared["ratio"] * ends, color=RED, label=label)
+    upper.plot(ends, ratio * ends, color=RED, label=f"ratio {ratio:.3g}")
     upper.set_xlabel("simulated amplitude, counts")
     upper.set_ylabel("recorded amplitude, counts")
     upper.legend(frameon=False)
     for axis in (upper.xaxis, upper.yaxis):
         _plain_numbers(axis)
     shape = observables.real_dropouts.map.shape
-    ratio = np.log(real[use] / sim[use]) - np.log(compared["ratio"])
-    tiles = 100 * np.expm1(_tile_means(both.real.pixel[use], ratio, shape))
+    tiles = 100 * np.expm1(_tile_means(both.real.pixel[lit], np.log(real / sim / ratio), shape))
     limit = max(float(np.nanmax(np.abs(tiles))), 1.0)
     image = lower.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit)
     lower.set_title("ratio over the image, less its mean", fontsize=10)
@@ -228,18 +214,24 @@ def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -
     return quotient(total, count).reshape(rows, columns)
 
 
+def _edges(brightness: np.ndarray, beyond: float) -> np.ndarray:
+    """Return the edges of bins that all but a share of the pixels at either end lie in."""
+    low, high = np.quantile(brightness, (beyond, 1 - beyond))
+    return np.geomspace(low, high if high > low else 2 * low, _POINTS + 1)
+
+
 def _centres(edges: np.ndarray) -> np.ndarray:
     """Return the geometric centres of bins."""
     return np.sqrt(edges[1:] * edges[:-1])
 
 
-def _binned(at: np.ndarray, values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and number of the values in each bin; NaN in an empty one."""
-    place = np.searchsorted(edges, at, side="right") - 1
-    inside = (place >= 0) & (place < len(edges) - 1)
-    count = np.bincount(place[inside], minlength=len(edges) - 1)
-    total = np.bincount(place[inside], values[inside], minlength=len(edges) - 1)
-    return quotient(total, count), count
+def _binned(at: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the mean of the known values in each bin; NaN in one of too few pixels."""
+    inside = np.isfinite(values) & (at >= edges[0]) & (at < edges[-1])
+    place = np.searchsorted(edges, at[inside], side="right") - 1
+    count = np.bincount(place, minlength=_POINTS)
+    mean = quotient(np.bincount(place, values[inside], minlength=_POINTS), count)
+    return np.where(count >= _FEWEST, mean, np.nan)
 
 
 def _plain_numbers(axis: Axis) -> None:
