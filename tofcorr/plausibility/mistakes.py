@@ -1,4 +1,4 @@
-"""The usual mistakes in poses, planes and images: one list of (cause, advice, undo), and one judge.
+"""The usual mistakes in poses, planes and images: one list of what undoes them, and one judge.
 
 Does one of them, undone, explain why points miss their planes? `importing` undoes some of them
 before a recording is written, and words its advice by its own options.
@@ -6,6 +6,7 @@ before a recording is written, and words its advice by its own options.
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,32 +18,117 @@ from tofcorr.plausibility.look import Look
 FAR_BETTER = 0.5
 """A mistake is named if undoing it leaves at most this share of the misfit. Chosen: a mistake
 undone leaves a third and less, a second mistake nearly all."""
-SHIFTS = (1, -1, 2, -2)
-"""Rows by which poses and images may be shifted against each other. Chosen."""
-# Units that translations, offsets and depth come in, as factors to metres.
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
 
 
-class Explanation(NamedTuple):
-    """A mistake, undone.
+class Mistake(NamedTuple):
+    """A usual mistake in poses or images.
 
     Attributes:
-        cause: What the mistake is, to follow "the likely cause: ".
+        cause: What it is, to follow "the likely cause: ".
         advice: What to do.
-        found: The alignment once it is undone.
-        fatal: Whether a fit would be meaningless if it is the cause.
-        frees: Whether undoing it frees unknowns, so that some of the misfit falls in any case.
+        undo: Returns poses or images without it.
     """
 
     cause: str
     advice: str
-    found: Alignment
-    fatal: bool = True
-    frees: bool = False
+    undo: Callable[[np.ndarray], np.ndarray]
 
 
-Undo = Callable[[], Scene | Alignment | None]
-_Mistake = tuple[str, str, Undo]
+def reordered(poses: np.ndarray) -> np.ndarray:
+    """Return the poses whose quaternions, read as x y z w, were written as w x y z."""
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    changed = poses.copy()
+    changed[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
+    return changed
+
+
+def transposed(poses: np.ndarray) -> np.ndarray:
+    """Return the poses with their rotations inverted, their translations as they are."""
+    changed = poses.copy()
+    changed[:, :3, :3] = poses[:, :3, :3].mT
+    return changed
+
+
+def scaled(poses: np.ndarray, factor: float) -> np.ndarray:
+    """Return the poses with their translations multiplied."""
+    changed = poses.copy()
+    changed[:, :3, 3] *= factor
+    return changed
+
+
+def of_other_axes(poses: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the poses in a world, and of a tool, whose axes are the rows of a (4, 4) matrix."""
+    return axes @ poses @ axes.T
+
+
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
+_AXES = {
+    **{f"{'xyz'[axis]} turned round": np.diag((-1.0) ** np.eye(4)[axis]) for axis in range(3)},
+    "y and z exchanged": np.eye(4)[[0, 2, 1, 3]],
+    "x and y exchanged": np.eye(4)[[1, 0, 2, 3]],
+    "x and z exchanged": np.eye(4)[[2, 1, 0, 3]],
+}
+_DRIVER = "undo the driver's flip before writing"
+IN_POSES: dict[str, Mistake] = {
+    "inverted": Mistake(
+        "the poses are tool_from_world, the inverse of what the format asks for",
+        "invert them",
+        np.linalg.inv,
+    ),
+    "quaternions": Mistake(
+        "the quaternions are stored as w, x, y, z", "write them as qx, qy, qz, qw", reordered
+    ),
+    "rotations": Mistake(
+        "the rotations are inverted and the translations are not",
+        "write world_from_tool",
+        transposed,
+    ),
+    **{
+        f"shifted {rows:+d}": Mistake(
+            f"poses and images are shifted by {words} against each other",
+            "pair them again: an image or a pose was dropped",
+            partial(np.roll, shift=rows, axis=0),
+        )
+        for rows, words in {1: "1 row", -1: "1 row", 2: "2 rows", -2: "2 rows"}.items()
+    },
+    "reversed": Mistake(
+        "the poses are in the opposite order of the images", "reverse one of them", np.flipud
+    ),
+    **{
+        name: Mistake(
+            f"the poses are of a left-handed world ({name})",
+            "convert them to a right-handed frame before writing",
+            partial(of_other_axes, axes=axes),
+        )
+        for name, axes in _AXES.items()
+    },
+    **{
+        f"in {unit}": Mistake(
+            f"the translations are in {unit}",
+            f"{'divide' if factor < 1 else 'multiply'} tx, ty, tz",
+            partial(scaled, factor=factor),
+        )
+        for unit, factor in (*_UNITS.items(), ("kilometres", 1e3))
+    },
+}
+"""Mistakes in poses (N, 4, 4) by name, the likely ones first."""
+IN_IMAGES: dict[str, Mistake] = {
+    "mirrored": Mistake("the images are mirrored left to right", _DRIVER, np.fliplr),
+    "upside down": Mistake("the images are turned upside down", _DRIVER, np.flipud),
+    "transposed": Mistake(
+        "the images are transposed: rows are columns", "transpose them before writing", np.transpose
+    ),
+}
+"""The same in images (H, W), whatever their pixels hold. Each undoes itself."""
+IN_DEPTH: dict[str, Mistake] = {
+    f"in {unit}": Mistake(f"the depth is in {unit}", "write metres", partial(np.multiply, factor))
+    for unit, factor in (("feet", 0.3048), *_UNITS.items())
+}
+"""The same in depths, of any shape."""
+
+Explanation = tuple[str, str, Alignment, bool]
+"""What the mistake is, to follow "the likely cause: ", what to do, the alignment without it, and
+whether undoing it frees unknowns, so that some of the misfit falls in any case."""
 
 
 def best_explanations(
@@ -64,176 +150,83 @@ def best_explanations(
     given = look.given
     most = min(FAR_BETTER * given.badness, max(acceptable, times_flat * look.flatness))
     better = [
-        one
-        for one in explanations(look)
-        if one.found.badness <= most
-        and given.badness - one.found.badness > gain
-        and (not one.frees or one.found.misfit <= FAR_BETTER * given.misfit)
+        (cause, advice, found, frees)
+        for cause, advice, found, frees in explanations(look)
+        if found.badness <= most
+        and given.badness - found.badness > gain
+        and (not frees or found.misfit <= FAR_BETTER * given.misfit)
     ]
-    least = min((one.found.badness for one in better), default=0.0)
-    return [one for one in better if one.found.badness <= as_good * least]
+    least = min((found.badness for *_, found, _ in better), default=0.0)
+    return [one for one in better if one[2].badness <= as_good * least]
 
 
 def explanations(look: Look) -> Iterator[Explanation]:
-    """Yield every mistake that can be undone, with the misfit that is left then."""
-    for cause, advice, undo in (*_of_poses(look), *_of_planes(look), *_of_images(look)):
-        undone = undo()
-        found = look.aligned(undone) if isinstance(undone, Scene) else undone
-        if found is not None and len(found.rms):
-            # Planes that are a few degrees off are no reason to refuse a recording.
-            fatal = cause != _WRONG_PLANES
-            yield Explanation(cause, advice, found, fatal, frees=not isinstance(undone, Scene))
+    """Yield every mistake that can be undone, with the alignment then."""
+    for cause, advice, scene in (*_of_poses(look), *_of_planes(look)):
+        if (found := look.aligned(scene)) is not None:
+            yield cause, advice, found, False
+    for cause, advice, alignment in _of_unknowns(look):
+        if alignment is not None:
+            yield cause, advice, alignment, True
+    for cause, advice, scene in _of_images(look):
+        if (found := look.aligned(scene)) is not None:
+            yield cause, advice, found, False
 
 
-def reordered(poses: np.ndarray) -> np.ndarray:
-    """Return the poses whose quaternions, read as x y z w, were written as w x y z."""
-    changed = poses.copy()
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    changed[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
-    return changed
-
-
-def transposed(poses: np.ndarray) -> np.ndarray:
-    """Return the poses with their rotations inverted, their translations as they are."""
-    changed = poses.copy()
-    changed[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-    return changed
-
-
-def mirrored(poses: np.ndarray, axis: int) -> np.ndarray:
-    """Return the poses of a world with one axis turned round."""
-    sign = np.where(np.arange(4) == axis, -1.0, 1.0)
-    return sign[:, None] * poses * sign
-
-
-def exchanged(poses: np.ndarray, first: int, second: int) -> np.ndarray:
-    """Return the poses of a world with two axes exchanged."""
-    order = np.arange(4)
-    order[[first, second]] = order[[second, first]]
-    return poses[:, order][:, :, order]
-
-
-def scaled(poses: np.ndarray, factor: float) -> np.ndarray:
-    """Return the poses with their translations multiplied."""
-    changed = poses.copy()
-    changed[:, :3, 3] *= factor
-    return changed
-
-
-def _of_poses(look: Look, narrowest: float = 0.02) -> Iterator[_Mistake]:
-    """Yield mistakes in poses; a unit is not tried that leaves an extent below `narrowest`, m."""
-    scene, poses = look.scene, look.scene.poses
+def _of_poses(look: Look, narrowest: float = 0.02) -> Iterator[tuple[str, str, Scene]]:
+    """Yield mistakes in poses; none that shrinks them to an extent below `narrowest`, metres."""
+    scene = look.scene
     if not scene.moves:
         return
-    shifts = [shift for shift in SHIFTS if len(poses) > 3 + 2 * abs(shift)]
-    left, convert = "the poses are of a left-handed world", "convert them to a right-handed frame"
-    extent = float(np.ptp(poses[:, :3, 3], axis=0).max())
-    changes: list[tuple[str, str, Callable[[np.ndarray], np.ndarray]]] = [
-        (
-            "the poses are tool_from_world, the inverse of what the format asks for",
-            "invert them",
-            np.linalg.inv,
-        ),
-        ("the quaternions are stored as w, x, y, z", "write them as qx, qy, qz, qw", reordered),
-        (
-            "the rotations are inverted and the translations are not",
-            "write world_from_tool",
-            transposed,
-        ),
-        (
-            "the poses are in the opposite order of the images",
-            "reverse one of them",
-            lambda poses: poses[::-1],
-        ),
-        *(
-            (
-                f"{left} ({'xyz'[axis]} turned round)",
-                f"{convert} before writing",
-                lambda poses, axis=axis: mirrored(poses, axis),
-            )
-            for axis in range(3)
-        ),
-        *(
-            (
-                f"{left} ({'xyz'[one]} and {'xyz'[other]} exchanged)",
-                f"{convert} before writing",
-                lambda poses, one=one, other=other: exchanged(poses, one, other),
-            )
-            for one, other in ((1, 2), (0, 1), (0, 2))
-        ),
-        *(
-            (
-                f"the translations are in {unit}",
-                "divide tx, ty, tz",
-                lambda poses, factor=factor: scaled(poses, factor),
-            )
-            for unit, factor in _UNITS.items()
-            if factor * extent >= narrowest
-        ),
-        (
-            "the translations are in kilometres",
-            "multiply tx, ty, tz",
-            lambda poses: scaled(poses, 1000.0),
-        ),
-    ]
-    undone = [
-        (cause, advice, lambda change=change: replace(scene, poses=change(poses)))
-        for cause, advice, change in changes
-    ]
-    shifted = [
-        (
-            f"poses and images are shifted by {abs(shift)} row{'s' if abs(shift) > 1 else ''} "
-            "against each other",
-            "pair them again: an image or a pose was dropped",
-            lambda shift=shift: _shifted(scene, shift),
+    narrowest = min(narrowest, float(np.ptp(scene.poses[:, :3, 3], axis=0).max()))
+    for name, (cause, advice, undo) in IN_POSES.items():
+        poses = undo(scene.poses)
+        # Frames at the end have no pose of theirs.
+        too_few = name.startswith("shifted") and len(poses) <= 3 + 2 * abs(int(name[-2:]))
+        if not too_few and np.ptp(poses[:, :3, 3], axis=0).max() >= narrowest:
+            yield cause, advice, replace(scene, poses=poses)
+
+
+def _of_planes(look: Look) -> Iterator[tuple[str, str, Scene]]:
+    scene = look.scene
+    if look.planes == "known":
+        yield (
+            "the planes' normals nx, ny, nz point the wrong way and d does not",
+            "turn nx, ny, nz round",
+            replace(scene, normal=-scene.normal),
         )
-        for shift in shifts
-    ]
-    yield from (*undone[:3], *shifted, *undone[3:])
+        for unit, factor in _UNITS.items():
+            offset = factor * scene.offset
+            what = f"the planes' offsets d are in {unit}"
+            yield what, "write d in metres", replace(scene, offset=offset)
 
 
-def _shifted(scene: Scene, shift: int) -> Scene:
-    """Return the frames that have a pose `shift` rows on, with that pose and their own plane."""
-    number = np.arange(len(scene.poses))
-    inside = (number + shift >= 0) & (number + shift < len(number))
-    return replace(scene.some(inside), poses=scene.poses[number[inside] + shift])
+WRONG_PLANES = "the recorded planes are wrong or of another frame"
+"""Planes that are a few degrees off are no reason to refuse a recording."""
 
 
-_WRONG_PLANES = "the recorded planes are wrong or of another frame"
-
-
-def _of_planes(look: Look) -> Iterator[_Mistake]:
+def _of_unknowns(look: Look) -> Iterator[tuple[str, str, Alignment | None]]:
+    """Yield mistakes in what a fit takes as known."""
     scene = look.scene
     if look.planes != "known":
         return
     yield (
-        "the planes' normals nx, ny, nz point the wrong way and d does not",
-        "turn nx, ny, nz round",
-        lambda: replace(scene, normal=-scene.normal),
-    )
-    for unit, factor in _UNITS.items():
-        yield (
-            f"the planes' offsets d are in {unit}",
-            "write d in metres",
-            lambda factor=factor: replace(scene, offset=factor * scene.offset),
-        )
-    yield (
-        _WRONG_PLANES,
+        WRONG_PLANES,
         "measure them again, or train with `planes: unknown`",
-        lambda: align_with_free_walls(scene),
+        align_with_free_walls(scene),
     )
     if scene.moves:
         yield (
             "two cameras, or one camera mounted twice, are in one recording",
             "split it where the camera was changed",
-            lambda: _in_two_parts(look),
+            _in_two_parts(look),
         )
     else:
         yield (
             "the planes are not in the camera's frame, which a recording without robot poses asks "
             "for",
             "write the planes in camera coordinates, or the robot's poses",
-            lambda: look.aligned(replace(scene, moves=True)),
+            look.aligned(replace(scene, moves=True)),
         )
 
 
@@ -242,12 +235,10 @@ def _in_two_parts(look: Look, fewest: int = 6) -> Alignment | None:
 
     Either side has `fewest` frames at least: seven unknowns, three from a frame.
     """
-    scene, count = look.scene, len(look.scene.poses)
-    found: list[Alignment] = []
+    scene, number, found = look.scene, np.arange(len(look.scene.poses)), []
     for share in (1 / 2, 1 / 4, 3 / 4, 1 / 3, 2 / 3):
-        cut = round(share * count)
-        if min(cut, count - cut) >= fewest:
-            before = np.arange(count) < cut
+        before = number < round(share * len(number))
+        if min(before.sum(), (~before).sum()) >= fewest:
             sides = [look.aligned(scene.some(part)) for part in (before, ~before)]
             known = [side for side in sides if side is not None]
             if len(known) == 2:
@@ -257,50 +248,34 @@ def _in_two_parts(look: Look, fewest: int = 6) -> Alignment | None:
     return min(found, key=lambda one: one.misfit, default=None)
 
 
-def _of_images(look: Look, nearest: float = 0.1) -> Iterator[_Mistake]:
-    """Yield mistakes in images; a unit is not tried that leaves a distance below `nearest`, m."""
-    sample = look.sample
-    height, width = sample.recording.camera.height, sample.recording.camera.width
-    if height * width < 4:
+def _of_images(
+    look: Look, nearest: float = 0.1, fewest: int = 12
+) -> Iterator[tuple[str, str, Scene]]:
+    """Yield mistakes in images.
+
+    Args:
+        look: The recording.
+        nearest: A unit is not tried that leaves a distance below it, metres: a camera that shrinks
+            to a point misses no plane.
+        fewest: Pixels off the mask that most frames must have to say that it is inverted: any
+            plane fits the few that a right mask leaves off the target.
+    """
+    sample, camera = look.sample, look.sample.recording.camera
+    if camera.height * camera.width < 4:
         return
-    row, column = np.divmod(sample.pixel, width)
-    flips = {
-        "mirrored left to right": (row, width - 1 - column),
-        "turned upside down": (height - 1 - row, column),
-    }
-    for words, (r, c) in flips.items():
-        yield (
-            f"the images are {words}",
-            "undo the driver's flip before writing",
-            lambda pixel=r * width + c: look.with_images(sample.stored, pixel),
-        )
-    if height == width:
-        yield (
-            "the images are transposed: rows are columns",
-            "transpose them before writing",
-            lambda: look.with_images(sample.stored, column * width + row),
-        )
-    typical = float(np.nanmedian(sample.stored))
-    for unit, factor in {"feet": 0.3048, **_UNITS}.items():
-        # A camera that shrinks to a point misses no plane.
-        if factor * typical >= nearest:
-            yield (
-                f"the depth is in {unit}",
-                "write metres",
-                lambda factor=factor: look.with_images(factor * sample.stored, sample.pixel),
-            )
-    off, off_pixel = sample.off_mask, sample.off_pixel
-    if off is not None and off_pixel is not None and _seen(off):
+    number = np.arange(camera.height * camera.width).reshape(camera.height, camera.width)
+    for cause, advice, undo in IN_IMAGES.values():
+        if (undone := undo(number)).shape == number.shape:
+            pixel = undone.reshape(-1)[sample.pixel]
+            yield cause, advice, look.with_images(sample.stored, pixel)
+    for cause, advice, undo in IN_DEPTH.values():
+        if np.nanmedian(depth := undo(sample.stored)) >= nearest:
+            yield cause, advice, look.with_images(depth, sample.pixel)
+    off = sample.off_mask
+    if off is not None and (np.isfinite(off).sum(axis=1) >= fewest).mean() > 0.5:
+        assert sample.off_pixel is not None
         yield (
             "the mask is inverted: it is 0 on the target",
             "write 1 where a pixel looks at the target",
-            lambda: look.with_images(off, off_pixel),
+            look.with_images(off, sample.off_pixel),
         )
-
-
-def _seen(off: np.ndarray, fewest: int = 12) -> bool:
-    """Return whether most frames have enough pixels (F, P) off the mask to say it is inverted.
-
-    Any plane fits the few pixels that a right mask leaves off the target.
-    """
-    return bool((np.isfinite(off).sum(axis=1) >= fewest).mean() > 0.5)

@@ -19,7 +19,7 @@ from tofcorr.plausibility.alignment import distinct, walls_of
 from tofcorr.plausibility.finding import Finding, Severity, in_words
 from tofcorr.plausibility.linear import Estimate, length_scale
 from tofcorr.plausibility.look import Look
-from tofcorr.plausibility.mistakes import Explanation, best_explanations
+from tofcorr.plausibility.mistakes import WRONG_PLANES, Explanation, best_explanations
 from tofcorr.plausibility.mounting import FEWEST_FOR_PARTS, FEWEST_FOR_STEP, CameraStep
 
 FAR_OFF = 0.1
@@ -413,17 +413,18 @@ def _explained(
     Where only the planes are wrong, a fit is meaningless from `of_planes` metres or `turned_deg`
     on: planes a few degrees off are what `diagnose` finds as target_registration.
     """
-    one, given = named[0], look.given
+    (cause, advice, found, frees), given = named[0], look.given
     # A mirrored image and a mirrored world look alike; say both.
-    other = next((more for more in named if more.advice != one.advice and not more.frees), None)
-    also = f" (as likely: {other.cause})" if other is not None and not one.frees else ""
-    turned = not one.fatal and math.degrees(given.typical_angle) > turned_deg
-    meaningless = given.badness > (_MEANINGLESS if one.fatal else of_planes) or turned
+    others = [more for more, other, _, freed in named if other != advice and not freed]
+    also = f" (as likely: {others[0]})" if others and not frees else ""
+    fatal = cause != WRONG_PLANES
+    turned = not fatal and math.degrees(given.typical_angle) > turned_deg
+    meaningless = given.badness > (_MEANINGLESS if fatal else of_planes) or turned
     return Finding(
         "agreement",
         "impossible" if meaningless else "doubtful",
-        f"{_misfit(look)}, and by {_mm(one.found.misfit)} if one mistake is undone: {one.cause}"
-        f"{also}; {one.advice}.",
+        f"{_misfit(look)}, and by {_mm(found.misfit)} if one mistake is undone: {cause}"
+        f"{also}; {advice}.",
         spoils=True,
     )
 
