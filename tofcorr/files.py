@@ -17,6 +17,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from types import TracebackType
@@ -403,25 +404,22 @@ def _digest(archive: zipfile.ZipFile) -> str:
 class NewPath(click.Path):
     """The name of a folder or file that a command makes anew; nothing may be there yet."""
 
+    refuse: Callable[[Path], object] = staticmethod(refuse_existing)
+    called = "path"
+
     def __init__(self) -> None:
         super().__init__(path_type=Path)
+        self.name = self.called
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        """Return the path; raise CalibrationDataError if something is there."""
+        """Return the path; raise CalibrationDataError or ExportError if it cannot be written."""
         path = Path(str(super().convert(value, param, ctx)))
-        refuse_existing(path)
+        self.refuse(path)
         return path
 
 
-class ReplacedFile(click.Path):
+class ReplacedFile(NewPath):
     """The name of a file that a command writes; an older one is replaced."""
 
-    def __init__(self) -> None:
-        super().__init__(path_type=Path)
-        self.name = "file"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        """Return the path; raise ExportError if no file can be written there."""
-        path = Path(str(super().convert(value, param, ctx)))
-        file_to_replace(path, ExportError)
-        return path
+    called = "file"
+    refuse = staticmethod(partial(file_to_replace, kind=ExportError))

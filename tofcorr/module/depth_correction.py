@@ -34,7 +34,7 @@ from tofcorr.errors import CalibrationDataError, ConfigError, StateError
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.files import refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
-from tofcorr.module.report import FitReport
+from tofcorr.module.fitting import FitReport, fit_to
 from tofcorr.options import Options, PositiveNumber, load_options, one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, covered_domain, opened
 from tofcorr.training.options import TrainingOptions
@@ -218,8 +218,6 @@ class DepthCorrection(FrameCorrection):
             CalibrationDataError: The recordings are of another camera, or cannot support the model.
             ConfigError: A change is not allowed.
         """
-        from tofcorr.module.fitting import fit_to
-
         dataset = open_dataset(recordings, self.camera)
         options = resolve_options(TrainingOptions, self.options, changes)
         state, report = fit_to(dataset, options, watcher, force=force)
