@@ -18,7 +18,7 @@ from tofcorr.errors import ConfigError
 LARGEST_NUMBER = 1e12
 """Largest number read from a file, in the file's own unit. Chosen: a hundred times the fastest
 modulation of light, 10 GHz, which is the largest quantity here; its cube still fits a float32."""
-SMALLEST_POSITIVE = 1e-12
+SMALLEST_POSITIVE = LARGEST_NUMBER**-1
 """Smallest positive number read where zero is not allowed, in the file's own unit. The reciprocal
 of `LARGEST_NUMBER`: nothing that is divided by it overflows."""
 LARGEST_DEGREE = 30

@@ -1,4 +1,4 @@
-"""Files of a calibration whose content was changed and saved again: each is refused in words.
+"""A calibration survives its file; one that was changed and saved again is refused in words.
 
 Most of these once ended in a traceback, far from the file: `python -m benchmarks.fuzz` found them.
 """
@@ -12,16 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from correction.export.states import TRANSFORMS, calibration
+from correction.export.states import ACCURACY, EYE_TO_HAND, TRANSFORMS, calibration, write
 
 import tofcorr
-from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.lut import export_lut
-from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.lookup import read_lut
 from tofcorr.correction.metadata import load_corrector
 from tofcorr.correction.state import load_calibration, save_calibration
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.camera import FrameNames
 
 Change = Callable[[dict[str, Any]], Any]
 
@@ -77,6 +75,23 @@ STATES: dict[str, tuple[Change, str]] = {
     "two noises": (put("noise", (1.0, 2.0)), "'noise.2' is missing|'noise'"),
     "a covariance of a row": (put("covariance", torch.ones(10).double()), r"expected shape \(K"),
 }
+
+
+def test_a_calibration_survives_its_file_and_an_older_one_is_read(tmp_path: Path) -> None:
+    accuracy = ACCURACY.model_copy(update={"undetermined": ("t_z and c0 together (corr +0.99)",)})
+    changed = {"frames": EYE_TO_HAND, "hand_eye_accuracy": accuracy, "saturation_amplitude": 800.0}
+    state = calibration(TRANSFORMS["general"], **changed)
+    save_calibration(tmp_path / "state.pt", state)
+    found = load_calibration(tmp_path / "state.pt")
+    for name in type(state).model_fields:
+        one, expected = getattr(found, name), getattr(state, name)
+        same = torch.equal(one, expected) if isinstance(expected, torch.Tensor) else one == expected
+        assert same, name
+    values = torch.load(tmp_path / "state.pt", weights_only=True)
+    del values["frames"], values["hand_eye_accuracy"]
+    torch.save(values, tmp_path / "old.pt")
+    old = load_calibration(tmp_path / "old.pt")
+    assert (old.frames, old.hand_eye_accuracy) == (FrameNames(), None)
 
 
 @pytest.mark.parametrize("name", STATES)
@@ -140,7 +155,7 @@ def test_a_corrector_with_one_changed_byte_is_refused(tmp_path: Path) -> None:
     # torch.jit.load reads it without a word, and corrects by other coefficients.
     state = calibration(TRANSFORMS["general"])
     path = tmp_path / "corrector.ts"
-    export_torchscript(DepthCorrector.from_state(state), path, state)
+    write("torchscript", state, path)
     load_corrector(path)
     content = path.read_bytes()
     at = content.index(b"data/0") + 100
@@ -151,7 +166,7 @@ def test_a_corrector_with_one_changed_byte_is_refused(tmp_path: Path) -> None:
 
 def test_a_table_whose_arrays_or_metadata_were_changed_is_refused(tmp_path: Path) -> None:
     state = calibration(TRANSFORMS["general"], depth_kind="radial")
-    export_lut(DepthCorrector.from_state(state), tmp_path / "whole.npz", state)
+    write("lut", state, tmp_path / "whole.npz")
     read_lut(tmp_path / "whole.npz")
     with np.load(tmp_path / "whole.npz") as file:
         arrays = dict(file)

@@ -139,6 +139,24 @@ def test_a_missing_return_gives_nan_and_is_not_valid(kind: str) -> None:
     assert torch.equal(module.valid(with_missing(depth), amplitude), expected.isfinite())
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_beyond_the_ranges_the_error_is_that_of_their_edges(kind: str) -> None:
+    module = module_of(kind, saturation_amplitude=5000.0)
+    ranges = module.error_model.limits(module.domain)
+    near, far = ranges.radial_distance
+    weak, strong = module.domain.amplitude or ranges.radial_distance
+    outside = torch.tensor([0.9 * near, 1.1 * far, near, near, near]).double()[:, None, None]
+    strength = torch.tensor([weak, weak, 0.9 * weak, 1.1 * strong, 5000.0]).double()[:, None, None]
+    frames_outside = [value.expand(5, 5, 7) for value in (outside, strength)]
+    edges = outside.clamp(near, far), strength.clamp(weak, strong)
+    if kind != "residual_network":  # It fades to zero outside in place of staying as it is.
+        at_edge = module.error(*(value.expand(5, 5, 7) for value in edges))
+        torch.testing.assert_close(module.error(*frames_outside), at_edge, rtol=0, atol=1e-12)
+    needed = module.error_model.needs_amplitude()
+    expected = [False, False, not needed, not needed, False]
+    assert module.valid(*frames_outside)[:, 0, 0].tolist() == expected
+
+
 @pytest.mark.parametrize("kind", TERMS)
 def test_amplitudes_are_needed_where_a_term_says_so(kind: str) -> None:
     module = module_of(kind)

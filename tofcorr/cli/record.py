@@ -95,9 +95,10 @@ def _transform(values: tuple[float, ...] | None, key: str) -> "np.ndarray | None
     import numpy as np
     from scipy.spatial.transform import Rotation
 
+    from tofcorr.data.table import UNIT_LENGTH_TOLERANCE
     from tofcorr.errors import ConfigError
 
-    if abs(float(np.linalg.norm(values[3:])) - 1) > 1e-3:
+    if abs(float(np.linalg.norm(values[3:])) - 1) > UNIT_LENGTH_TOLERANCE:
         named = f"--{key.replace('_', '-')}"
         raise ConfigError(f"{named}: the last four numbers are no unit quaternion x y z w.")
     transform = np.eye(4)

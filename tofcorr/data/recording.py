@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray, frame_chunks, open_array, read_frames
-from tofcorr.data.table import COLUMN_OF, TABLE_FILE, FrameTable, read_table
+from tofcorr.data.table import COLUMN_OF, TABLE_FILE, UNIT_LENGTH_TOLERANCE, FrameTable, read_table
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
 from tofcorr.geometry.rays import plane_in_frame, radial_distance_from_z_depth, ray_directions
@@ -25,10 +25,6 @@ PlaneOrigin = Literal["recorded", "estimated"]
 
 # Largest size of a header, bytes. Set by hand: a header has about twenty lines.
 _LARGEST_HEADER_BYTES = 1_000_000
-# Largest deviation of a rotation from an orthonormal matrix (no unit): rounding to three digits.
-_TOLERANCE = 1e-3
-# Smallest deviation that is corrected (no unit): smaller ones are rounding errors of float64.
-_EXACT = 1e-12
 
 Row4 = tuple[Number, Number, Number, Number]
 
@@ -162,7 +158,7 @@ def refuse_unless_rigid(matrix: np.ndarray) -> None:
     rotation = matrix[:3, :3]
     # Entries above 2 cannot belong to a rotation, and their squares may overflow.
     if np.abs(rotation).max() > 2 or (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * _TOLERANCE
+        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * UNIT_LENGTH_TOLERANCE
     ):
         raise ValueError("the upper left 3x3 block must be a rotation: orthonormal, to 0.001")
     if np.linalg.det(rotation) < 0:
@@ -177,7 +173,8 @@ def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
     """
     left, _, right = np.linalg.svd(matrix[:3, :3])
     exact = matrix.copy()
-    if np.abs(left @ right - matrix[:3, :3]).max() > _EXACT:
+    # What is exact but for the rounding of float64 stays as it is, to the last digit.
+    if np.abs(left @ right - matrix[:3, :3]).max() > 1000 * np.finfo(np.float64).eps:
         exact[:3, :3] = left @ right
     return exact
 

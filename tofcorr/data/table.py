@@ -27,9 +27,9 @@ REQUIRED_COLUMNS = ("frame", *NUMBERS, "target")
 COLUMN_OF = {"pose_id": "pose_id", **{each.name: each.column for each in OPTIONAL_CONDITIONS}}
 """Columns that a recording may lack, by the attribute of `FrameTable` that holds them."""
 
-# Largest difference from 1 of the length of a quaternion or a normal (no unit). The value is part
-# of the recording format, version 1.
-_UNIT_LENGTH_TOLERANCE = 1e-3
+UNIT_LENGTH_TOLERANCE = 1e-3
+"""Largest difference from 1 of the length of a quaternion, a normal or a column of a rotation (no
+unit): rounding to three digits. Part of the recording format, version 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -241,7 +241,7 @@ def _optional_numbers(cells: dict[str, list[str]], path: Path) -> dict[str, np.n
 def _check_unit_length(vectors: np.ndarray, name: str, path: Path) -> np.ndarray:
     with np.errstate(over="ignore"):
         length = np.sqrt((vectors**2).sum(axis=1))
-    for frame in np.flatnonzero(~(np.abs(length - 1) <= _UNIT_LENGTH_TOLERANCE))[:1]:
+    for frame in np.flatnonzero(~(np.abs(length - 1) <= UNIT_LENGTH_TOLERANCE))[:1]:
         raise CalibrationDataError(
             f"{path}: frame {frame}: the {name} has length {length[frame]:.6g}; "
             "expected 1 to within 0.001."
