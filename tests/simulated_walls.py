@@ -9,7 +9,6 @@ import torch
 import yaml
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.fit.fitting import fit
@@ -18,7 +17,8 @@ from tofcorr.geometry import se3
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.simulator import append_measurement, draw_plan, simulate, take_frames
+from tofcorr.simulation.robot import draw_plan
+from tofcorr.simulation.simulator import append_measurement, row_of, simulate, take_frames
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 
@@ -137,32 +137,25 @@ def taken(
     robot = options.robot
     scale = torch.tensor([robot.repeatability_mm] * 3 + [robot.repeatability_mrad] * 3) / 1e3
     slips = scale.double() * torch.randn(len(targets), 6, generator=generator, dtype=torch.float64)
-    frames = tuple(
+    frames = [
         replace(
             frame,
             target=target,
             world_from_tool_recorded=pose,
             world_from_tool=pose @ se3.exp(slip),
+            conditions=replace(frame.conditions, timestamp=float(time)),
         )
-        for frame, target, pose, slip in zip(
-            plan.frames, targets, world_from_tool, slips, strict=True
+        for time, (frame, target, pose, slip) in enumerate(
+            zip(plan, targets, world_from_tool, slips, strict=True)
         )
-    )
+    ]
     with RecordingWriter(
         folder,
         camera=options.camera.intrinsics(),
         depth_kind="radial",
         modulation_frequency=options.sensor.modulation_frequency_hz,
     ) as writer:
-        states = take_frames(options, replace(plan, frames=frames), generator)
-        normal, offset = options.scene.plane.tensors()
-        for time, (state, frame) in enumerate(zip(states, frames, strict=True)):
-            row = FrameRow(
-                timestamp=float(time),
-                world_from_tool=frame.world_from_tool_recorded.numpy(),
-                normal_world=normal.numpy(),
-                offset=float(offset),
-                target=frame.target,
-            )
+        for state in take_frames(options, frames, generator):
+            row = row_of(state, recorded=())
             append_measurement(writer, state, "radial", write_raw=False, row=row)
     return Dataset((Recording.open(folder),))

@@ -16,12 +16,11 @@ from tofcorr.data.table import FrameRow, FrameTable
 from tofcorr.error_terms.condition_terms import in_si_units, with_means
 from tofcorr.errors import CalibrationDataError
 from tofcorr.simulation.effects.inputs import FrameFacts
-from tofcorr.simulation.hooks import FrameConditions
 
 OPTIONAL = pytest.mark.parametrize("known", OPTIONAL_CONDITIONS, ids=lambda each: each.name)
 
 
-@pytest.mark.parametrize("holder", [FrameRow, FrameTable, FrameFacts, FrameConditions])
+@pytest.mark.parametrize("holder", [FrameRow, FrameTable, FrameFacts])
 def test_whatever_holds_conditions_holds_all_of_them(holder: type) -> None:
     assert {field.name for field in fields(holder)} >= set(CONDITIONS)
 

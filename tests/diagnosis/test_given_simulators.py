@@ -21,7 +21,7 @@ from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.twin import twin_frames
+from tofcorr.simulation.simulator import twin_frames
 
 # One candidate effect is enough for laws about the simulator.
 OPTIONS = DiagnosisOptions(

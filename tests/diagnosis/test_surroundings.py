@@ -14,7 +14,7 @@ from tofcorr.diagnosis.rerun.simulator import twin_distance
 from tofcorr.diagnosis.sums.base_fit import BaseFit, filtered_inputs
 from tofcorr.diagnosis.sums.observations import effect_inputs, observe, predicted_images
 from tofcorr.simulation.effects.stray_light import StrayLightEffect
-from tofcorr.simulation.twin import default_hand_eye, twin_frames
+from tofcorr.simulation.simulator import default_hand_eye, twin_frames
 
 NEAR, WIDTH = 0.5, 6  # metres; columns of the image
 STRAY_SHARES = {"share_0.05": 0.02, "share_0.12": 0.05, "share_0.3": 0.02, "ghost_0.72": 0.01}

@@ -6,16 +6,17 @@ import pytest
 import torch
 from sensor.sensors import CAMERA, ERROR, FREQUENCY, NOISE, plane_scene, sensor_file, sensor_values
 
+from tofcorr.conditions import Conditions
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import FrameError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.model import SensorModel, SensorWarning
 from tofcorr.simulation.effects.registry import build_effects
-from tofcorr.simulation.hooks import FrameConditions, FrameState
+from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SensorOptions
-from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.scene import SceneOptions
+from tofcorr.simulation.simulator import SensorPipeline
 
 EFFECTS: dict[str, dict[str, Any]] = {
     "distance": {"legendre_1": 0.02, "legendre_5": -0.01},
@@ -55,7 +56,7 @@ def simulated(effects: list[dict[str, Any]], amplitude: torch.Tensor, normal: to
         camera=CAMERA,
         modulation_frequency=FREQUENCY,
         electrons_per_count=40.0,
-        conditions=FrameConditions(
+        conditions=Conditions(
             timestamp=90.0, integration_time=800e-6, room_temperature=25.0, ambient=300.0
         ),
         target="white",

@@ -11,6 +11,7 @@ from tofcorr.errors import ConfigError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.robot import draw_plan
 from tofcorr.simulation.signal import (
     AmplitudeDelayOptions,
     Curve,
@@ -18,7 +19,7 @@ from tofcorr.simulation.signal import (
     image_from_lattice,
     pixel_delay,
 )
-from tofcorr.simulation.simulator import draw_plan, seeded, take_frames
+from tofcorr.simulation.simulator import seeded, take_frames
 
 Small = Callable[..., SimulatorOptions]
 

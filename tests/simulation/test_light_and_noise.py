@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import Conditions
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
-from tofcorr.simulation.hooks import FrameConditions, FrameState
+from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SensorOptions
-from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.scene import SceneOptions
 from tofcorr.simulation.signal import (
     LightOptions,
@@ -20,6 +20,7 @@ from tofcorr.simulation.signal import (
     amplitude_per_reflectivity,
     read_out,
 )
+from tofcorr.simulation.simulator import SensorPipeline
 
 CAMERA = CameraIntrinsics(
     width=40, height=30, matrix=((60.0, 0.0, 19.5), (0.0, 60.0, 14.5), (0.0, 0.0, 1.0))
@@ -47,7 +48,7 @@ def measure() -> Measure:
             camera=CAMERA,
             modulation_frequency=options.modulation_frequency_hz,
             electrons_per_count=options.readout.electrons_per_count,
-            conditions=FrameConditions(integration_time=integration_time),
+            conditions=Conditions(timestamp=0.0, integration_time=integration_time),
             target="white",
             world_from_tool_recorded=identity,
             normal_world_recorded=normal,

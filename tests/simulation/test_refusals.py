@@ -10,7 +10,8 @@ from simulation.written_files import files_in
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.simulator import draw_plan, seeded, simulate
+from tofcorr.simulation.robot import draw_plan
+from tofcorr.simulation.simulator import seeded, simulate
 
 Small = Callable[..., SimulatorOptions]
 

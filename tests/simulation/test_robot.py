@@ -9,14 +9,15 @@ import torch
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.robot import CameraMountOptions, MountGuessOptions, perturbed, tool_twists
-from tofcorr.simulation.simulator import Plan, draw_plan, seeded, take_frames
+from tofcorr.simulation.hooks import FrameState
+from tofcorr.simulation.options import CameraMountOptions, MountGuessOptions, SimulatorOptions
+from tofcorr.simulation.robot import draw_plan, hand_eye_guess, tool_twists
+from tofcorr.simulation.simulator import seeded, take_frames
 
 Small = Callable[..., SimulatorOptions]
 
 
-def _plan(options: SimulatorOptions) -> Plan:
+def _plan(options: SimulatorOptions) -> list[FrameState]:
     return draw_plan(options, seeded(options))
 
 
@@ -37,7 +38,7 @@ def test_distance_along_the_optical_axis_is_within_its_bounds(small: Small) -> N
         robot={"distance_m": [0.7, 0.9], "farthest_pixel_m": None},
         scene={"plane": {"normal": [0.6, 0.0, 0.8], "offset_m": -2.0}},
     )
-    for frame in _plan(options).frames:
+    for frame in _plan(options):
         camera = frame.world_from_tool_recorded @ options.hand_eye.tool_from_camera()
         normal, offset = plane_in_frame(*options.scene.plane.tensors(), camera)
         assert 0.7 <= -offset / normal[2] <= 0.9
@@ -49,7 +50,7 @@ def test_distance_along_the_optical_axis_is_within_its_bounds(small: Small) -> N
 )
 def test_tilt_is_restricted_to_its_axes(small: Small, axes: str, tilted: tuple[bool, bool]) -> None:
     options = small(robot={"tilt_axes": axes, "farthest_pixel_m": None})
-    axis = torch.stack([f.world_from_tool_recorded for f in _plan(options).frames])
+    axis = torch.stack([f.world_from_tool_recorded for f in _plan(options)])
     optical = (axis @ options.hand_eye.tool_from_camera())[:, :3, 2]
     # The wall is z = 0: tilt about x moves the optical axis along y, and the other way round.
     leans = tuple(bool((optical[:, k].abs() > 1e-9).any()) for k in range(2))
@@ -61,7 +62,7 @@ def test_robot_reaches_poses_within_its_repeatability(small: Small) -> None:
         shots=[{"target": "white", "poses": 300}],
         robot={"repeatability_mm": 0.4, "repeatability_mrad": 0.7, "farthest_pixel_m": None},
     )
-    frames = _plan(options).frames
+    frames = _plan(options)
     recorded = torch.stack([f.world_from_tool_recorded for f in frames])
     reached = torch.stack([f.world_from_tool for f in frames])
     missed = se3.log(se3.inverse(recorded) @ reached)
@@ -74,7 +75,7 @@ def test_repeated_frames_share_their_pose(small: Small) -> None:
         robot={"repeat_poses": 2, "repeat_frames": 4, "farthest_pixel_m": None},
         conditions={"integration_time_us": [250.0, 500.0, 1000.0], "ambient_counts": [10, 20]},
     )
-    frames = _plan(options).frames
+    frames = _plan(options)
     assert [f.pose_id for f in frames] == [0] * 4 + [1] * 4 + [2, 3, 4, 5, 6]
     for frame in frames[1:4]:
         assert torch.equal(frame.world_from_tool, frames[0].world_from_tool)
@@ -90,8 +91,9 @@ def test_sweep_goes_away_from_the_wall(small: Small) -> None:
 
 
 def test_guess_is_as_far_from_the_truth_as_asked(generator: torch.Generator) -> None:
+    asked = MountGuessOptions(translation_mm=30.0, rotation_deg=5.0)
     truth = CameraMountOptions().tool_from_camera()
-    guess = perturbed(truth, MountGuessOptions(translation_mm=30.0, rotation_deg=5.0), generator)
+    guess = hand_eye_guess(CameraMountOptions(guess=asked), generator)
     assert (guess - truth)[:3, 3].norm().item() == pytest.approx(0.030)
     turn = se3.rotation_angle(guess[:3, :3].T @ truth[:3, :3])
     assert math.degrees(turn.item()) == pytest.approx(5.0)
@@ -118,7 +120,7 @@ def test_speed_on_a_path_agrees_with_the_poses_before_and_after(small: Small) ->
         },
         conditions={"frame_interval_s": 0.1},
     )
-    frames = _plan(options).frames
+    frames = _plan(options)
     times = torch.tensor([f.conditions.timestamp for f in frames], dtype=torch.float64)
     poses = torch.stack([f.world_from_tool_recorded for f in frames])
     truth = torch.stack([f.tool_twist for f in frames])

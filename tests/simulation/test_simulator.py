@@ -1,6 +1,7 @@
 """Whole recordings, their twins, and the truth beside them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.options import load_options
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.pipeline import SensorPipeline
+from tofcorr.simulation.robot import draw_plan
 from tofcorr.simulation.signal import demodulate, distance_from_phase
-from tofcorr.simulation.simulator import draw_plan, seeded, simulate, take_frames
+from tofcorr.simulation.simulator import SensorPipeline, seeded, simulate, take_frames
 
 Small = Callable[..., SimulatorOptions]
 
@@ -89,10 +90,10 @@ def test_raw_samples_demodulate_to_depth_and_amplitude(
     recording = Recording.open(tmp_path / "r")
     assert recording.raw is not None
     assert recording.amplitude is not None
-    found = demodulate(torch.from_numpy(np.array(recording.raw)).to(torch.float64))
-    distance = distance_from_phase(found.phase, 20.0e6)
+    phase, amplitude, _ = demodulate(torch.from_numpy(np.array(recording.raw)).double())
+    distance = distance_from_phase(phase, 20.0e6)
     np.testing.assert_allclose(recording.depth, distance, atol=1e-6)
-    np.testing.assert_allclose(recording.amplitude, found.amplitude, rtol=1e-6)
+    np.testing.assert_allclose(recording.amplitude, amplitude, rtol=1e-6)
 
 
 def test_conditions_reach_the_recording_or_stay_unknown(small: Small, tmp_path: Path) -> None:
@@ -161,23 +162,7 @@ def test_effects_act_in_every_stage_in_order(small: Small) -> None:
     plain = next(take_frames(options, plan, None))
     effect = _Recorder()
     pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (effect,))
-    normal, offset = options.scene.plane.tensors()
-    state = FrameState(
-        index=0,
-        camera=plain.camera,
-        modulation_frequency=plain.modulation_frequency,
-        electrons_per_count=plain.electrons_per_count,
-        conditions=plain.conditions,
-        target=plain.target,
-        world_from_tool_recorded=plain.world_from_tool,
-        normal_world_recorded=normal,
-        offset_recorded=offset,
-        generator=None,
-        world_from_tool=plain.world_from_tool,
-        tool_from_camera=plain.tool_from_camera,
-        normal_world=normal,
-        offset=offset,
-    )
+    state = replace(plan[0], world_from_tool=plan[0].world_from_tool_recorded)
     pipeline.run(state)
     assert effect.calls == list(STAGES)
     error = state.measured_distance - state.radial_distance

@@ -11,8 +11,7 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.simulator import simulate
-from tofcorr.simulation.twin import twin_frames
+from tofcorr.simulation.simulator import simulate, twin_frames
 
 Small = Callable[..., SimulatorOptions]
 

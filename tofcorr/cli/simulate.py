@@ -28,13 +28,11 @@ def simulate_command(
     What the camera cannot know (true distances, the hand-eye transform) goes to OUT/truth, which
     nothing that fits, corrects or diagnoses reads.
     """
-    from tofcorr.progress import through
     from tofcorr.simulation.simulator import simulate
 
     if seed is not None:
         options = options.model_copy(update={"seed": seed})
-    show = lambda states, total: through(states, "simulating", total=total)  # noqa: E731
-    simulate(options, out, num_frames=frames, progress=show)
+    simulate(options, out, num_frames=frames)
     click.echo(f"Recording written to {out}")
 
 

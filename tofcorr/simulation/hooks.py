@@ -17,7 +17,7 @@ Everything is float64 (`signal` is complex128). Without noise the measured dista
 differentiable in every field, if effects assign new tensors and never write into existing ones.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -33,13 +33,6 @@ STAGES = ("pose", "geometry", "light", "delay", "signal", "taps", "readout")
 _NOT_YET = torch.empty(0, dtype=torch.float64)
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameConditions(Conditions[float]):
-    """The conditions of one simulated frame; `ambient` is in counts per tap, as the amplitude."""
-
-    timestamp: float = 0.0
-
-
 @dataclass(kw_only=True)
 class FrameState:
     """One frame between pose and measurement; mutable, one object per frame.
@@ -49,8 +42,10 @@ class FrameState:
         camera: Intrinsics as recorded (the true rays may differ).
         modulation_frequency: Hz, as recorded (the true one may differ).
         electrons_per_count: Electrons for one count of amplitude, offset or raw sample.
-        conditions: The conditions of the frame, recorded or not.
+        conditions: The conditions of the frame, recorded or not; `ambient` is in counts per tap, as
+            the amplitude.
         target: Name of the target.
+        pose_id: Frames with the same id are taken without moving; None if the robot never stops.
         world_from_tool_recorded: The pose the robot reports, shape (4, 4).
         normal_world_recorded: The plane's unit normal in the recording, shape (3,).
         offset_recorded: The plane's d in n . x + d = 0 in the recording, shape (), metres.
@@ -108,44 +103,45 @@ class FrameState:
     camera: CameraIntrinsics
     modulation_frequency: float
     electrons_per_count: float
-    conditions: FrameConditions
+    conditions: Conditions[float]
     target: str
     world_from_tool_recorded: Tensor
     normal_world_recorded: Tensor
     offset_recorded: Tensor
-    generator: torch.Generator | None
+    generator: torch.Generator | None = None
+    pose_id: int | None = None
     tool_twist: Tensor | None = None
     approach: Tensor | None = None
     amplitude_recorded: Tensor | None = None
     surroundings: tuple[Tensor, Tensor] | None = None
 
-    ray_directions: Tensor = field(default=_NOT_YET)
-    world_from_tool: Tensor = field(default=_NOT_YET)
-    tool_from_camera: Tensor = field(default=_NOT_YET)
-    normal_world: Tensor = field(default=_NOT_YET)
-    offset: Tensor = field(default=_NOT_YET)
+    ray_directions: Tensor = _NOT_YET
+    world_from_tool: Tensor = _NOT_YET
+    tool_from_camera: Tensor = _NOT_YET
+    normal_world: Tensor = _NOT_YET
+    offset: Tensor = _NOT_YET
 
-    radial_distance: Tensor = field(default=_NOT_YET)
-    incidence_cosine: Tensor = field(default=_NOT_YET)
-    points_world: Tensor = field(default=_NOT_YET)
-    target_xy: Tensor = field(default=_NOT_YET)
+    radial_distance: Tensor = _NOT_YET
+    incidence_cosine: Tensor = _NOT_YET
+    points_world: Tensor = _NOT_YET
+    target_xy: Tensor = _NOT_YET
 
-    reflectivity: Tensor = field(default=_NOT_YET)
-    amplitude: Tensor = field(default=_NOT_YET)
-    background: Tensor = field(default=_NOT_YET)
+    reflectivity: Tensor = _NOT_YET
+    amplitude: Tensor = _NOT_YET
+    background: Tensor = _NOT_YET
 
-    delay: Tensor = field(default=_NOT_YET)
+    delay: Tensor = _NOT_YET
 
-    orders: Tensor = field(default=_NOT_YET)
-    signal: Tensor = field(default=_NOT_YET)
+    orders: Tensor = _NOT_YET
+    signal: Tensor = _NOT_YET
     tap_delay: Tensor | None = None
 
-    taps: Tensor = field(default=_NOT_YET)
+    taps: Tensor = _NOT_YET
 
-    measured_distance: Tensor = field(default=_NOT_YET)
-    measured_amplitude: Tensor = field(default=_NOT_YET)
-    measured_offset: Tensor = field(default=_NOT_YET)
-    raw: Tensor = field(default=_NOT_YET)
+    measured_distance: Tensor = _NOT_YET
+    measured_amplitude: Tensor = _NOT_YET
+    measured_offset: Tensor = _NOT_YET
+    raw: Tensor = _NOT_YET
 
     @property
     def world_from_camera(self) -> Tensor:
@@ -161,16 +157,10 @@ class FrameState:
         Returns:
             exp(1j m 4 pi f extra / c) for every order m, shape (M, 1, 1) or (M, H, W), complex128.
         """
-        return path_phasor(self.orders, extra_distance, self.modulation_frequency)
-
-
-def path_phasor(
-    orders: Tensor, extra_distance: Tensor | float, modulation_frequency: float
-) -> Tensor:
-    """Return exp(1j m 4 pi f d / c) for orders m (M,) and distances d () or (H, W)."""
-    distance = torch.as_tensor(extra_distance, dtype=torch.float64)
-    phase = orders[:, None, None] * phase_from_radial_distance(distance, modulation_frequency)
-    return torch.polar(torch.ones_like(phase), phase)
+        extra = torch.as_tensor(extra_distance, dtype=torch.float64)
+        phase = phase_from_radial_distance(extra, self.modulation_frequency)
+        phase = self.orders[:, None, None] * phase
+        return torch.polar(torch.ones_like(phase), phase)
 
 
 class Effect:

@@ -1,14 +1,24 @@
 """All options of the simulator: what `configs/simulate/*.yaml` holds."""
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import ConfigDict, Field, field_validator
+import torch
+from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
+from torch import Tensor
 
 from tofcorr.data.recording import CameraSection, DepthKind
+from tofcorr.data.table import COLUMN_OF
+from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.options import Options
-from tofcorr.simulation.numbers import Count, PositiveNumber
-from tofcorr.simulation.robot import CameraMountOptions, ConditionOptions, RobotOptions
+from tofcorr.options import (
+    Count,
+    NonNegativeNumber,
+    Number,
+    Options,
+    PositiveNumber,
+    Range,
+    Vector3,
+)
 from tofcorr.simulation.scene import SceneOptions
 from tofcorr.simulation.signal import DelayOptions, Harmonic, LightOptions, ReadoutOptions
 
@@ -48,6 +58,134 @@ class SensorOptions(Options):
         if len(set(orders)) < len(orders):
             raise ValueError(f"each order may appear once only, got {orders}")
         return harmonics
+
+
+class MountGuessOptions(Options):
+    """Distance of the recorded guess of the hand-eye transform from the true one."""
+
+    translation_mm: NonNegativeNumber = 30.0
+    rotation_deg: NonNegativeNumber = 5.0
+
+
+class CameraMountOptions(Options):
+    """The true hand-eye transform, and the guess of it in the recording.
+
+    Attributes:
+        translation_mm: Position of the camera in the tool frame.
+        rotation_deg: Rotation vector: its direction is the axis, its length the angle.
+        guess: Distance of the recorded guess from the truth, in a random direction; null: the guess
+            is the identity.
+    """
+
+    translation_mm: Vector3 = (50.0, -20.0, 120.0)
+    rotation_deg: Vector3 = (1.5, -2.0, 88.0)
+    guess: MountGuessOptions | None = None
+
+    def tool_from_camera(self) -> Tensor:
+        """Return the true transform, shape (4, 4)."""
+        rotation = torch.deg2rad(torch.tensor(self.rotation_deg, dtype=torch.float64))
+        turned = se3.exp(torch.cat([torch.zeros(3, dtype=torch.float64), rotation]))
+        translation = torch.tensor(self.translation_mm, dtype=torch.float64) * 1e-3
+        return se3.assemble(turned[:3, :3], translation)
+
+    @classmethod
+    def from_matrix(cls, tool_from_camera: Tensor) -> Self:
+        """Return the options whose truth is this transform (4, 4)."""
+        rotation = se3.log(tool_from_camera.detach())[3:]
+        return cls(
+            translation_mm=tuple((tool_from_camera[:3, 3].detach() * 1e3).tolist()),
+            rotation_deg=tuple(torch.rad2deg(rotation).tolist()),
+        )
+
+
+def _recordable(name: str) -> str:
+    if name not in COLUMN_OF:
+        raise ValueError(f"expected one of {', '.join(COLUMN_OF)}")
+    return name
+
+
+class ConditionOptions(Options):
+    """How the conditions of the frames are drawn.
+
+    Attributes:
+        frame_interval_s: Mean time from frame to frame.
+        interval_jitter: Largest deviation of an interval from the mean, as a share of it (uniformly
+            distributed); not used in continuous motion.
+        integration_time_us: One is drawn for each pose.
+        ambient_counts: Background light in counts per tap at the first integration time, drawn
+            for each pose between these bounds.
+        room_temperature_c: Of the room at the first frame.
+        room_drift_c: Amplitude of the room's temperature, which follows a sine.
+        room_period_s: Period of that sine.
+        body_rise_c: Temperature of the warm camera body above that of the room.
+        body_time_constant_s: Time from power-on to 63 % of `body_rise_c`.
+        power_on_s: Time from power-on to the first frame.
+        recorded: Which optional columns the recording has; the others are left out.
+    """
+
+    frame_interval_s: PositiveNumber = 5.0
+    interval_jitter: Annotated[float, Field(ge=0, lt=1)] = 0.3
+    integration_time_us: Annotated[tuple[PositiveNumber, ...], Field(min_length=1)] = (500.0,)
+    ambient_counts: Range = (0.0, 0.0)
+    room_temperature_c: Number = 22.0
+    room_drift_c: NonNegativeNumber = 0.5
+    room_period_s: PositiveNumber = 1800.0
+    body_rise_c: Number = 15.0
+    body_time_constant_s: PositiveNumber = 600.0
+    power_on_s: NonNegativeNumber = 30.0
+    recorded: tuple[Annotated[str, AfterValidator(_recordable)], ...] = tuple(COLUMN_OF)
+
+
+class RobotOptions(Options):
+    """The poses of the camera.
+
+    Attributes:
+        distance_m: Smallest and largest distance of the wall along the optical axis.
+        farthest_pixel_m: No pixel may see the wall farther away than this; null: no limit.
+        steepest_incidence_deg: No pixel may see the wall at a steeper angle from its normal.
+        tilt_deg: Largest tilt of the optical axis about each of two axes of the wall.
+        tilt_axes: Axes to tilt about.
+        roll_deg: Largest rotation about the optical axis, in both directions.
+        aim_spread_m: Largest distance of the point aimed at from the wall's origin, along each axis
+            of the wall.
+        order: `random`, or `by_distance` as in a sweep away from the wall.
+        repeat_poses: Number of poses that are recorded more than once; the first ones.
+        repeat_frames: Number of frames of each of them.
+        motion: `stop_and_go`, or `continuous`: frames are taken while the robot follows a smooth
+            path. Poses show the velocity only if frames are at most a second apart
+            (`tool_twists`).
+        waypoint_every_frames: Frames between two random poses of that path.
+        repeatability_mm: Standard deviation of the true from the reported position, on each axis.
+        repeatability_mrad: The same for the orientation.
+    """
+
+    distance_m: tuple[PositiveNumber, PositiveNumber] = (0.5, 1.8)
+    farthest_pixel_m: PositiveNumber | None = 2.0
+    steepest_incidence_deg: Annotated[float, Field(gt=0, lt=90)] = 75.0
+    tilt_deg: Annotated[float, Field(ge=0, lt=90)] = 30.0
+    tilt_axes: Literal["both", "x", "y", "none"] = "both"
+    roll_deg: Annotated[float, Field(ge=0, le=180)] = 180.0
+    aim_spread_m: NonNegativeNumber = 0.3
+    order: Literal["random", "by_distance"] = "random"
+    repeat_poses: Count = 0
+    repeat_frames: Annotated[int, Field(ge=1)] = 1
+    motion: Literal["stop_and_go", "continuous"] = "stop_and_go"
+    waypoint_every_frames: Annotated[int, Field(ge=2)] = 6
+    repeatability_mm: NonNegativeNumber = 0.3
+    repeatability_mrad: NonNegativeNumber = 0.3
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        low, high = self.distance_m
+        if high < low:
+            raise ValueError(
+                f"distance_m: the smallest distance {low:g} exceeds the largest {high:g}"
+            )
+        if self.motion == "continuous" and (self.repeat_poses or self.order != "random"):
+            raise ValueError(
+                "continuous motion allows neither repeat_poses nor an order other than random"
+            )
+        return self
 
 
 class ShotOptions(Options):

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
-from tofcorr.options import Options
-from tofcorr.simulation.numbers import Number, PositiveNumber, Share, Vector3
+from tofcorr.options import Number, Options, PositiveNumber, Share, Vector3
 
 
 class UniformTarget(Options):
@@ -138,13 +137,23 @@ def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Ten
     square = target.square_mm * 1e-3
     corner = target_xy.new_tensor(target.corner_mm) * 1e-3
     in_squares = (target_xy - corner) / square
-    step_down, step_right = _steps(in_squares)
     share_bright = _bright(in_squares)
-    reach = (step_down.abs() + step_right.abs()) / 2
+    # How the coordinates change from row to row, and from column to column.
+    steps = [
+        torch.gradient(in_squares, dim=axis)[0] if count > 1 else torch.zeros_like(in_squares)
+        for axis, count in enumerate(in_squares.shape[:2])
+    ]
+    reach = (steps[0].abs() + steps[1].abs()) / 2
     crossed = (torch.floor(in_squares - reach) != torch.floor(in_squares + reach)).any(-1)
-    share_bright[crossed] = _mean_over_footprint(
-        in_squares[crossed], step_down[crossed], step_right[crossed], subsamples
-    )
+    # Coordinates first, so that each is contiguous in memory: twice as fast.
+    at, down, right = (each[crossed].T.contiguous() for each in (in_squares, *steps))
+    inside = (torch.arange(subsamples, dtype=at.dtype) + 0.5) / subsamples - 0.5
+    total = torch.zeros_like(at[0])
+    for share_down in inside:
+        line = at + share_down * down
+        for share_right in inside:
+            total += _bright((line + share_right * right).T)
+    share_bright[crossed] = total / subsamples**2
     contrast = target.reflectivity_bright - target.reflectivity_dark
     return target.reflectivity_dark + contrast * share_bright
 
@@ -153,29 +162,3 @@ def _bright(in_squares: Tensor) -> Tensor:
     """Return 1.0 in bright squares and 0.0 in dark ones; coordinates (..., 2) in squares."""
     column, row = in_squares.unbind(-1)
     return torch.remainder(torch.floor(column) + torch.floor(row), 2.0)
-
-
-def _steps(coordinates: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how coordinates (H, W, 2) change from row to row and from column to column."""
-    return tuple(_slope(coordinates, axis) for axis in (0, 1))  # type: ignore[return-value]
-
-
-def _slope(coordinates: Tensor, axis: int) -> Tensor:
-    if coordinates.shape[axis] == 1:
-        return torch.zeros_like(coordinates)
-    return torch.gradient(coordinates, dim=axis)[0]
-
-
-def _mean_over_footprint(
-    centre: Tensor, step_down: Tensor, step_right: Tensor, subsamples: int
-) -> Tensor:
-    """Average the pattern over a regular grid of points in each footprint (P, 2)."""
-    inside = (torch.arange(subsamples, dtype=centre.dtype) + 0.5) / subsamples - 0.5
-    # Coordinates first, so that each is contiguous in memory: twice as fast.
-    at, down, right = (steps.T.contiguous() for steps in (centre, step_down, step_right))
-    total = torch.zeros_like(at[0])
-    for share_down in inside:
-        line = at + share_down * down
-        for share_right in inside:
-            total += _bright((line + share_right * right).T)
-    return total / subsamples**2

@@ -9,16 +9,17 @@ the differences of opposite samples.
 """
 
 import math
-from collections.abc import Sequence
-from typing import Annotated, Literal, NamedTuple, Self
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Annotated, Literal, Self
 
+import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
 from tofcorr.geometry.rays import phase_from_radial_distance, unambiguous_range
-from tofcorr.options import Options
-from tofcorr.simulation.numbers import Count, NonNegativeNumber, Number, PositiveNumber
+from tofcorr.options import Count, NonNegativeNumber, Number, Options, PositiveNumber
 
 
 class Curve:
@@ -56,19 +57,16 @@ def image_from_lattice(values: tuple[tuple[float, ...], ...], height: int, width
     The lattice spans the image evenly, from the centre of the first pixel to that of the last.
     Cubic splines along rows and columns interpolate between its points.
     """
-    lattice = torch.tensor(values, dtype=torch.float64)
-    return _refined(_refined(lattice, height).T, width).T
-
-
-def _refined(rows: Tensor, count: int) -> Tensor:
-    """Interpolate lattice rows (R, C) to (count, C)."""
     from scipy.interpolate import CubicSpline  # Slow to import; few commands need it.
 
-    if len(rows) == 1:
-        return rows.expand(count, -1)
-    at = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
-    knots = torch.linspace(0.0, 1.0, len(rows), dtype=torch.float64).numpy()
-    return torch.from_numpy(CubicSpline(knots, rows.numpy())(at.numpy()))
+    image = np.array(values)
+    for axis, count in enumerate((height, width)):
+        at, knots = np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, image.shape[axis])
+        if len(knots) == 1:
+            image = np.repeat(image, count, axis)
+        else:
+            image = CubicSpline(knots, image, axis)(at)
+    return torch.from_numpy(image)
 
 
 # The light that returns: inverse square law, incidence, vignetting, integration time.
@@ -89,12 +87,6 @@ class LightOptions(Options):
     reference_integration_time_us: PositiveNumber = 500.0
     demodulation_contrast: Annotated[float, Field(gt=0, le=1)] = 0.5
     vignetting_exponent: NonNegativeNumber = 4.0
-
-    def exposure(self, integration_time: float | None) -> float:
-        """Return the integration time over the reference; 1 if it is unknown."""
-        if integration_time is None:
-            return 1.0
-        return integration_time / (self.reference_integration_time_us * 1e-6)
 
 
 def amplitude_per_reflectivity(
@@ -121,15 +113,13 @@ def amplitude_per_reflectivity(
         Shape (H, W), electrons.
     """
     vignetting = ray_directions[..., 2] ** options.vignetting_exponent
-    electrons = options.electrons_at_1m * options.exposure(integration_time)
-    modulated = electrons * options.demodulation_contrast
-    return modulated * vignetting * incidence_cosine / radial_distance**2
+    seconds = options.reference_integration_time_us * 1e-6
+    exposure = 1.0 if integration_time is None else integration_time / seconds
+    electrons = options.electrons_at_1m * exposure * options.demodulation_contrast
+    return electrons * vignetting * incidence_cosine / radial_distance**2
 
 
 # Delays of a pixel's signal: by its place on the chip, its charge, and the clock.
-
-
-_Knots = Annotated[tuple[Number, ...], Field(min_length=2)]
 
 
 class PixelDelayOptions(Options):
@@ -178,22 +168,16 @@ class AmplitudeDelayOptions(Options):
 class CurveTable(Options):
     """A cubic spline through knots, constant beyond them; its values are metres."""
 
-    knots: _Knots
-    values_m: _Knots
+    knots: Annotated[tuple[Number, ...], Field(min_length=2)]
+    values_m: tuple[Number, ...]
 
     @model_validator(mode="after")
     def _matched(self) -> Self:
         if len(self.knots) != len(self.values_m):
             raise ValueError(f"{len(self.knots)} knots but {len(self.values_m)} values_m")
-        if any(
-            later <= earlier for earlier, later in zip(self.knots, self.knots[1:], strict=False)
-        ):
+        if any(later <= earlier for earlier, later in pairwise(self.knots)):
             raise ValueError("the knots must increase")
         return self
-
-    def curve(self) -> Curve:
-        """Return the curve."""
-        return Curve(self.knots, self.values_m)
 
 
 class AmplitudeTable(CurveTable):
@@ -253,53 +237,44 @@ class DelayOptions(Options):
     measured: MeasuredErrorOptions = MeasuredErrorOptions()
 
 
-class Delays:
-    """The delays of one camera.
+def delays(
+    options: DelayOptions, ray_directions: Tensor, electrons_per_count: float
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return the delay of every pixel of one camera, as a function of distance and amplitude.
 
     Args:
         options: The size of the delays.
         ray_directions: Unit viewing rays of every pixel, shape (H, W, 3).
         electrons_per_count: Electrons for one count of amplitude.
+
+    Returns:
+        A function of true distances, (H, W), metres, and amplitudes, (H, W), electrons; it returns
+        metres, (H, W).
     """
+    measured = options.measured
+    by_pixel = pixel_delay(options.pixel, ray_directions)
+    by_pixel = by_pixel + options.constant_mm * 1e-3 + measured.constant_m
+    if measured.pixel is not None:
+        by_pixel = by_pixel + image_from_lattice(measured.pixel.values_m, *by_pixel.shape)
+    by_distance, by_amplitude = (
+        None if table is None else Curve(table.knots, table.values_m)
+        for table in (measured.distance, measured.amplitude)
+    )
 
-    def __init__(
-        self, options: DelayOptions, ray_directions: Tensor, electrons_per_count: float
-    ) -> None:
-        self._options = options
-        self._electrons_per_count = electrons_per_count
-        measured = options.measured
-        self._by_pixel = pixel_delay(options.pixel, ray_directions)
-        self._by_pixel = self._by_pixel + options.constant_mm * 1e-3 + measured.constant_m
-        if measured.pixel is not None:
-            height, width = self._by_pixel.shape
-            self._by_pixel = self._by_pixel + image_from_lattice(
-                measured.pixel.values_m, height, width
-            )
-        self._distance_curve = measured.distance.curve() if measured.distance else None
-        self._amplitude_curve = measured.amplitude.curve() if measured.amplitude else None
-
-    def of(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
-        """Return the delay of every pixel.
-
-        Args:
-            radial_distance: True distances, shape (H, W), metres.
-            amplitude: Electrons, shape (H, W).
-
-        Returns:
-            Shape (H, W), metres.
-        """
-        options = self._options
-        delay = self._by_pixel + options.clock_deviation * radial_distance
+    def of(radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+        delay = by_pixel + options.clock_deviation * radial_distance
         if options.amplitude.scale_mm:
             delay = delay + options.amplitude.delay(amplitude)
-        if self._distance_curve is not None:
-            delay = delay + self._distance_curve(radial_distance)
-        if self._amplitude_curve is not None and options.measured.amplitude is not None:
-            counts = amplitude / self._electrons_per_count
-            if options.measured.amplitude.variable == "normalised_amplitude":
+        if by_distance is not None:
+            delay = delay + by_distance(radial_distance)
+        if by_amplitude is not None and measured.amplitude is not None:
+            counts = amplitude / electrons_per_count
+            if measured.amplitude.variable == "normalised_amplitude":
                 counts = counts * radial_distance**2
-            delay = delay + self._amplitude_curve(counts)
+            delay = delay + by_amplitude(counts)
         return delay
+
+    return of
 
 
 def pixel_delay(options: PixelDelayOptions, ray_directions: Tensor) -> Tensor:
@@ -318,11 +293,6 @@ def pixel_delay(options: PixelDelayOptions, ray_directions: Tensor) -> Tensor:
 # The correlation function of a modulated signal that is not quite sinusoidal.
 
 
-_HIGHEST_ORDER = 1000
-"""Highest overtone. Chosen: no light source of a camera follows one beyond the twentieth; an
-integer without limit fits into no float."""
-
-
 class Harmonic(Options):
     """One overtone of the correlation function.
 
@@ -332,7 +302,9 @@ class Harmonic(Options):
         phase_deg: Its phase at distance zero.
     """
 
-    order: Annotated[int, Field(ge=2, le=_HIGHEST_ORDER)]
+    # No light source of a camera follows an overtone beyond the twentieth; an integer without limit
+    # fits into no float.
+    order: Annotated[int, Field(ge=2, le=1000)]
     share: Number
     phase_deg: Number = 0.0
 
@@ -398,21 +370,7 @@ def correlation_samples(
 # (2010).
 
 
-class Demodulated(NamedTuple):
-    """The result of four samples, each of shape (..., H, W).
-
-    Attributes:
-        phase: Radians in [0, 2 pi).
-        amplitude: In the unit of the samples.
-        offset: In the unit of the samples.
-    """
-
-    phase: Tensor
-    amplitude: Tensor
-    offset: Tensor
-
-
-def demodulate(samples: Tensor) -> Demodulated:
+def demodulate(samples: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Demodulate correlation samples A_k = offset + amplitude cos(phase + k pi / 2).
 
     phase = atan2(A3 - A1, A0 - A2), amplitude = sqrt((A3 - A1)^2 + (A0 - A2)^2) / 2,
@@ -420,11 +378,14 @@ def demodulate(samples: Tensor) -> Demodulated:
 
     Args:
         samples: A0..A3, shape (..., 4, H, W).
+
+    Returns:
+        Phase in [0, 2 pi), radians; amplitude and offset in the unit of the samples; (..., H, W).
     """
     first, second, third, fourth = samples.unbind(-3)
     sine, cosine = fourth - second, first - third
     phase = torch.remainder(torch.atan2(sine, cosine), 2 * math.pi)
-    return Demodulated(phase, torch.hypot(sine, cosine) / 2, samples.mean(-3))
+    return phase, torch.hypot(sine, cosine) / 2, samples.mean(-3)
 
 
 def distance_from_phase(phase: Tensor, modulation_frequency: float) -> Tensor:
@@ -481,20 +442,3 @@ def read_out(taps: Tensor, options: ReadoutOptions, generator: torch.Generator |
     electrons = electrons + options.read_noise_electrons * read_noise
     counts = torch.round(electrons / options.electrons_per_count)
     return counts.clamp(0.0, options.largest_count())
-
-
-def has_distance(
-    counts: Tensor, amplitude: Tensor, options: ReadoutOptions, *, noisy: bool
-) -> Tensor:
-    """Return True where a pixel has a distance: no sample saturated, amplitude large enough.
-
-    Args:
-        counts: Samples, shape (4, H, W).
-        amplitude: Counts, shape (H, W).
-        options: Converter and threshold.
-        noisy: Whether the converter's limits were applied.
-    """
-    bright_enough = (amplitude >= options.least_amplitude_counts) & (amplitude > 0)
-    if not noisy:
-        return bright_enough
-    return bright_enough & (counts < options.largest_count()).all(0)

@@ -1,207 +1,167 @@
-"""Whole recordings from the simulator: the frames are planned, simulated, and written."""
+"""Frames from pose to measurement, stage by stage: of a plan, or at those of a recording."""
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.conditions import OPTIONAL_CONDITIONS
+from tofcorr.conditions import Conditions
 from tofcorr.data.recording import DepthKind, Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
-from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import (
     plane_in_frame,
+    radial_distance_from_z_depth,
     ray_directions,
     ray_plane_distance,
     z_depth_from_radial_distance,
 )
 from tofcorr.options import resolve_options
+from tofcorr.progress import bar
 from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.registry import build_effects
-from tofcorr.simulation.hooks import FrameConditions, FrameState
-from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.pipeline import SensorPipeline
-from tofcorr.simulation.robot import (
-    FillsImage,
-    draw_camera_path,
-    draw_camera_poses,
-    draw_conditions,
-    draw_timestamps,
-    draw_twist,
-    perturbed,
+from tofcorr.simulation.hooks import STAGES, Effect, FrameState
+from tofcorr.simulation.options import SensorOptions, SimulatorOptions
+from tofcorr.simulation.robot import draw_plan, draw_slip, hand_eye_guess, tool_twists
+from tofcorr.simulation.scene import SceneOptions, seen_reflectivity, target_named, world_from_plane
+from tofcorr.simulation.signal import (
+    amplitude_per_reflectivity,
+    correlation_samples,
+    delays,
+    demodulate,
+    distance_from_phase,
+    harmonic_tensors,
+    read_out,
+    signal_phasors,
 )
-from tofcorr.simulation.scene import world_from_plane
+
+Reflectivity = Literal["pattern", "from_recording"]
+"""Source of the brightness of the target: the scene's pattern of that name, or the amplitude of the
+recording. In the second case, pixels outside the recording's mask have the recorded distance:
+stray light comes from all that the lens sees."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlannedFrame:
-    """One frame before it is simulated.
-
-    Attributes:
-        target: Name of the target.
-        pose_id: Frames with the same id are taken without moving; None if the robot never stops.
-        conditions: All conditions, recorded or not.
-        world_from_tool_recorded: What the robot reports, shape (4, 4).
-        world_from_tool: The true pose, shape (4, 4).
-        tool_twist: Velocity in the tool's own frame, translation first, shape (6,), m/s and rad/s.
-    """
-
-    target: str
-    pose_id: int | None
-    conditions: FrameConditions
-    world_from_tool_recorded: Tensor
-    world_from_tool: Tensor
-    tool_twist: Tensor
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """All frames of a recording before they are simulated, and its hand-eye guess (4, 4)."""
-
-    frames: tuple[PlannedFrame, ...]
-    tool_from_camera_guess: Tensor
-
-
-def draw_plan(
-    options: SimulatorOptions, generator: torch.Generator, *, num_frames: int | None = None
-) -> Plan:
-    """Draw poses, targets and conditions of a recording.
+class SensorPipeline:
+    """A camera in front of a wall: turns the pose of a frame into a measurement.
 
     Args:
-        options: Camera, scene, robot.
-        generator: Source of randomness.
-        num_frames: Only the first frames; None: all.
-
-    Raises:
-        ConfigError: No pose was found where the wall fills the image, or fewer frames are
-            planned than asked for.
+        camera: The camera intrinsics.
+        sensor: Light source, pixel and converter.
+        scene: Appearance of the targets.
+        effects: Effects beyond the plain sensor; at each stage they act in this order.
     """
-    targets = [shot.target for shot in options.shots for _ in range(shot.poses)]
-    order = torch.randperm(len(targets), generator=generator).tolist()
-    targets = [targets[place] for place in order]
-    plan = _plan_path if options.robot.motion == "continuous" else _plan_stops
-    frames = plan(options, targets, generator)
-    if num_frames is not None and num_frames > len(frames):
-        raise ConfigError(
-            f"{num_frames} frames are asked for, but the options plan {len(frames)}; "
-            "raise 'poses' under 'shots'."
+
+    def __init__(
+        self,
+        camera: CameraIntrinsics,
+        sensor: SensorOptions,
+        scene: SceneOptions,
+        effects: Sequence[Effect] = (),
+    ) -> None:
+        self._rays = ray_directions(camera)
+        self._sensor = sensor
+        self._scene = scene
+        self._effects = tuple(effects)
+        self._harmonics = harmonic_tensors(sensor.harmonics)
+        self._delay_of = delays(sensor.delays, self._rays, sensor.readout.electrons_per_count)
+
+    def run(self, state: FrameState) -> FrameState:
+        """Fill `state`, stage by stage.
+
+        Args:
+            state: Its fields known from the start, `world_from_tool`, `tool_from_camera`,
+                `normal_world` and `offset` are set.
+
+        Returns:
+            The same state, measured. A pixel without a distance has NaN.
+
+        Raises:
+            ConfigError: The scene does not know the target's name.
+        """
+        for name in STAGES:
+            getattr(self, f"_{name}")(state)
+            for effect in self._effects:
+                getattr(effect, f"on_{name}")(state)
+        return state
+
+    def _pose(self, state: FrameState) -> None:
+        state.ray_directions = self._rays
+
+    def _geometry(self, state: FrameState) -> None:
+        world_from_camera = state.world_from_camera
+        normal, offset = plane_in_frame(state.normal_world, state.offset, world_from_camera)
+        rays = state.ray_directions
+        state.radial_distance = ray_plane_distance(rays, normal, offset)
+        if state.surroundings is not None:
+            state.radial_distance = torch.where(*state.surroundings, state.radial_distance)
+        state.incidence_cosine = -(rays @ normal)
+        points = rays * state.radial_distance[..., None]
+        rotation, origin = world_from_camera[:3, :3], world_from_camera[:3, 3]
+        state.points_world = points @ rotation.T + origin
+        frame = world_from_plane(state.normal_world, state.offset)
+        state.target_xy = (state.points_world - frame[:3, 3]) @ frame[:3, :2]
+
+    def _light(self, state: FrameState) -> None:
+        light, electrons_per_count = self._sensor.light, state.electrons_per_count
+        full = amplitude_per_reflectivity(
+            light,
+            state.radial_distance,
+            state.incidence_cosine,
+            state.ray_directions,
+            state.conditions.integration_time,
         )
-    frames = frames[:num_frames]
-    guess = torch.eye(4, dtype=torch.float64)
-    if options.hand_eye.guess is not None:
-        truth = options.hand_eye.tool_from_camera()
-        guess = perturbed(truth, options.hand_eye.guess, generator)
-    return Plan(frames=tuple(frames), tool_from_camera_guess=guess)
+        if state.amplitude_recorded is None:
+            target = target_named(self._scene.targets, state.target)
+            state.reflectivity = seen_reflectivity(target, state.target_xy, self._scene.subsamples)
+            state.amplitude = full * state.reflectivity
+        else:
+            seen = torch.isfinite(state.radial_distance)
+            electrons = state.amplitude_recorded * electrons_per_count
+            state.amplitude = torch.where(seen, electrons, torch.nan)
+            state.reflectivity = state.amplitude / full
+        # If background light is unknown, zero is assumed.
+        ambient = (state.conditions.ambient or 0.0) * electrons_per_count
+        state.background = state.amplitude / light.demodulation_contrast + ambient
 
+    def _delay(self, state: FrameState) -> None:
+        state.delay = self._delay_of(state.radial_distance, state.amplitude)
 
-def _plan_stops(
-    options: SimulatorOptions, targets: list[str], generator: torch.Generator
-) -> list[PlannedFrame]:
-    robot = options.robot
-    poses = draw_camera_poses(robot, len(targets), _fills_image(options), generator)
-    if robot.order == "by_distance":
-        poses.sort(key=lambda pose: pose.distance)
-    repeats = [
-        robot.repeat_frames if pose < robot.repeat_poses else 1 for pose in range(len(poses))
-    ]
-    pose_ids = [pose for pose, count in enumerate(repeats) for _ in range(count)]
-    jitter = options.conditions.interval_jitter
-    timestamps = draw_timestamps(options.conditions, len(pose_ids), jitter, generator)
-    conditions = draw_conditions(options.conditions, timestamps, pose_ids, generator)
-    commanded = [_world_from_tool(options, pose.plane_from_camera) for pose in poses]
-    reached = [pose @ _robot_noise(options, generator) for pose in commanded]
-    at_rest = torch.zeros(6, dtype=torch.float64)
-    return [
-        PlannedFrame(
-            target=targets[pose],
-            pose_id=pose,
-            conditions=frame_conditions,
-            world_from_tool_recorded=commanded[pose],
-            world_from_tool=reached[pose],
-            tool_twist=at_rest,
+    def _signal(self, state: FrameState) -> None:
+        state.orders, relative = self._harmonics
+        distance = state.radial_distance + state.delay
+        signal = signal_phasors(
+            state.orders, relative, state.amplitude, distance, state.modulation_frequency
         )
-        for pose, frame_conditions in zip(pose_ids, conditions, strict=True)
-    ]
+        # Pixels without return are dark. A NaN would spread when an effect blurs the signal.
+        state.signal = signal.masked_fill(signal.isnan(), 0.0)
+
+    def _taps(self, state: FrameState) -> None:
+        turned = None
+        if state.tap_delay is not None:
+            turned = torch.stack([state.path_phasor(delay) for delay in state.tap_delay])
+        state.taps = correlation_samples(state.orders, state.signal, state.background, turned)
+
+    def _readout(self, state: FrameState) -> None:
+        readout = self._sensor.readout
+        state.raw = read_out(state.taps, readout, state.generator)
+        phase, state.measured_amplitude, state.measured_offset = demodulate(state.raw)
+        distance = distance_from_phase(phase, state.modulation_frequency)
+        # Light, an amplitude that is large enough, and no sample saturated.
+        lit = torch.isfinite(state.radial_distance) & (state.amplitude > 0)
+        counts = state.measured_amplitude
+        usable = lit & (counts >= readout.least_amplitude_counts) & (counts > 0)
+        if state.generator is not None:
+            usable &= (state.raw < readout.largest_count()).all(0)
+        state.measured_distance = torch.where(usable, distance, torch.nan)
 
 
-def _plan_path(
-    options: SimulatorOptions, targets: list[str], generator: torch.Generator
-) -> list[PlannedFrame]:
-    timestamps = draw_timestamps(options.conditions, len(targets), 0.0, generator)
-    poses, camera_twists = draw_camera_path(
-        options.robot, timestamps, _fills_image(options), generator
-    )
-    frames = list(range(len(targets)))
-    conditions = draw_conditions(options.conditions, timestamps, frames, generator)
-    tool_from_camera = options.hand_eye.tool_from_camera()
-    planned = []
-    for frame, frame_conditions in zip(frames, conditions, strict=True):
-        commanded = _world_from_tool(options, poses[frame].plane_from_camera)
-        planned.append(
-            PlannedFrame(
-                target=targets[frame],
-                pose_id=None,
-                conditions=frame_conditions,
-                world_from_tool_recorded=commanded,
-                world_from_tool=commanded @ _robot_noise(options, generator),
-                tool_twist=_adjoint(tool_from_camera) @ camera_twists[frame],
-            )
-        )
-    return planned
-
-
-def _world_from_tool(options: SimulatorOptions, plane_from_camera: Tensor) -> Tensor:
-    world_from_camera = world_from_plane(*options.scene.plane.tensors()) @ plane_from_camera
-    return world_from_camera @ se3.inverse(options.hand_eye.tool_from_camera())
-
-
-def _robot_noise(options: SimulatorOptions, generator: torch.Generator) -> Tensor:
-    robot = options.robot
-    return se3.exp(
-        draw_twist(robot.repeatability_mm * 1e-3, robot.repeatability_mrad * 1e-3, generator)
-    )
-
-
-def _adjoint(transform: Tensor) -> Tensor:
-    """Return the (6, 6) matrix that carries a twist, translation first, to the target frame."""
-    rotation, (x, y, z) = transform[:3, :3], transform[:3, 3].tolist()
-    cross = transform.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    top = torch.cat([rotation, cross @ rotation], dim=1)
-    return torch.cat([top, torch.cat([torch.zeros_like(rotation), rotation], dim=1)])
-
-
-def _fills_image(options: SimulatorOptions) -> FillsImage:
-    """Return a function that says whether every pixel sees the wall, near and frontal enough."""
-    rays = ray_directions(options.camera.intrinsics())
-    # The wall is flat: if the rays at the image border satisfy the limits, so do all others.
-    border = torch.cat(
-        [rays[:1], rays[-1:], rays[:, :1].transpose(0, 1), rays[:, -1:].transpose(0, 1)], 1
-    )
-    steepest = math.cos(math.radians(options.robot.steepest_incidence_deg))
-    farthest = options.robot.farthest_pixel_m or math.inf
-    wall = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-
-    def fills_image(plane_from_camera: Tensor) -> bool:
-        normal, offset = plane_in_frame(wall, wall.new_zeros(()), plane_from_camera)
-        distance = ray_plane_distance(border, normal, offset)
-        frontal = -(border @ normal) >= steepest
-        return bool((frontal & (distance <= farthest)).all())
-
-    return fills_image
-
-
-# Simulation and recording of the planned frames.
-
-
-Progress = Callable[[Iterator[FrameState], int], Iterable[FrameState]]
-"""Wraps an iterator over frames, given their number, as `tqdm(frames, total=...)` does."""
+# Whole recordings: their frames are planned, simulated and written.
 
 
 def simulate(
@@ -211,7 +171,6 @@ def simulate(
     *,
     num_frames: int | None = None,
     noise: bool = True,
-    progress: Progress | None = None,
 ) -> Recording:
     """Simulate a camera on a robot before a wall, and write what it records.
 
@@ -226,7 +185,6 @@ def simulate(
         generator: Source of randomness; None: from the seed of the configuration.
         num_frames: Simulate only this many frames; None: all.
         noise: False: the expected measurement at exactly the recorded poses.
-        progress: Shows how many frames are done.
 
     Returns:
         The recording, opened.
@@ -237,81 +195,66 @@ def simulate(
     """
     options = resolve_options(SimulatorOptions, config)
     generator = seeded(options) if generator is None else generator
-    truth = _truth(options, generator)
+    seed, mount = generator.initial_seed(), options.hand_eye
     plan = draw_plan(options, generator, num_frames=num_frames)
-    rows = [_row(options, frame) for frame in plan.frames]
+    guess = hand_eye_guess(mount, generator)
     states = take_frames(options, plan, generator if noise else None)
-    with RecordingWriter(
+    recorded = options.conditions.recorded
+    writing = RecordingWriter(
         out,
         camera=options.camera.intrinsics(),
         depth_kind=options.depth_kind,
         modulation_frequency=options.sensor.modulation_frequency_hz,
-        tool_from_camera=plan.tool_from_camera_guess.numpy(),
-    ) as writer:
-        shown = states if progress is None else progress(states, len(rows))
-        for state, row in zip(shown, rows, strict=True):
+        tool_from_camera=guess.numpy(),
+    )
+    with writing as writer, bar(len(plan), "simulating") as advance:
+        for state in states:
+            row = row_of(state, recorded)
             append_measurement(writer, state, options.depth_kind, options.write_raw, row)
-        add_truth(writer, truth, options)
+            advance(1)
+        truth = {"tool_from_camera": mount.tool_from_camera().tolist(), "seed": seed}
+        writer.add_truth("truth", truth)
+        writer.add_truth("options", options.to_mapping())
     # The writer has checked each frame already.
     return Recording.open(out, check_contents=False)
 
 
 def take_frames(
-    options: SimulatorOptions, plan: Plan, generator: torch.Generator | None
+    options: SimulatorOptions, plan: Iterable[FrameState], generator: torch.Generator | None
 ) -> Iterator[FrameState]:
     """Simulate the frames of a plan.
 
     Args:
         options: Camera, scene, robot.
-        plan: The frames.
+        plan: The frames, of `draw_plan`.
         generator: Source of noise; None: the expected measurement at the recorded poses.
 
     Raises:
         ConfigError: An effect or a target is unknown.
     """
-    pipeline = SensorPipeline(
-        options.camera.intrinsics(), options.sensor, options.scene, build_effects(options.effects)
-    )
-    poses = [frame.world_from_tool_recorded for frame in plan.frames]
-    approach = sides_of_approach(torch.stack(poses))
-    return (
-        pipeline.run(_initial_state(options, frame, index, generator, approach[index]))
-        for index, frame in enumerate(plan.frames)
-    )
-
-
-def _initial_state(
-    options: SimulatorOptions,
-    frame: PlannedFrame,
-    index: int,
-    generator: torch.Generator | None,
-    approach: torch.Tensor,
-) -> FrameState:
-    normal, offset = options.scene.plane.tensors()
-    reached = frame.world_from_tool_recorded if generator is None else frame.world_from_tool
-    return FrameState(
-        index=index,
-        camera=options.camera.intrinsics(),
-        modulation_frequency=options.sensor.modulation_frequency_hz,
-        electrons_per_count=options.sensor.readout.electrons_per_count,
-        conditions=frame.conditions,
-        target=frame.target,
-        world_from_tool_recorded=frame.world_from_tool_recorded,
-        normal_world_recorded=normal,
-        offset_recorded=offset,
-        tool_twist=frame.tool_twist,
-        approach=approach,
-        generator=generator,
-        world_from_tool=reached,
-        tool_from_camera=options.hand_eye.tool_from_camera(),
-        normal_world=normal,
-        offset=offset,
-    )
+    camera, effects = options.camera.intrinsics(), build_effects(options.effects)
+    pipeline = SensorPipeline(camera, options.sensor, options.scene, effects)
+    for planned in plan:
+        reached = planned.world_from_tool_recorded if generator is None else planned.world_from_tool
+        yield pipeline.run(replace(planned, generator=generator, world_from_tool=reached))
 
 
 def seeded(options: SimulatorOptions) -> torch.Generator:
     """Return a generator that starts from the options' seed."""
     return torch.Generator().manual_seed(options.seed)
+
+
+def row_of(state: FrameState, recorded: Sequence[str]) -> FrameRow:
+    """Return what the recording says of a frame; `recorded` names the optional columns it has."""
+    known = {name: value for name, value in state.conditions.by_name().items() if name in recorded}
+    return FrameRow(
+        **known | {"timestamp": state.conditions.timestamp},
+        world_from_tool=state.world_from_tool_recorded.numpy(),
+        normal_world=state.normal_world_recorded.numpy(),
+        offset=float(state.offset_recorded),
+        target=state.target,
+        pose_id=state.pose_id if "pose_id" in recorded else None,
+    )
 
 
 def append_measurement(
@@ -339,33 +282,125 @@ def append_measurement(
     )
 
 
-def add_truth(writer: RecordingWriter, truth: dict[str, Any], options: SimulatorOptions) -> None:
-    """Add the true values and the options to `truth/`."""
-    writer.add_truth("truth", truth)
-    writer.add_truth("options", options.to_mapping())
+# The simulator at the poses, targets and conditions of an existing recording.
 
 
-def _truth(options: SimulatorOptions, generator: torch.Generator) -> dict[str, Any]:
-    return {
-        "tool_from_camera": options.hand_eye.tool_from_camera().tolist(),
-        "seed": generator.initial_seed(),
-    }
+def twin_frames(
+    options: SimulatorOptions,
+    recording: Recording,
+    generator: torch.Generator | None = None,
+    *,
+    tool_from_camera: Tensor | None = None,
+    reflectivity: Reflectivity = "pattern",
+    indices: Sequence[int] | None = None,
+) -> Iterator[FrameState]:
+    """Simulate the frames of an existing recording.
 
+    Poses, planes, targets, conditions and intrinsics are those of the recording; scene, sensor and
+    effects are those of the options. If the recording has no integration time, the reference time
+    of the light is used; if it has no background light, zero is used.
 
-def _row(options: SimulatorOptions, frame: PlannedFrame) -> FrameRow:
-    recorded = options.conditions.recorded
-    normal, offset = options.scene.plane.tensors()
-    known = {
-        each.name: getattr(frame.conditions, each.name)
-        for each in OPTIONAL_CONDITIONS
-        if each.name in recorded
-    }
-    return FrameRow(
-        timestamp=frame.conditions.timestamp,
-        world_from_tool=frame.world_from_tool_recorded.numpy(),
-        normal_world=normal.numpy(),
-        offset=float(offset),
-        target=frame.target,
-        pose_id=frame.pose_id if "pose_id" in recorded else None,
-        **known,
+    Args:
+        options: Scene, sensor, effects, and the robot's repeatability.
+        recording: The recording.
+        generator: Source of noise; None: the expected measurement at exactly the recorded poses.
+        tool_from_camera: Hand-eye transform, shape (4, 4); None: that of the options, or the
+            identity if the recording has no robot.
+        reflectivity: Source of the brightness of the target.
+        indices: Which frames, in this order; None: all.
+
+    Returns:
+        An iterator over the states of the frames. `measured_distance`, `measured_amplitude` and
+        `raw` are what this camera would report; `radial_distance` is the true distance.
+
+    Raises:
+        ConfigError: The scene does not know a target, or an effect is unknown.
+        CalibrationDataError: The recording's amplitude is needed, and it has none.
+    """
+    if tool_from_camera is None:
+        tool_from_camera = default_hand_eye(options, recording)
+    known = reflectivity == "from_recording"
+    if known:
+        recording.require("amplitude", "a twin that takes the reflectivity from the recording")
+    pipeline = SensorPipeline(
+        recording.camera, options.sensor, options.scene, build_effects(options.effects)
     )
+    table = recording.frames
+    poses = torch.from_numpy(table.world_from_tool)
+    twists = tool_twists(torch.from_numpy(table.timestamp), poses)
+    approach = sides_of_approach(poses)
+    reached = _reached_poses(options, recording, generator)
+
+    def simulated(index: int) -> FrameState:
+        row = table.row(index)
+        normal = torch.from_numpy(row.normal_world)
+        offset = torch.tensor(row.offset, dtype=torch.float64)
+        state = FrameState(
+            index=index,
+            camera=recording.camera,
+            modulation_frequency=modulation_frequency(options, recording),
+            electrons_per_count=options.sensor.readout.electrons_per_count,
+            conditions=Conditions(**row.by_name()),
+            target=row.target,
+            world_from_tool_recorded=poses[index],
+            normal_world_recorded=normal,
+            offset_recorded=offset,
+            tool_twist=None if twists[index].isnan().any() else twists[index],
+            approach=approach[index],
+            amplitude_recorded=_image(recording, "amplitude", index) if known else None,
+            surroundings=_surroundings(recording, index) if known else None,
+            generator=generator,
+            world_from_tool=reached[index],
+            tool_from_camera=tool_from_camera.to(torch.float64),
+            normal_world=normal,
+            offset=offset,
+        )
+        return pipeline.run(state)
+
+    return map(simulated, range(recording.num_frames) if indices is None else indices)
+
+
+def default_hand_eye(options: SimulatorOptions, recording: Recording) -> Tensor:
+    """Return the hand-eye transform of the options; without a robot, the identity."""
+    if recording.moves:
+        return options.hand_eye.tool_from_camera()
+    return torch.eye(4, dtype=torch.float64)
+
+
+def modulation_frequency(options: SimulatorOptions, recording: Recording) -> float:
+    """Return the modulation frequency of the recording in Hz, or that of the options if unknown."""
+    return recording.modulation_frequency or options.sensor.modulation_frequency_hz
+
+
+def _reached_poses(
+    options: SimulatorOptions, recording: Recording, generator: torch.Generator | None
+) -> Tensor:
+    """Return the true poses of the tool, (N, 4, 4): recorded poses with repeatability errors."""
+    recorded, pose_id = torch.from_numpy(recording.frames.world_from_tool), recording.frames.pose_id
+    if generator is None or not recording.moves:
+        return recorded
+    slips = torch.stack([draw_slip(options.robot, generator) for _ in range(recording.num_frames)])
+    if pose_id is not None:
+        # Same pose_id: same pose error; without one, independent errors.
+        alone = [f"frame {index}" for index in range(recording.num_frames)]
+        stop = np.where(pose_id == "", alone, pose_id)
+        _, first, group = np.unique(stop, return_index=True, return_inverse=True)
+        slips = slips[torch.from_numpy(first[group])]
+    return recorded @ se3.exp(slips)
+
+
+def _image(recording: Recording, name: str, index: int) -> Tensor | None:
+    """Return one frame of an array, shape (H, W), float64; None if the recording has none."""
+    frames = recording.read(name, np.array([index]))
+    return None if frames is None else torch.from_numpy(frames[0]).double()
+
+
+def _surroundings(recording: Recording, index: int) -> tuple[Tensor, Tensor] | None:
+    """Return what was recorded beside the target, as in `FrameState.surroundings`."""
+    mask, distance = (_image(recording, name, index) for name in ("mask", "depth"))
+    if mask is None or distance is None:
+        return None
+    if recording.depth_kind == "z":
+        distance = radial_distance_from_z_depth(distance, ray_directions(recording.camera))
+    returned = distance.isfinite() & (distance > 0)
+    return mask == 0, distance.where(returned, torch.nan)

@@ -14,7 +14,7 @@ from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.errors import ConfigError
 from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.twin import default_hand_eye
+from tofcorr.simulation.simulator import default_hand_eye
 
 
 class BuiltInSimulator(GivenSimulator):

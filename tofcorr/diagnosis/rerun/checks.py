@@ -29,7 +29,7 @@ from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.observables.compare import Observables, compare_observables
 from tofcorr.pixels.dataset import Dataset, HandEyeOptions, covered_domain
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.twin import Reflectivity, twin_frames
+from tofcorr.simulation.simulator import Reflectivity, twin_frames
 
 
 def fitted_to(study: Study, units: Tensor, names: Sequence[str]) -> Study:

@@ -21,8 +21,13 @@ from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions, unambiguous_range
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
-from tofcorr.simulation.options import CameraOptions, SensorOptions, ShotOptions, SimulatorOptions
-from tofcorr.simulation.robot import CameraMountOptions
+from tofcorr.simulation.options import (
+    CameraMountOptions,
+    CameraOptions,
+    SensorOptions,
+    ShotOptions,
+    SimulatorOptions,
+)
 from tofcorr.simulation.scene import SceneOptions, UniformTarget
 from tofcorr.simulation.signal import (
     AmplitudeTable,
@@ -33,7 +38,7 @@ from tofcorr.simulation.signal import (
     ReadoutOptions,
     image_from_lattice,
 )
-from tofcorr.simulation.twin import twin_frames
+from tofcorr.simulation.simulator import twin_frames
 
 # Knots of the distance curve at the least, beside twice the coefficients of a term, so that splines
 # and harmonics are resolved; knots of the amplitude curve; points of the pixel lattice a side.
