@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, ValidationError
 
-from tofcorr.errors import ConfigError
+from tofcorr.errors import ConfigError, TofcorrError
 
 LARGEST_NUMBER = 1e12
 """Largest number read from a file, in the file's own unit. Chosen: a hundred times the fastest
@@ -64,20 +64,23 @@ class Options(BaseModel):
     config_folder: ClassVar[str] = ""
 
     @classmethod
-    def from_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
+    def from_mapping(
+        cls, values: Mapping[str, Any], where: str, kind: type[TofcorrError] = ConfigError
+    ) -> Self:
         """Check `values` and build the options.
 
         Args:
             values: Keys and values, as YAML gives them.
             where: What to call the source in an error message, usually the file.
+            kind: The error to raise; that of a broken recording or calibration is another one.
 
         Raises:
-            ConfigError: A key is unknown or missing, or a value is not allowed.
+            TofcorrError: Of kind `kind`: a key is unknown or missing, or a value is not allowed.
         """
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise ConfigError(in_words(error, cls, where)) from None
+            raise kind(in_words(error, cls, where)) from None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, ready for YAML or JSON."""
@@ -186,6 +189,21 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401 - YAML may hold anything
         ConfigError: The file is missing, unreadable, too large or not YAML.
     """
     return parse_yaml(read_text(path), str(path))
+
+
+def read_mapping(path: Path, kind: type[TofcorrError] = ConfigError) -> Mapping[str, Any]:
+    """Read the keys and values of one YAML file.
+
+    Raises:
+        TofcorrError: Of kind `kind`: the file cannot be read, or holds something else.
+    """
+    try:
+        values = read_yaml(path)
+    except ConfigError as error:
+        raise kind(str(error)) from None
+    if not isinstance(values, Mapping):
+        raise kind(f"{path}: expected keys and values, got {type(values).__name__}.")
+    return values
 
 
 def read_text(path: Path) -> str:
@@ -314,7 +332,7 @@ def load_options(cls: type[OptionsT], path: Path | str) -> OptionsT:
     Raises:
         ConfigError: The file cannot be read, or does not fit `cls`.
     """
-    return cls.from_mapping(_read_mapping(Path(path)), str(path))
+    return cls.from_mapping(read_mapping(Path(path)), str(path))
 
 
 def resolve_options(
@@ -355,14 +373,7 @@ def _values_of(
         return config, "the configuration"
     if isinstance(config, str):
         config = shipped_file(config, cls.config_folder)
-    return _read_mapping(config), str(config)
-
-
-def _read_mapping(path: Path) -> Mapping[str, Any]:
-    values = read_yaml(path)
-    if not isinstance(values, Mapping):
-        raise ConfigError(f"{path}: expected keys and values, got {type(values).__name__}.")
-    return values
+    return read_mapping(config), str(config)
 
 
 def _with_defaults(cls: type[Options], values: Mapping[str, Any]) -> Mapping[str, Any]:

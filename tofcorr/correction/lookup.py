@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tofcorr.correction.metadata import LutMetadata
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError
 
 FORMAT = "tofcorr-lut"
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError)
@@ -98,10 +98,7 @@ def read_lut(path: Path | str) -> LookupTable:
         raise CalibrationDataError(f"{path}: is not a look-up table that tofcorr export wrote.")
     if mark.get("version") != 1:
         raise CalibrationDataError(f"{path}: is a table of another version of tofcorr.")
-    try:
-        known = LutMetadata.from_mapping(metadata, f"{path}, metadata")
-    except ConfigError as error:
-        raise CalibrationDataError(str(error)) from None
+    known = LutMetadata.from_mapping(metadata, f"{path}, metadata", CalibrationDataError)
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise CalibrationDataError(f"{path}: is damaged: one of its arrays is none.")
     _refuse_other_arrays(arrays, known, path)

@@ -9,7 +9,7 @@ import torch
 from pydantic import BeforeValidator, ConfigDict
 from torch.jit import ScriptModule
 
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError
 from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import DepthKind, Distortion, PinholeMatrix
 from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size, not_a_truth_value
@@ -92,7 +92,5 @@ def load_corrector(path: Path) -> tuple[ScriptModule, CorrectorMetadata]:
         raise CalibrationDataError(
             f"{path}: a TorchScript module, but without a corrector's metadata; expected {_WHAT}."
         )
-    try:
-        return corrector, CorrectorMetadata.from_mapping(metadata, f"{path}, metadata")
-    except ConfigError as error:
-        raise CalibrationDataError(str(error)) from None
+    known = CorrectorMetadata.from_mapping(metadata, f"{path}, metadata", CalibrationDataError)
+    return corrector, known

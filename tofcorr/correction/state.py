@@ -15,7 +15,7 @@ from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError
 from tofcorr.files import refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
 from tofcorr.options import LARGEST_NUMBER, FiniteNumber, Options, PositiveNumber, one_line
@@ -207,10 +207,7 @@ def load_calibration(path: Path | str) -> CalibrationState:
     values = read_values(path, _FORMAT, "this package reads version 1")
     if values is None:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
-    try:
-        state = CalibrationState.from_mapping(values, str(path))
-    except ConfigError as error:
-        raise CalibrationDataError(str(error)) from None
+    state = CalibrationState.from_mapping(values, str(path), CalibrationDataError)
     _refuse_other_numbers(state, path)
     try:
         state.model()

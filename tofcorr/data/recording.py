@@ -14,10 +14,17 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray, frame_chunks, open_array, read_frames
 from tofcorr.data.table import COLUMN_OF, TABLE_FILE, UNIT_LENGTH_TOLERANCE, FrameTable, read_table
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
 from tofcorr.geometry.rays import plane_in_frame, radial_distance_from_z_depth, ray_directions
-from tofcorr.options import Number, Options, PositiveNumber, dump_yaml, not_a_truth_value, read_yaml
+from tofcorr.options import (
+    Number,
+    Options,
+    PositiveNumber,
+    dump_yaml,
+    not_a_truth_value,
+    read_mapping,
+)
 
 HEADER_FILE = "recording.yaml"
 PlaneOrigin = Literal["recorded", "estimated"]
@@ -100,14 +107,7 @@ def read_header(path: Path) -> Header:
             raise CalibrationDataError(f"{path}: larger than 1 MB, so not a {HEADER_FILE}.")
     except OSError as error:
         raise CalibrationDataError(f"{path}: cannot be read ({error.strerror}).") from None
-    try:
-        values = read_yaml(path)
-    except ConfigError as error:
-        raise CalibrationDataError(str(error)) from None
-    if not isinstance(values, Mapping):
-        raise CalibrationDataError(
-            f"{path}: expected keys and values, got {type(values).__name__}."
-        )
+    values = read_mapping(path, CalibrationDataError)
     # Their defaults are for the writer; a file must contain both.
     for key in ("format", "version"):
         if key not in values:
@@ -128,10 +128,7 @@ def header_text(header: Header) -> str:
 def _validated(values: Mapping[str, Any], where: str) -> Header:
     if values.get("tool_from_camera", ()) is None:  # null: unknown, so the identity.
         values = {key: value for key, value in values.items() if key != "tool_from_camera"}
-    try:
-        return Header.from_mapping(values, where)
-    except ConfigError as error:
-        raise CalibrationDataError(str(error)) from None
+    return Header.from_mapping(values, where, CalibrationDataError)
 
 
 def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
