@@ -444,9 +444,9 @@ def _replaced(
 def _default(here: Any, names: list[str]) -> Any:  # noqa: ANN401 - any YAML value
     """Return the default at `names`, or an empty mapping where there is none."""
     for name in names:
-        entries = dict(enumerate(here)) if isinstance(here, list) else here
-        key = int(name) if isinstance(here, list) and name.isdecimal() else name
-        here = entries.get(key) if isinstance(entries, Mapping) else None
+        if isinstance(here, list):
+            here = {str(index): entry for index, entry in enumerate(here)}
+        here = here.get(name) if isinstance(here, Mapping) else None
     return {} if here is None else here
 
 

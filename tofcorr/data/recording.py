@@ -30,8 +30,6 @@ HEADER_FILE = "recording.yaml"
 PlaneOrigin = Literal["recorded", "estimated"]
 """`recorded`: measured by other means; `estimated`: found in the depth itself, never truth."""
 
-# Largest size of a header, bytes. Set by hand: a header has about twenty lines.
-_LARGEST_HEADER_BYTES = 1_000_000
 
 Row4 = tuple[Number, Number, Number, Number]
 
@@ -90,9 +88,10 @@ def build_header(
         "saturation_amplitude": saturation_amplitude,
         "planes": planes,
         "frames": (frame_names or FrameNames()).to_mapping(),
+        "tool_from_camera": None
+        if tool_from_camera is None
+        else np.asarray(tool_from_camera, dtype=np.float64).tolist(),
     }
-    if tool_from_camera is not None:
-        values["tool_from_camera"] = np.asarray(tool_from_camera, dtype=np.float64).tolist()
     return _validated(values, HEADER_FILE)
 
 
@@ -102,11 +101,6 @@ def read_header(path: Path) -> Header:
     Raises:
         CalibrationDataError: The file is missing or breaks the format; the message names the key.
     """
-    try:
-        if path.stat().st_size > _LARGEST_HEADER_BYTES:
-            raise CalibrationDataError(f"{path}: larger than 1 MB, so not a {HEADER_FILE}.")
-    except OSError as error:
-        raise CalibrationDataError(f"{path}: cannot be read ({error.strerror}).") from None
     values = read_mapping(path, CalibrationDataError)
     # Their defaults are for the writer; a file must contain both.
     for key in ("format", "version"):
