@@ -8,7 +8,8 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.error_terms.registry import RESIDUAL_NETWORK, TERMS
+from tofcorr.error_terms.registry import TERMS
+from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 
 KINDS = [*TERMS, "residual_network"]
 DOMAIN = Domain(
@@ -35,7 +36,7 @@ def model_of(kind: str, domain: Domain = DOMAIN, **options: Any) -> ErrorModel:
     """Build an untrained model of one kind of term."""
     if kind == "residual_network":
         model = ErrorModel(ErrorModelOptions(), domain)
-        model.residual = RESIDUAL_NETWORK.term(RESIDUAL_NETWORK.options(**options), domain)
+        model.residual = ResidualNetwork(ResidualNetworkOptions(**options), domain)
         return model
     term = {"kind": kind, **options}
     return ErrorModel(ErrorModelOptions.from_mapping({"terms": [term]}, kind), domain)

@@ -15,7 +15,7 @@ SIZES = [
     (kind, name)
     for kind, found in TERMS.items()
     for name in ("degree", "harmonics")
-    if name in found.options.model_fields
+    if name in found.model_fields
 ]
 WITHOUT = {
     "amplitude": replace(DOMAIN, amplitude=None, normalised_amplitude=None),
@@ -72,7 +72,7 @@ def test_every_value_of_a_state_is_a_tensor(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", TERMS)
 def test_a_domain_without_what_a_term_needs_is_refused(kind: str) -> None:
-    for need in TERMS[kind].options.needs:
+    for need in TERMS[kind].needs:
         with pytest.raises(CalibrationDataError):
             model_of(kind, WITHOUT[need])
 
@@ -82,7 +82,7 @@ def test_a_term_reads_only_what_it_says_it_needs(kind: str, generator: torch.Gen
     model = model_of(kind)
     randomise(model, generator)
     distance, amplitude, conditions = inputs(generator)
-    needs = TERMS[kind].options.needs
+    needs = TERMS[kind].needs
     read = [CONDITIONS.index(name) for name in needs if name in CONDITIONS]
     unread = [k for k in range(len(CONDITIONS)) if k not in read]
     changed = conditions.clone()
@@ -129,7 +129,7 @@ def test_the_polynomial_of_a_term_is_the_term(kind: str, generator: torch.Genera
 
 @pytest.mark.parametrize("kind", TERMS)
 def test_options_found_in_data_do_not_change_the_functions(kind: str) -> None:
-    options = TERMS[kind].options()
+    options = TERMS[kind]()
     assert set(options.found_in_data) <= set(type(options).model_fields)
     assert all(options.is_open(name) for name in options.found_in_data)
     assert not set(options.found_in_data) & set(options.structure())

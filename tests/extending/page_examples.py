@@ -11,7 +11,7 @@ from extended_package import Addition
 PAGES = sorted((ROOT / "docs" / "how-to").glob("add-*.md"))
 # The text in each registry in front of which the line goes.
 END_OF_LIST = {
-    "error_terms": ")\n# Not a term",
+    "error_terms": ")\n\n\ndef _class",
     "simulation": ")\n\n\ndef _effect",
     "importing": ")\n\nIMPORTERS",
     "correction": ")\n\nFORMATS",

@@ -161,7 +161,7 @@ def test_beyond_the_ranges_the_error_is_that_of_their_edges(kind: str) -> None:
 def test_amplitudes_are_needed_where_a_term_says_so(kind: str) -> None:
     module = module_of(kind)
     depth, amplitude = frames()
-    if TERMS[kind].options.needs == ("amplitude",):
+    if TERMS[kind].needs == ("amplitude",):
         with pytest.raises(FrameError, match="the model has a term of the amplitude"):
             module(depth)
         amplitude[0, 1, 2] = math.nan

@@ -28,7 +28,7 @@ from tofcorr.fit.problem import Start, build_model, refuse_missing_inputs
 from tofcorr.fit.walls import FoundWalls, name_walls, recorded_walls, walls_alone, with_every_wall
 from tofcorr.pixels.dataset import Dataset, covered_domain, recorded_hand_eye
 from tofcorr.pixels.metrics import FrameErrors
-from tofcorr.pixels.sample import MaskOptions, error_at, pixels_of_image, usable_pixels
+from tofcorr.pixels.sample import MaskOptions, pixels_of_image, usable_pixels
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.judgement import frames_left_out, left_out_mapping, left_out_words
 from tofcorr.training.options import TrainingOptions
@@ -279,7 +279,7 @@ def _planes_in_tool(dataset: Dataset) -> Tensor:
 @torch.no_grad()
 def _error_sums(model: CalibrationModel, pixels: Pixels, rays: Tensor, plane: Tensor) -> Tensor:
     """Return |error| and error^2 of the three kinds, summed, and the number of pixels: (7,)."""
-    corrected = pixels.radial_distance - error_at(model.error, pixels)
+    corrected = pixels.radial_distance - model.error.error_at(pixels)
     plane_in_camera = plane.to(corrected) @ model.hand_eye()
     cosine = rays @ plane_in_camera[:3]
     to_plane = cosine * corrected + plane_in_camera[3]

@@ -267,7 +267,7 @@ def _by_pose(dataset: Dataset, groups: list[FrameErrors], options: SelectionOpti
 def _complexity(training: TrainingOptions, domain: Domain, dataset: Dataset) -> int:
     """Return how many unknowns a model has beside the hand-eye transform."""
     unknowns = ErrorModel(training.model, domain).coefficient_vector().numel()
-    if training.model.pixel_map is not None:
+    if training.model.with_columns() != training.model:
         unknowns += domain.height * domain.width
     if training.planes == "unknown":
         unknowns += 3 * len(name_walls(dataset).names)

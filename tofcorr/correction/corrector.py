@@ -19,9 +19,9 @@ from tofcorr.error_terms.base import (
     Interval,
     ScaledPolynomial,
     SignalTerm,
+    unscale,
 )
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.polynomials import unscale
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.geometry.se3 import transformed
 from tofcorr.version import __version__

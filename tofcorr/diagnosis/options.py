@@ -5,10 +5,10 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.error_terms.polynomials import (
+from tofcorr.error_terms.pixel_terms import PixelPolynomialOptions
+from tofcorr.error_terms.signal_terms import (
     AmplitudePolynomialOptions,
     DistancePolynomialOptions,
-    PixelPolynomialOptions,
 )
 from tofcorr.options import Options
 

@@ -37,9 +37,9 @@ from tofcorr.fit.linear_image import (
 )
 from tofcorr.fit.reference import Reference, own_noise, pixel_weights, repeated
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.pixels.dataset import Dataset, within
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import image_planes, off_the_wall, some_pixels
-from tofcorr.pixels.sample import error_at, pixels_of_image
+from tofcorr.pixels.sample import pixels_of_image
 
 Wall = Literal["per_image", "one", "recorded"]
 """What is known of the wall: nothing; that all images show one wall; its recorded plane."""
@@ -112,7 +112,7 @@ def corrected_images(
     )
     for batch in dataset.batches():
         on_wall = batch.valid & ~off_wall(batch)
-        inside = on_wall & within(state.domain, batch.radial_distance, batch.amplitude)
+        inside = on_wall & state.domain.holds(batch.radial_distance, batch.amplitude)
         count.on_wall += int(on_wall.sum())
         count.calibrated += int(inside.sum())
         corrected = _corrected(model.error, batch, inside)
@@ -147,7 +147,7 @@ def _corrected(error: ErrorModel, batch: FrameBatch, inside: Tensor) -> FrameBat
     for k in range(len(distance)):
         used = inside[k].flatten().nonzero()[:, 0]
         flat = distance[k].flatten()
-        flat[used] -= error_at(error, pixels_of_image(batch, k, used))
+        flat[used] -= error.error_at(pixels_of_image(batch, k, used))
         distance[k] = flat.view(distance.shape[1:])
     return replace(batch, radial_distance=distance, valid=inside)
 

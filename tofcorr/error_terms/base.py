@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
+from numpy.polynomial import Polynomial
 from pydantic import AfterValidator, ConfigDict
 from torch import Tensor, nn
 
@@ -52,11 +53,9 @@ class Interval(NamedTuple):
     def outwards(self) -> "Interval":
         """Return the smallest interval between float32 numbers that holds this one."""
         low, high = np.float32(self.low), np.float32(self.high)
-        if low > self.low:
-            low = np.nextafter(low, np.float32(-inf))
-        if high < self.high:
-            high = np.nextafter(high, np.float32(inf))
-        return Interval(float(low), float(high))
+        outside = np.nextafter(low, np.float32(-inf)), np.nextafter(high, np.float32(inf))
+        low = outside[0] if low > self.low else low
+        return Interval(float(low), float(outside[1] if high < self.high else high))
 
 
 EVERYTHING = Interval(-inf, inf)
@@ -111,6 +110,15 @@ class Domain:
         """Return the mean conditions in the order of `CONDITIONS`; 0 where unknown."""
         return [self.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
 
+    def holds(self, distance: Tensor, amplitude: Tensor | None) -> Tensor:
+        """Return where distance and amplitude are in their ranges, shape of the distance, bool."""
+        low, high = self.radial_distance
+        inside = (distance >= low) & (distance <= high)
+        if self.amplitude is not None and amplitude is not None:
+            low, high = self.amplitude
+            inside &= (amplitude >= low) & (amplitude <= high)
+        return inside
+
     def amplitude_floor(self) -> float:
         """Return the amplitude below which the logarithm is constant.
 
@@ -133,11 +141,10 @@ class Domain:
         if variable == "distance":
             return self.radial_distance
         floor = self.amplitude_floor()
-        assert self.amplitude is not None
-        assert self.normalised_amplitude is not None
+        known = getattr(self, variable.removeprefix("log_"))
         if variable == "log_amplitude":
-            return Interval(*(log(max(end, floor)) for end in self.amplitude))
-        return self.amplitude if variable == "amplitude" else self.normalised_amplitude
+            return Interval(*(log(max(end, floor)) for end in known))
+        return known
 
 
 class ScaledPolynomial(NamedTuple):
@@ -172,8 +179,33 @@ class Axis(NamedTuple):
     segments: int = 1
 
 
-Strength = float | str
-"""Weight of a term's roughness in the loss: a number, or "auto": by cross-validation."""
+def powers(scaled: Tensor, degree: int) -> Tensor:
+    """Return u, u^2, ..., u^degree, shape (degree, ...)."""
+    columns = [scaled]
+    for _ in range(degree - 1):
+        columns.append(columns[-1] * scaled)
+    return torch.stack(columns)
+
+
+def combined(coefficients: Tensor, functions: Tensor) -> Tensor:
+    """Return the sum of functions (K, ...), each times its coefficient, in full precision."""
+    return (functions.movedim(0, -1) * coefficients).sum(-1)
+
+
+def unscale(coefficients: Tensor, centre: float, half_width: float) -> list[float]:
+    """Expand a polynomial in u = (x - centre) / half_width into powers of x.
+
+    Args:
+        coefficients: Coefficients of u, u^2, ..., shape (degree,).
+        centre: Centre of the scaled variable, in units of x.
+        half_width: Its half-width, in units of x.
+
+    Returns:
+        Coefficients of 1, x, x^2, ...: one more than were given.
+    """
+    scaled = Polynomial([0.0, *coefficients.detach().double().cpu().tolist()])
+    found = scaled(Polynomial([-centre / half_width, 1.0 / half_width])).coef.tolist()
+    return found + [0.0] * (len(coefficients) + 1 - len(found))
 
 
 class DescribedOptions(Options):
@@ -224,8 +256,8 @@ class DescribedModule(nn.Module):
     """
 
     def description(self) -> dict[str, Any]:
-        """Return what a state must agree on to be loaded, as plain values."""
-        raise NotImplementedError
+        """Return what a state must agree on to be loaded, as plain values: the fixed options."""
+        return self.options.structure()  # type: ignore[union-attr, operator]
 
     def get_extra_state(self) -> Tensor:
         """Return the description as JSON in a tensor of bytes.
@@ -259,7 +291,20 @@ class DescribedModule(nn.Module):
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def _require_same(self, state: Tensor) -> None:
-        require_equal(self._description_in(state), self.description(), type(self).__name__)
+        own, stored = self.description(), self._description_in(state)
+        for key in dict.fromkeys([*own, *stored]):
+            expected, found = own.get(key), stored.get(key)
+            if found != json.loads(json.dumps(expected)):
+                raise StateError(
+                    f"{type(self).__name__}: the state is of another model: its '{key}' is "
+                    f"{found}, this module's is {expected}. Build the module as the saved one was "
+                    "built."
+                )
+
+    def register_interval(self, prefix: str, interval: Interval) -> None:
+        """Keep `centre` and `half_width` of an interval, each behind a prefix, as such numbers."""
+        self.register_number(f"{prefix}centre", interval.centre)
+        self.register_number(f"{prefix}half_width", interval.half_width)
 
     def register_number(self, name: str, value: float, *, persistent: bool = True) -> None:
         """Keep a number as a buffer of shape (), float64; in the state, if persistent."""
@@ -277,21 +322,6 @@ def decode(state: Tensor) -> dict[str, Any]:
     return json.loads(bytes(state.tolist()).decode())
 
 
-def require_equal(stored: dict[str, Any], own: dict[str, Any], name: str) -> None:
-    """Refuse a stored description that differs from a module's own.
-
-    Raises:
-        StateError: The message names the first difference.
-    """
-    for key in dict.fromkeys([*own, *stored]):
-        expected, found = own.get(key), stored.get(key)
-        if found != json.loads(json.dumps(expected)):
-            raise StateError(
-                f"{name}: the state is of another model: its '{key}' is {found}, "
-                f"this module's is {expected}. Build the module as the saved one was built."
-            )
-
-
 class Term(DescribedModule, ABC):
     """Base of all terms with coefficients: a vector (K,) that starts at zero, and its names.
 
@@ -305,29 +335,19 @@ class Term(DescribedModule, ABC):
 
     Attributes:
         coefficients: Shape (K,), metres.
-        strength: Weight of `roughness` in the loss, or "auto".
     """
 
-    group: str
-    symbols: list[str]
-    strength: Strength
+    __jit_unused_properties__: ClassVar[list[str]] = ["strength"]
 
     def __init__(self, options: BaseTermOptions, group: str, symbols: list[str]) -> None:
         super().__init__()
-        self.options = options
-        self.group = group
-        self.symbols = symbols
-        self.strength = getattr(options, "strength", 0.0)
+        self.options, self.group, self.symbols = options, group, symbols
         self.coefficients = nn.Parameter(torch.zeros(len(symbols), dtype=torch.float64))
 
-    def set_options(self, options: BaseTermOptions) -> None:
-        """Replace the options by others of the same functions: what a fit found in the data."""
-        self.options = options
-        self.strength = getattr(options, "strength", 0.0)
-
-    def description(self) -> dict[str, Any]:
-        """Return the options that fix the functions."""
-        return self.options.structure()
+    @property
+    def strength(self) -> float | str:
+        """Weight of `roughness` in the loss: a number, or "auto": by cross-validation."""
+        return getattr(self.options, "strength", 0.0)
 
     def roughness(self) -> Tensor:
         """Return the rows F (R, K) whose squared product with the coefficients is penalised.
@@ -336,23 +356,23 @@ class Term(DescribedModule, ABC):
         """
         return torch.zeros(0, len(self.symbols), dtype=torch.float64)
 
-    def paper_coefficients(self) -> tuple[dict[str, float], float]:
-        """Return the coefficients on unscaled variables, and the constant that remains, metres.
+    def paper_coefficients(self) -> tuple[dict[str, tuple[float, str]], float]:
+        """Return the coefficients on unscaled variables, each with its unit, and what remains.
 
-        A term that has no form in the paper gives its coefficients as they are, in metres.
+        A term that has no form in the paper gives its coefficients as they are, in metres. What
+        remains is a constant, metres.
         """
         values = self.coefficients.detach().double().tolist()
-        return dict(zip(self.symbols, values, strict=True)), 0.0
-
-    def paper_units(self) -> dict[str, str]:
-        """Return the unit of every symbol that `paper_coefficients` may give."""
-        return dict.fromkeys(self.symbols, "m")
+        return {symbol: (own, "m") for symbol, own in zip(self.symbols, values, strict=True)}, 0.0
 
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
         """Set coefficients on unscaled variables; return the constant they add, metres."""
-        own = [values[symbol] for symbol in self.symbols]
-        self.coefficients.data.copy_(self.coefficients.new_tensor(own))
+        self.set_coefficients([values[symbol] for symbol in self.symbols])
         return 0.0
+
+    def set_coefficients(self, values: list[float]) -> None:
+        """Set the coefficients, metres, untouched by autograd."""
+        self.coefficients.data.copy_(self.coefficients.new_tensor(values))
 
 
 class SignalTerm(Term):
@@ -366,21 +386,19 @@ class SignalTerm(Term):
             range of N the value at its edge is used.
     """
 
-    needs_amplitude: bool
-    uses_normalised_amplitude: bool
-
     def __init__(self, options: BaseTermOptions, group: str, symbols: list[str]) -> None:
         super().__init__(options, group, symbols)
-        self.needs_amplitude = options.needs_amplitude
-        self.uses_normalised_amplitude = False
+        self.needs_amplitude: bool = options.needs_amplitude
+        variable = getattr(options, "variable", None)
+        self.uses_normalised_amplitude: bool = variable == "normalised_amplitude"
 
     @abstractmethod
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the functions f_k, shape (K, ...), of distances (...) in metres and amplitudes."""
 
-    @abstractmethod
     def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""
+        return combined(self.coefficients, self.basis(radial_distance, amplitude))
 
     def polynomial(self) -> ScaledPolynomial | None:
         """Return the term as a polynomial of one variable, which the runtime adds to others.
@@ -426,33 +444,33 @@ class CurveTerm(SignalTerm):
         of_distance = variable == "distance"
         super().__init__(options, "distance" if of_distance else "intensity", symbols)
         self.variable = variable
-        self.uses_normalised_amplitude = variable == "normalised_amplitude"
-        interval = domain.interval(variable)
-        self.register_number("centre", interval.centre)
-        self.register_number("half_width", interval.half_width)
+        self.register_interval("", domain.interval(variable))
         floor = 0.0 if of_distance else domain.amplitude_floor()
         self.register_number("floor", floor, persistent=not of_distance)
 
     def scaled(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the scaled variable u, shape (...)."""
-        value = radial_distance
-        if self.variable == "amplitude":
-            value = amplitude
-        elif self.variable == "normalised_amplitude":
-            value = amplitude * radial_distance * radial_distance
-        elif self.variable == "log_amplitude":
-            value = torch.maximum(amplitude, self.floor).log()
+        value = variable_of(self.variable, radial_distance, amplitude, self.floor)
         return (value - self.centre) / self.half_width
 
     def scale(self) -> tuple[float, float]:
         """Return centre and half-width."""
         return float(self.centre), float(self.half_width)
 
-    def axis(self, segments: int) -> Axis:
-        """Return the variable with so many pieces over its calibrated range."""
-        centre, half_width = self.scale()
-        low, high = centre - half_width, centre + half_width
-        return Axis(self.variable, low, high, segments)  # type: ignore[arg-type]
+
+def variable_of(variable: str, radial_distance: Tensor, amplitude: Tensor, floor: Tensor) -> Tensor:
+    """Return a variable of the signal, shape (...); the logarithm is constant below the floor."""
+    if variable == "distance":
+        return radial_distance
+    if variable == "normalised_amplitude":
+        return amplitude * radial_distance * radial_distance
+    return torch.maximum(amplitude, floor).log() if variable == "log_amplitude" else amplitude
+
+
+def axis_of(variable: str, centre: Tensor, half_width: Tensor, segments: int) -> Axis:
+    """Return a variable with so many pieces over its calibrated range."""
+    low, high = float(centre - half_width), float(centre + half_width)
+    return Axis(variable, low, high, segments)  # type: ignore[arg-type]
 
 
 class PixelTerm(Term):
@@ -461,16 +479,13 @@ class PixelTerm(Term):
     .. math:: E(v) = \sum_k \beta_k s_k(r_v, c_v)
     """
 
-    def __init__(self, options: BaseTermOptions, symbols: list[str]) -> None:
-        super().__init__(options, "pixel", symbols)
-
     @abstractmethod
     def basis(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Return the functions s_k, shape (K, ...), of rows and columns (...) in pixels."""
 
-    @abstractmethod
     def forward(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""
+        return combined(self.coefficients, self.basis(rows, columns))
 
 
 class ConditionTerm(Term):
@@ -527,9 +542,9 @@ class ConditionTerm(Term):
     def basis(self, conditions: Tensor) -> Tensor:
         """Return the functions h_k, shape (K, ...), of conditions (..., C) as in `CONDITIONS`."""
 
-    @abstractmethod
     def forward(self, conditions: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""
+        return combined(self.coefficients, self.basis(conditions))
 
 
 class PixelMap(DescribedModule):
@@ -550,10 +565,6 @@ class PixelMap(DescribedModule):
         self.options = options
         size = (domain.height, domain.width)
         self.register_buffer("offset", torch.zeros(size, dtype=torch.float64))
-
-    def set_options(self, options: BaseTermOptions) -> None:
-        """Replace the options by others of the same functions: what a fit found in the data."""
-        self.options = options
 
     def description(self) -> dict[str, Any]:
         """Return kind and image size."""

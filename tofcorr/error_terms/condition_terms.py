@@ -8,8 +8,7 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.error_terms.base import BaseTermOptions, ConditionTerm, Domain
-from tofcorr.error_terms.polynomials import horner, powers
+from tofcorr.error_terms.base import BaseTermOptions, ConditionTerm, Domain, powers
 from tofcorr.errors import FrameError
 
 
@@ -63,17 +62,9 @@ class ConditionPolynomial(ConditionTerm):
         # A condition that did not change has no scale: any number does.
         self.register_number("half_width", float(self.high - self.low) / 2 or 1.0)
 
-    def scaled(self, conditions: Tensor) -> Tensor:
-        """Return the scaled condition u, shape (...)."""
-        return (self.value(conditions) - self.mean) / self.half_width
-
     def basis(self, conditions: Tensor) -> Tensor:
         """Return u, u^2, ..., shape (K, ...)."""
-        return powers(self.scaled(conditions), self.degree)
-
-    def forward(self, conditions: Tensor) -> Tensor:
-        """Return the predicted error, shape (...), metres."""
-        return horner(self.coefficients, self.scaled(conditions))
+        return powers((self.value(conditions) - self.mean) / self.half_width, self.degree)
 
 
 class WarmUpOptions(BaseTermOptions):
@@ -118,18 +109,11 @@ class WarmUp(ConditionTerm):
         constants = (max(span, 1.0) / 3,) if chosen == "auto" else chosen
         self.register_buffer("rates", 1.0 / torch.tensor(constants, dtype=torch.float64))
 
-    def decay(self, conditions: Tensor) -> Tensor:
-        """Return each exponential less its value at the mean time, shape (..., K)."""
-        time = self.value(conditions).unsqueeze(-1)
-        return torch.exp(-time * self.rates) - torch.exp(-self.mean * self.rates)
-
     def basis(self, conditions: Tensor) -> Tensor:
-        """Return the exponentials, shape (K, ...)."""
-        return self.decay(conditions).movedim(-1, 0)
-
-    def forward(self, conditions: Tensor) -> Tensor:
-        """Return the predicted error, shape (...), metres."""
-        return (self.decay(conditions) * self.coefficients).sum(-1)
+        """Return each exponential less its value at the mean time, shape (K, ...)."""
+        time = self.value(conditions).unsqueeze(-1)
+        decay = torch.exp(-time * self.rates) - torch.exp(-self.mean * self.rates)
+        return decay.movedim(-1, 0)
 
 
 Condition = float | Tensor | None

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from tofcorr.error_terms.base import (
     EVERYTHING,
-    BaseTermOptions,
     ConditionTerm,
     DescribedModule,
     Domain,
@@ -35,23 +34,13 @@ class ErrorModelOptions(Options):
 
     @model_validator(mode="after")
     def _one_map(self) -> "ErrorModelOptions":
-        maps = [term.kind for term in self.terms if not term.has_columns]
-        if len(maps) > 1:
+        if len(maps := [term.kind for term in self.terms if not term.has_columns]) > 1:
             raise ValueError(f"the term {maps[0]} may be given only once")
         return self
-
-    @property
-    def pixel_map(self) -> BaseTermOptions | None:
-        """The options of the term that is a map of the pixels; None if there is none."""
-        return next((term for term in self.terms if not term.has_columns), None)
 
     def with_columns(self) -> "ErrorModelOptions":
         """Return the terms that the moments estimate: all but a map of the pixels."""
         return ErrorModelOptions(terms=tuple(term for term in self.terms if term.has_columns))
-
-    def without(self, missing: str) -> "ErrorModelOptions":
-        """Return the terms that do not need `missing`, such as `amplitude`."""
-        return ErrorModelOptions(terms=tuple(t for t in self.terms if missing not in t.needs))
 
     def same_coefficients(self, other: "ErrorModelOptions") -> bool:
         """Whether both models have the same terms, apart from what a fit finds in the data."""
@@ -98,39 +87,40 @@ class ErrorModel(DescribedModule):
         super().__init__()
         self.constant = nn.Parameter(torch.zeros((), dtype=torch.float64))
         built = [build_term(term, domain) for term in options.terms]
-        self.signal_terms = nn.ModuleList([term for term in built if isinstance(term, SignalTerm)])
-        self.pixel_terms = nn.ModuleList([term for term in built if isinstance(term, PixelTerm)])
-        self.condition_terms = nn.ModuleList([t for t in built if isinstance(t, ConditionTerm)])
-        maps = [term for term in built if isinstance(term, PixelMap)]
-        self.fixed_pattern: PixelMap | None = maps[0] if maps else None
+        self.signal_terms, self.pixel_terms, self.condition_terms = (
+            nn.ModuleList([term for term in built if isinstance(term, base)])
+            for base in (SignalTerm, PixelTerm, ConditionTerm)
+        )
+        self.fixed_pattern: PixelMap | None = next(
+            (term for term in built if isinstance(term, PixelMap)), None
+        )
         self.residual: ResidualNetwork | None = None
         self.height: int = domain.height
         self.width: int = domain.width
 
     def description(self) -> dict[str, Any]:
         """Return image size, terms and residual network."""
-        maps = [] if self.fixed_pattern is None else [self.fixed_pattern.description()]
         return {
             "image size": [self.height, self.width],
-            "terms": [*(term.description() for term in self.terms()), *maps],
+            "terms": [term.description() for term in self._terms_and_map()],
             "residual network": None if self.residual is None else self.residual.description(),
         }
 
     def set_options(self, options: ErrorModelOptions) -> None:
         """Replace the terms' options by others of the same functions, in any order."""
         remaining = list(options.terms)
-        maps = [] if self.fixed_pattern is None else [self.fixed_pattern]
-        for term in [*self.terms(), *maps]:
+        for term in self._terms_and_map():
             own = term.options.structure()
-            found = next(one for one in remaining if one.structure() == own)
-            remaining.remove(found)
-            term.set_options(found)
+            term.options = next(one for one in remaining if one.structure() == own)
+            remaining.remove(term.options)
+
+    def _terms_and_map(self) -> list[Term | PixelMap]:
+        return [*self.terms(), *([] if self.fixed_pattern is None else [self.fixed_pattern])]
 
     def needs_amplitude(self) -> bool:
         """Whether any term, or the residual network, reads the amplitude."""
-        if self.residual is not None and self.residual.uses_amplitude:
-            return True
-        return any(bool(term.needs_amplitude) for term in self.signal_terms)
+        of_network = self.residual is not None and self.residual.uses_amplitude
+        return of_network or any(bool(term.needs_amplitude) for term in self.signal_terms)
 
     def needs_normalised_amplitude(self) -> bool:
         """Whether any term is a function of the distance-normalised amplitude N = I D^2."""
@@ -142,14 +132,13 @@ class ErrorModel(DescribedModule):
         Every variable of the error is clamped to its range: beyond it the error at the range's edge
         is used. A variable that the error does not depend on has no limits.
         """
-        amplitude = domain.amplitude if self.needs_amplitude() else None
-        normalised = domain.normalised_amplitude if self.needs_normalised_amplitude() else None
-        return replace(
-            domain,
-            radial_distance=domain.radial_distance.outwards(),
-            amplitude=(amplitude or EVERYTHING).outwards(),
-            normalised_amplitude=(normalised or EVERYTHING).outwards(),
-        )
+        read = {
+            "radial_distance": True,
+            "amplitude": self.needs_amplitude(),
+            "normalised_amplitude": self.needs_normalised_amplitude(),
+        }
+        limits = {name: getattr(domain, name) if own else None for name, own in read.items()}
+        return replace(domain, **{k: (one or EVERYTHING).outwards() for k, one in limits.items()})
 
     def symbols(self) -> list[str]:
         """The coefficients' names, in the order of `coefficient_vector`."""
@@ -157,8 +146,9 @@ class ErrorModel(DescribedModule):
 
     def image_symbols(self) -> list[str]:
         """The names of the coefficients but those of condition terms; they come first."""
-        terms = [*self.signal_terms, *self.pixel_terms]
-        return ["c0", *(symbol for term in terms for symbol in term.symbols)]  # type: ignore[union-attr]
+        of_frames = sum(len(term.symbols) for term in self.condition_terms)  # type: ignore[arg-type]
+        symbols = self.symbols()
+        return symbols[: len(symbols) - of_frames]
 
     def pixel_grid(self) -> tuple[Tensor, Tensor]:
         """Return rows (H, 1) and columns (1, W) in pixels."""
@@ -167,8 +157,7 @@ class ErrorModel(DescribedModule):
 
     def pixel_error(self) -> Tensor:
         """Return the sum of constant, pixel terms and fixed pattern, shape (H, W), metres."""
-        rows, columns = self.pixel_grid()
-        rows, columns = torch.broadcast_tensors(rows, columns)
+        rows, columns = torch.broadcast_tensors(*self.pixel_grid())
         error = self.constant.expand(self.height, self.width)
         for term in self.pixel_terms:
             error = error + term(rows, columns)
@@ -193,8 +182,7 @@ class ErrorModel(DescribedModule):
         if conditions is not None:
             error = error + self.condition_error(conditions)[..., None, None]
         if self.residual is not None:
-            rows, columns = self.pixel_grid()
-            error = error + self.residual(radial_distance, amplitude, rows, columns)
+            error = error + self.residual(radial_distance, amplitude, *self.pixel_grid())
         return error.expand(radial_distance.shape)
 
     def columns_at(self, pixels: Pixels) -> Tensor:
@@ -211,23 +199,23 @@ class ErrorModel(DescribedModule):
             return torch.zeros_like(pixels.radial_distance)
         return self.fixed_pattern.offset[pixels.rows.long(), pixels.columns.long()]
 
-    def residual_at(self, pixels: Pixels) -> Tensor:
-        """Return the residual network's output at some pixels, shape (M,), metres."""
-        if self.residual is None:
-            return torch.zeros_like(pixels.radial_distance)
-        return self.residual(pixels.radial_distance, pixels.amplitude, pixels.rows, pixels.columns)
+    @torch.no_grad()
+    def error_at(self, pixels: Pixels) -> Tensor:
+        """Return the predicted error at some pixels, shape (M,), metres along the ray."""
+        error = self.coefficient_vector() @ self.columns_at(pixels) + self.pattern_at(pixels)
+        return error if self.residual is None else error + self.residual(*pixels[:4])
 
     def coefficient_vector(self) -> Tensor:
         """Return constant and coefficients as one vector, detached, float64."""
-        return torch.cat([p.detach().reshape(-1) for p in self._ordered()])
+        return nn.utils.parameters_to_vector(self._ordered()).detach().clone()
 
     def set_coefficient_vector(self, values: Tensor) -> None:
         """Set constant and coefficients from one vector; inverse of `coefficient_vector`."""
-        start = 0
-        for parameter in self._ordered():
-            part = values[start : start + parameter.numel()].detach()
-            parameter.data.copy_(part.reshape(parameter.shape))
-            start += parameter.numel()
+        with torch.no_grad():
+            for own, given in zip(
+                self._ordered(), values.split([p.numel() for p in self._ordered()]), strict=True
+            ):
+                own.copy_(given.view_as(own))
 
     def paper_coefficients(self) -> dict[str, dict[str, float]]:
         """Return the coefficients in the paper's symbols, on unscaled variables.
@@ -236,20 +224,22 @@ class ErrorModel(DescribedModule):
         paper. Only the sum of the constants c0, p0 and i0 is identifiable: it is given as c0 of
         the distance.
         """
+        found = self._in_the_paper()
+        return {g: {name: own for name, (own, _) in named.items()} for g, named in found.items()}
+
+    def paper_units(self) -> dict[str, dict[str, str]]:
+        """Return the units of the coefficients, in the groups of `paper_coefficients`."""
+        found = self._in_the_paper()
+        return {g: {name: unit for name, (_, unit) in named.items()} for g, named in found.items()}
+
+    def _in_the_paper(self) -> dict[str, dict[str, tuple[float, str]]]:
         constant = float(self.constant.detach())
-        groups: dict[str, dict[str, float]] = {"distance": {}}
+        groups: dict[str, dict[str, tuple[float, str]]] = {"distance": {"c0": (0.0, "m")}}
         for term in self.terms():
             values, remaining = term.paper_coefficients()
             constant += remaining
             groups.setdefault(term.group, {}).update(values)
-        groups["distance"] = {"c0": constant} | groups["distance"]
-        return groups
-
-    def paper_units(self) -> dict[str, dict[str, str]]:
-        """Return the units of the coefficients, in the groups of `paper_coefficients`."""
-        groups: dict[str, dict[str, str]] = {"distance": {"c0": "m"}}
-        for term in self.terms():
-            groups.setdefault(term.group, {}).update(term.paper_units())
+        groups["distance"]["c0"] = constant, "m"
         return groups
 
     def set_paper_coefficients(self, groups: dict[str, dict[str, float]]) -> None:

@@ -4,55 +4,44 @@ A new kind is a file in this folder and one line here: its module, its options c
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Union
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 from pydantic import Field
 
 from tofcorr.error_terms.base import BaseTermOptions, Domain, PixelMap, Term
 
 _KINDS = (
-    ("polynomials", "DistancePolynomialOptions", "SignalPolynomial"),
+    ("signal_terms", "DistancePolynomialOptions", "SignalPolynomial"),
     ("splines", "DistanceSplineOptions", "SignalSpline"),
     ("splines", "LookupTableOptions", "SignalSpline"),
-    ("periodic", "PeriodicOptions", "Periodic"),
-    ("polynomials", "AmplitudePolynomialOptions", "SignalPolynomial"),
+    ("signal_terms", "PeriodicOptions", "Periodic"),
+    ("signal_terms", "AmplitudePolynomialOptions", "SignalPolynomial"),
     ("splines", "IncidentLightOptions", "SignalSpline"),
     ("splines", "TensorSplineOptions", "TensorSpline"),
-    ("polynomials", "PixelPolynomialOptions", "PixelPolynomial"),
-    ("fixed_pattern", "FixedPatternOptions", "FixedPattern"),
+    ("pixel_terms", "PixelPolynomialOptions", "PixelPolynomial"),
+    ("pixel_terms", "FixedPatternOptions", "FixedPattern"),
     ("condition_terms", "IntegrationTimeOptions", "ConditionPolynomial"),
     ("condition_terms", "RoomTemperatureOptions", "ConditionPolynomial"),
     ("condition_terms", "WarmUpOptions", "WarmUp"),
 )
-# Not a term of the list `terms`: it is trained on top of them and has a key of its own in YAML.
-_RESIDUAL = ("residual", "ResidualNetworkOptions", "ResidualNetwork")
 
 
-class Kind(NamedTuple):
-    """One kind of term: what describes it, and what computes it."""
-
-    options: type[Any]
-    term: type[Any]
+def _class(module: str, name: str) -> type[Any]:
+    return getattr(import_module(f"tofcorr.error_terms.{module}"), name)
 
 
-def _load(module: str, options: str, term: str) -> Kind:
-    found = import_module(f"tofcorr.error_terms.{module}")
-    return Kind(getattr(found, options), getattr(found, term))
+_TERM_OF = {_class(module, options): _class(module, term) for module, options, term in _KINDS}
 
-
-TERMS: dict[str, Kind] = {
-    kind.options.model_fields["kind"].default: kind for kind in (_load(*line) for line in _KINDS)
+TERMS: dict[str, type[BaseTermOptions]] = {
+    options.model_fields["kind"].default: options for options in _TERM_OF
 }
-"""Every kind of term by its name in YAML."""
-
-RESIDUAL_NETWORK: Kind = _load(*_RESIDUAL)
-"""The residual network."""
+"""The options of every kind of term by its name in YAML."""
 
 if TYPE_CHECKING:
     TermOptions = BaseTermOptions
 else:
     TermOptions = Annotated[
-        Union[tuple(kind.options for kind in TERMS.values())],  # noqa: UP007 - built from a tuple
+        Union[tuple(_TERM_OF)],  # noqa: UP007 - built from a tuple
         Field(discriminator="kind"),
     ]
     """The options of any kind of term; `kind` says which."""
@@ -64,4 +53,4 @@ def build_term(options: BaseTermOptions, domain: Domain) -> Term | PixelMap:
     Raises:
         CalibrationDataError: The domain lacks what the term needs.
     """
-    return TERMS[options.kind].term(options, domain)
+    return _TERM_OF[type(options)](options, domain)

@@ -63,20 +63,16 @@ class ResidualNetwork(DescribedModule):
         super().__init__()
         self.options = options
         self.uses_amplitude: bool = domain.amplitude is not None
-        logarithms = (
-            domain.interval("log_amplitude") if self.uses_amplitude else Interval(-1.0, 1.0)
-        )
         self.register_number("floor", domain.amplitude_floor() if self.uses_amplitude else 1.0)
         intervals = (
             domain.radial_distance,
-            logarithms,
+            domain.interval("log_amplitude") if self.uses_amplitude else Interval(-1.0, 1.0),
             Interval(0.0, domain.height - 1.0),
             Interval(0.0, domain.width - 1.0),
         )
-        centres = [interval.centre for interval in intervals]
-        half_widths = [interval.half_width for interval in intervals]
-        self.register_buffer("centre", torch.tensor(centres, dtype=torch.float64))
-        self.register_buffer("half_width", torch.tensor(half_widths, dtype=torch.float64))
+        for name in ("centre", "half_width"):
+            numbers = [getattr(interval, name) for interval in intervals]
+            self.register_buffer(name, torch.tensor(numbers, dtype=torch.float64))
         self.margin: float = _FADE
         self.bound: float = options.bound_mm / 1000
         self.first = nn.Linear(4, options.width, dtype=torch.float64)
@@ -86,35 +82,30 @@ class ResidualNetwork(DescribedModule):
 
     def description(self) -> dict[str, Any]:
         """Return size, bound, and whether the network reads amplitudes."""
-        return self.options.structure() | {"uses_amplitude": self.uses_amplitude}
+        return super().description() | {"uses_amplitude": self.uses_amplitude}
 
     def forward(
         self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
     ) -> Tensor:
         """Return the predicted error, shape (...), metres."""
-        inputs, most = self.scaled(radial_distance, amplitude, rows, columns)
-        return self.of_scaled(inputs, most)
+        return self.of_scaled(*self.scaled(radial_distance, amplitude, rows, columns))
 
     def scaled(
         self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return what of `forward` depends on no weight: inputs (..., 4), and most metres (...)."""
-        u = (radial_distance - self.centre[0]) / self.half_width[0]
-        fade = self.fade(u)
-        w = torch.zeros_like(u)
+        strength = torch.zeros_like(radial_distance)
         if self.uses_amplitude:
-            w = (torch.maximum(amplitude, self.floor).log() - self.centre[1]) / self.half_width[1]
-            fade = fade * self.fade(w)
-        r = (rows - self.centre[2]) / self.half_width[2]
-        c = (columns - self.centre[3]) / self.half_width[3]
+            strength = torch.maximum(amplitude, self.floor).log()
+        given = torch.broadcast_tensors(radial_distance, strength, rows, columns)
+        inputs = (torch.stack(given, dim=-1) - self.centre) / self.half_width
+        fade = self.fade(inputs[..., 0]) * self.fade(inputs[..., 1])
         # Far outside, where the fade is zero, the network must still be finite.
-        u, w, r, c = torch.broadcast_tensors(u.clamp(-2.0, 2.0), w.clamp(-2.0, 2.0), r, c)
-        return torch.stack([u, w, r, c], dim=-1), self.bound * fade
+        return inputs.clamp(-2.0, 2.0), self.bound * fade
 
     def of_scaled(self, inputs: Tensor, most: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres, from what `scaled` returns."""
-        hidden = torch.tanh(self.first(inputs))
-        hidden = torch.tanh(self.second(hidden))
+        hidden = torch.tanh(self.second(torch.tanh(self.first(inputs))))
         return most * torch.tanh(self.last(hidden).squeeze(-1))
 
     def fade(self, scaled: Tensor) -> Tensor:

@@ -14,36 +14,21 @@ from tofcorr.error_terms.base import (
     Domain,
     SignalTerm,
     Variable,
+    axis_of,
+    variable_of,
 )
 
 
-def position(scaled: Tensor, segments: int) -> Tensor:
-    """Map [-1, 1] onto the knots 0, 1, .., segments, clamped to the ends."""
-    return (scaled.clamp(-1.0, 1.0) + 1.0) * (0.5 * segments)
-
-
-def spline_basis(scaled: Tensor, segments: int, degree: int) -> Tensor:
-    """Return all B-splines, shape (segments + degree, ...), of a variable scaled to [-1, 1]."""
-    x = position(scaled, segments)
-    functions = []
-    for k in range(segments + degree):
-        if degree == 1:
-            functions.append((1.0 - (x - k).abs()).clamp(min=0.0))
-        else:
-            t = (x - (k - 1)).abs()
-            outer, inner = (2.0 - t).clamp(min=0.0), (1.0 - t).clamp(min=0.0)
-            functions.append((outer * outer * outer - 4.0 * inner * inner * inner) / 6)
-    return torch.stack(functions)
-
-
-def spline_weights(x: Tensor, segments: int, degree: int) -> tuple[Tensor, list[Tensor]]:
+def spline_weights(scaled: Tensor, segments: int, degree: int) -> tuple[Tensor, list[Tensor]]:
     """Return the first of the degree + 1 splines that are not zero, and their values.
 
     Args:
-        x: As `position` gives it, shape (...); NaN gives values of NaN.
+        scaled: The variable, scaled to [-1, 1], shape (...); NaN gives values of NaN.
         segments: Number of segments.
         degree: 1 or 3.
     """
+    # Knots lie at 0, 1, .., segments.
+    x = (scaled.clamp(-1.0, 1.0) + 1.0) * (0.5 * segments)
     first = x.nan_to_num(0.0).floor().clamp(0.0, float(segments - 1)).to(torch.int64)
     f = x - first
     g = 1.0 - f
@@ -55,13 +40,13 @@ def spline_weights(x: Tensor, segments: int, degree: int) -> tuple[Tensor, list[
     return first, [value / 6 for value in [g * other, inner, mirrored, f * square]]
 
 
-def spline_value(full: Tensor, scaled: Tensor, segments: int, degree: int) -> Tensor:
-    """Return sum_k full[k] B_k, shape of `scaled`, from the splines that are not zero."""
-    first, weights = spline_weights(position(scaled, segments), segments, degree)
-    value = weights[0] * full[first]
-    for k in range(1, degree + 1):
-        value = value + weights[k] * full[first + k]
-    return value
+def spline_basis(scaled: Tensor, segments: int, degree: int) -> Tensor:
+    """Return all B-splines, shape (segments + degree, ...), of a variable scaled to [-1, 1]."""
+    first, weights = spline_weights(scaled, segments, degree)
+    basis = torch.zeros([segments + degree] + list(scaled.shape)).to(scaled)  # noqa: RUF005
+    for k in range(degree + 1):
+        basis = basis.scatter(0, (first + k).unsqueeze(0), weights[k].unsqueeze(0))
+    return basis
 
 
 def with_middle(coefficients: Tensor) -> Tensor:
@@ -88,12 +73,15 @@ def second_differences(size: int, segments: int) -> Tensor:
     return rows * segments**1.5
 
 
-_Strength = Literal["auto"] | NonNegativeFloat
-
-
 class SplineOptions(BaseTermOptions):
-    """What the options of all splines share: a strength that may be found in the data."""
+    """What the options of all splines share.
 
+    Attributes:
+        strength: Weight of the integrated squared curvature, along all axes, against the mean
+            squared residual.
+    """
+
+    strength: Literal["auto"] | NonNegativeFloat = "auto"
     found_in_data: ClassVar[tuple[str, ...]] = ("strength",)
 
 
@@ -102,12 +90,10 @@ class DistanceSplineOptions(SplineOptions):
 
     Attributes:
         segments: Pieces over the calibrated range of distances.
-        strength: Weight of the integrated squared curvature against the mean squared residual.
     """
 
     kind: Literal["distance_spline"] = "distance_spline"
     segments: int = Field(default=24, ge=2, le=100)
-    strength: _Strength = "auto"
     variable: ClassVar[Variable] = "distance"
     degree: ClassVar[int] = 3
     letter: ClassVar[str] = "s"
@@ -118,12 +104,10 @@ class LookupTableOptions(SplineOptions):
 
     Attributes:
         segments: Intervals between the table's entries, over the calibrated range of distances.
-        strength: Weight of the integrated squared curvature against the mean squared residual.
     """
 
     kind: Literal["lookup_table"] = "lookup_table"
     segments: int = Field(default=48, ge=2, le=200)
-    strength: _Strength = "auto"
     variable: ClassVar[Variable] = "distance"
     degree: ClassVar[int] = 1
     letter: ClassVar[str] = "l"
@@ -134,12 +118,10 @@ class IncidentLightOptions(SplineOptions):
 
     Attributes:
         segments: Pieces over the calibrated range of log amplitude.
-        strength: Weight of the integrated squared curvature against the mean squared residual.
     """
 
     kind: Literal["incident_light"] = "incident_light"
     segments: int = Field(default=6, ge=2, le=100)
-    strength: _Strength = "auto"
     needs: ClassVar[tuple[str, ...]] = ("amplitude",)
     variable: ClassVar[Variable] = "log_amplitude"
     degree: ClassVar[int] = 3
@@ -191,13 +173,17 @@ class SignalSpline(CurveTerm):
         return without_middle(spline_basis(scaled, self.segments, self.degree))
 
     def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
-        """Return the predicted error, shape (...), metres."""
-        scaled = self.scaled(radial_distance, amplitude)
-        return spline_value(with_middle(self.coefficients), scaled, self.segments, self.degree)
+        """Return the predicted error, shape (...), metres: from the splines that are not zero."""
+        full, scaled = with_middle(self.coefficients), self.scaled(radial_distance, amplitude)
+        first, weights = spline_weights(scaled, self.segments, self.degree)
+        value = weights[0] * full[first]
+        for k in range(1, self.degree + 1):
+            value = value + weights[k] * full[first + k]
+        return value
 
     def axes(self) -> tuple[Axis, ...]:
         """Return the variable, with the knots."""
-        return (self.axis(self.segments),)
+        return (axis_of(self.variable, self.centre, self.half_width, self.segments),)
 
     def roughness(self) -> Tensor:
         """Return second differences, shape (K - 1, K)."""
@@ -212,15 +198,12 @@ class TensorSplineOptions(SplineOptions):
         distance_segments: Pieces over the calibrated range of distances.
         amplitude_segments: Pieces over the calibrated range of amplitudes.
         axis: Whether the amplitude's pieces are equal in its logarithm or in itself.
-        strength: Weight of the integrated squared curvature, along both axes, against the mean
-            squared residual.
     """
 
     kind: Literal["tensor_spline"] = "tensor_spline"
     distance_segments: int = Field(default=5, ge=1, le=40)
     amplitude_segments: int = Field(default=3, ge=1, le=20)
     axis: Literal["log_amplitude", "amplitude"] = "log_amplitude"
-    strength: _Strength = "auto"
     needs: ClassVar[tuple[str, ...]] = ("amplitude",)
 
 
@@ -252,70 +235,57 @@ class TensorSpline(SignalTerm):
     floor: Tensor
 
     def __init__(self, options: TensorSplineOptions, domain: Domain) -> None:
-        self_is_log = options.axis == "log_amplitude"
-        pieces = (options.distance_segments, options.amplitude_segments)
-        rows, columns = (segments + 3 for segments in pieces)
-        stem = f"t{pieces[0]}x{pieces[1]}{'' if self_is_log else 'lin'}"
-        names = [f"{stem}.{j}.{k}" for j in range(rows) for k in range(columns)]
+        pieces = options.distance_segments, options.amplitude_segments
+        stem = f"t{pieces[0]}x{pieces[1]}{'' if options.axis == 'log_amplitude' else 'lin'}"
+        columns = range(pieces[1] + 3)
+        names = [f"{stem}.{j}.{k}" for j in range(pieces[0] + 3) for k in columns]
         del names[len(names) // 2]
         super().__init__(options, "distance_amplitude", names)
-        self.is_log: bool = self_is_log
-        self.rows: int = rows
-        self.columns: int = columns
+        self.variable: str = options.axis
         self.distance_segments: int = pieces[0]
         self.amplitude_segments: int = pieces[1]
-        for prefix, interval in (
-            ("", domain.radial_distance),
-            ("amplitude_", domain.interval(options.axis)),
-        ):
-            self.register_number(f"{prefix}centre", interval.centre)
-            self.register_number(f"{prefix}half_width", interval.half_width)
+        for prefix, variable in (("", "distance"), ("amplitude_", options.axis)):
+            self.register_interval(prefix, domain.interval(variable))  # type: ignore[arg-type]
         self.register_number("floor", domain.amplitude_floor())
 
-    def scaled_amplitude(self, amplitude: Tensor) -> Tensor:
-        """Return the scaled amplitude or its logarithm w, shape (...)."""
-        value = torch.maximum(amplitude, self.floor).log() if self.is_log else amplitude
-        return (value - self.amplitude_centre) / self.amplitude_half_width
+    def scaled(self, radial_distance: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the scaled distance u and the scaled amplitude or its logarithm w, (...)."""
+        value = variable_of(self.variable, radial_distance, amplitude, self.floor)
+        u = (radial_distance - self.centre) / self.half_width
+        return u, (value - self.amplitude_centre) / self.amplitude_half_width
 
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the products but the middle one, shape (K, ...)."""
-        u = (radial_distance - self.centre) / self.half_width
-        by_distance = spline_basis(u, self.distance_segments, 3)
-        by_amplitude = spline_basis(self.scaled_amplitude(amplitude), self.amplitude_segments, 3)
-        return without_middle((by_distance[:, None] * by_amplitude[None, :]).flatten(0, 1))
+        u, w = self.scaled(radial_distance, amplitude)
+        along = spline_basis(u, self.distance_segments, 3)
+        across = spline_basis(w, self.amplitude_segments, 3)
+        return without_middle((along.unsqueeze(1) * across.unsqueeze(0)).flatten(0, 1))
 
     def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
-        """Return the predicted error, shape (...), metres."""
-        full = with_middle(self.coefficients)
-        x = position((radial_distance - self.centre) / self.half_width, self.distance_segments)
-        y = position(self.scaled_amplitude(amplitude), self.amplitude_segments)
-        row, along = spline_weights(x, self.distance_segments, 3)
-        column, across = spline_weights(y, self.amplitude_segments, 3)
-        first = row * self.columns + column
-        total = torch.zeros_like(x)
+        """Return the predicted error, shape (...), metres: from the products that are not zero."""
+        full, columns = with_middle(self.coefficients), self.amplitude_segments + 3
+        u, w = self.scaled(radial_distance, amplitude)
+        row, along = spline_weights(u, self.distance_segments, 3)
+        column, across = spline_weights(w, self.amplitude_segments, 3)
+        total = torch.zeros_like(u)
         for j in range(4):
-            start = first + j * self.columns
-            inner = across[0] * full[start]
-            for k in range(1, 4):
-                inner = inner + across[k] * full[start + k]
-            total = total + along[j] * inner
+            start = (row + j) * columns + column
+            for k in range(4):
+                total = total + along[j] * across[k] * full[start + k]
         return total
 
     def axes(self) -> tuple[Axis, ...]:
         """Return the distance and the amplitude or its logarithm, with the knots."""
-        d, h = float(self.centre), float(self.half_width)
-        a, w = float(self.amplitude_centre), float(self.amplitude_half_width)
-        variable: Variable = "log_amplitude" if self.is_log else "amplitude"
+        amplitude = self.amplitude_centre, self.amplitude_half_width
         return (
-            Axis("distance", d - h, d + h, self.distance_segments),
-            Axis(variable, a - w, a + w, self.amplitude_segments),
+            axis_of("distance", self.centre, self.half_width, self.distance_segments),
+            axis_of(self.variable, *amplitude, self.amplitude_segments),
         )
 
     def roughness(self) -> Tensor:
         """Return second differences along both axes, shape (R, K)."""
-        along = second_differences(self.rows, self.distance_segments)
-        across = second_differences(self.columns, self.amplitude_segments)
-        eye_rows = torch.eye(self.rows, dtype=torch.float64) / math.sqrt(self.rows)
-        eye_columns = torch.eye(self.columns, dtype=torch.float64) / math.sqrt(self.columns)
-        both = torch.cat([torch.kron(along, eye_columns), torch.kron(eye_rows, across)])
+        pieces = self.distance_segments, self.amplitude_segments
+        along, across = (second_differences(number + 3, number) for number in pieces)
+        rows, columns = (torch.eye(n + 3).double() / math.sqrt(n + 3) for n in pieces)
+        both = torch.cat([torch.kron(along, columns), torch.kron(rows, across)])
         return without_middle(both.T).T

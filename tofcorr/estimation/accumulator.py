@@ -26,7 +26,7 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import Domain, SignalTerm
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.polynomials import SignalPolynomial
+from tofcorr.error_terms.signal_terms import SignalPolynomial
 from tofcorr.estimation.moments import ImageMoments
 
 # Random points at which products of functions are compared. Products whose randomly weighted sums

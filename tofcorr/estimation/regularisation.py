@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tofcorr.error_terms.base import Strength
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.linear import NormalEquations, solved
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, Prior, WithPrior
@@ -43,7 +42,7 @@ class Penalty:
 
     name: str
     factor: Float[Tensor, "R K"]
-    strength: Strength
+    strength: float | str
 
 
 def penalties_of(model: ErrorModel) -> list[Penalty]:

@@ -28,7 +28,7 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.geometry.rays import tangents
-from tofcorr.pixels.sample import error_at, pixels_of_image
+from tofcorr.pixels.sample import pixels_of_image
 
 CLASSES = (
     "distance",
@@ -208,7 +208,7 @@ class Linearisation(NamedTuple):
         normal, offset = plane
         pixels = pixels_of_image(batch, k, used)
         rays = self.ray_directions.flatten(0, 1)[used]
-        corrected = pixels.radial_distance - error_at(self.error, pixels)
+        corrected = pixels.radial_distance - self.error.error_at(pixels)
         gain = rays @ normal
         residual = gain * corrected + offset
         # What changes the residuals is computed where the wall is, not where noise puts the pixels:

@@ -46,7 +46,7 @@ from tofcorr.fit.linear_image import (
     wall_moves,
 )
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.pixels.dataset import Dataset, within
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import off_the_wall, some_pixels
 
 # Noise of a pixel where nothing is known, metres: only a scale, since the noise of each image is
@@ -311,7 +311,7 @@ def _images(
     hand_eye = model.hand_eye().detach()
     poses = torch.cat([torch.from_numpy(one.frames.world_from_tool) for one in dataset.recordings])
     for batch in dataset.batches(frames):
-        inside = batch.valid & within(domain, batch.radial_distance, batch.amplitude)
+        inside = batch.valid & domain.holds(batch.radial_distance, batch.amplitude)
         for k, frame in enumerate(batch.indices.tolist()):
             used = inside[k].flatten().nonzero()[:, 0]
             used = some_pixels(used, _MOST_PIXELS, frame)

@@ -13,7 +13,7 @@ from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.planes import Walls, plane_through
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.sample import error_at, pixels_of_image
+from tofcorr.pixels.sample import pixels_of_image
 
 # Fewest images of a wall. A wall has three unknowns, and one image determines about three, so that
 # fewer than three images contribute little to the other unknowns.
@@ -194,6 +194,6 @@ def _corrected_points(batch: FrameBatch, k: int, rays: Tensor, model: Calibratio
     """Return the corrected points (x, 1) of image k in the camera frame, shape (M, 4), metres."""
     used = batch.valid[k].flatten().nonzero()[:, 0]
     pixels = pixels_of_image(batch, k, used)
-    corrected = pixels.radial_distance - error_at(model.error, pixels)
+    corrected = pixels.radial_distance - model.error.error_at(pixels)
     points = rays[used] * corrected[:, None]
     return torch.cat([points, torch.ones_like(points[:, :1])], dim=1)

@@ -479,16 +479,6 @@ def _sample(
     return torch.cat(distances), torch.cat(known) if known else None
 
 
-def within(domain: Domain, distance: Tensor, amplitude: Tensor | None) -> Tensor:
-    """Return where distance and amplitude lie within the ranges, of the shape of the distance."""
-    low, high = domain.radial_distance
-    inside = (distance >= low) & (distance <= high)
-    if domain.amplitude is not None and amplitude is not None:
-        low, high = domain.amplitude
-        inside &= (amplitude >= low) & (amplitude <= high)
-    return inside
-
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

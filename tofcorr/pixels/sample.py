@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import FrameBatch
-from tofcorr.error_terms.model import ErrorModel, Pixels
+from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
 from tofcorr.options import Options
@@ -119,13 +119,6 @@ def draw_pixels(
             )
     own, ray, normal, offset, *pixels = (torch.cat(column) for column in zip(*drawn, strict=True))
     return FramePixels(own, Pixels(*pixels), ray, normal, offset)
-
-
-@torch.no_grad()
-def error_at(error: ErrorModel, pixels: Pixels) -> Float[Tensor, "M"]:
-    """Return the error that a model predicts at some pixels, shape (M,), metres along the ray."""
-    predicted = error.coefficient_vector() @ error.columns_at(pixels)
-    return predicted + error.pattern_at(pixels) + error.residual_at(pixels)
 
 
 def distance_to_plane(

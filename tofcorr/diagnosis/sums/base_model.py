@@ -40,8 +40,8 @@ from tofcorr.diagnosis.sums.observations import (
     seen_points,
 )
 from tofcorr.error_terms.base import ConditionTerm, Domain, PixelTerm, SignalTerm, Term
-from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.pixel_terms import FixedPatternOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
