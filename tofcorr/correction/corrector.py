@@ -19,10 +19,10 @@ from tofcorr.error_terms.base import (
     Interval,
     ScaledPolynomial,
     SignalTerm,
-    unscale,
 )
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
+from tofcorr.error_terms.signal_terms import unscale
 from tofcorr.geometry.se3 import transformed
 from tofcorr.version import __version__
 

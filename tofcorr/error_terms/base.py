@@ -14,7 +14,6 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
-from numpy.polynomial import Polynomial
 from pydantic import AfterValidator, ConfigDict
 from torch import Tensor, nn
 
@@ -190,22 +189,6 @@ def powers(scaled: Tensor, degree: int) -> Tensor:
 def combined(coefficients: Tensor, functions: Tensor) -> Tensor:
     """Return the sum of functions (K, ...), each times its coefficient, in full precision."""
     return (functions.movedim(0, -1) * coefficients).sum(-1)
-
-
-def unscale(coefficients: Tensor, centre: float, half_width: float) -> list[float]:
-    """Expand a polynomial in u = (x - centre) / half_width into powers of x.
-
-    Args:
-        coefficients: Coefficients of u, u^2, ..., shape (degree,).
-        centre: Centre of the scaled variable, in units of x.
-        half_width: Its half-width, in units of x.
-
-    Returns:
-        Coefficients of 1, x, x^2, ...: one more than were given.
-    """
-    scaled = Polynomial([0.0, *coefficients.detach().double().cpu().tolist()])
-    found = scaled(Polynomial([-centre / half_width, 1.0 / half_width])).coef.tolist()
-    return found + [0.0] * (len(coefficients) + 1 - len(found))
 
 
 class DescribedOptions(Options):

@@ -14,9 +14,8 @@ from tofcorr.error_terms.base import (
     PixelMap,
     PixelTerm,
     powers,
-    unscale,
 )
-from tofcorr.error_terms.signal_terms import rescale, unit_of_power
+from tofcorr.error_terms.signal_terms import rescale, unit_of_power, unscale
 from tofcorr.options import Degree
 
 

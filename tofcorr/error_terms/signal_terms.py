@@ -4,6 +4,7 @@ import math
 from typing import ClassVar, Literal
 
 import torch
+from numpy.polynomial import Polynomial
 from pydantic import Field, PositiveInt
 from torch import Tensor
 
@@ -17,7 +18,6 @@ from tofcorr.error_terms.base import (
     Variable,
     axis_of,
     powers,
-    unscale,
 )
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import unambiguous_range
@@ -127,6 +127,22 @@ class SignalPolynomial(CurveTerm):
         scaled, constant = rescale([values[symbol] for symbol in self.symbols], *self.scale())
         self.set_coefficients(scaled)
         return constant
+
+
+def unscale(coefficients: Tensor, centre: float, half_width: float) -> list[float]:
+    """Expand a polynomial in u = (x - centre) / half_width into powers of x.
+
+    Args:
+        coefficients: Coefficients of u, u^2, ..., shape (degree,).
+        centre: Centre of the scaled variable, in units of x.
+        half_width: Its half-width, in units of x.
+
+    Returns:
+        Coefficients of 1, x, x^2, ...: one more than were given.
+    """
+    scaled = Polynomial([0.0, *coefficients.detach().double().cpu().tolist()])
+    found = scaled(Polynomial([-centre / half_width, 1.0 / half_width])).coef.tolist()
+    return found + [0.0] * (len(coefficients) + 1 - len(found))
 
 
 def rescale(raw: list[float], centre: float, half_width: float) -> tuple[list[float], float]:
