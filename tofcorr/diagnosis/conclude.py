@@ -4,19 +4,17 @@ from collections.abc import Callable
 
 import torch
 
-from tofcorr.diagnosis.findings.absorption import rank_effects
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
 from tofcorr.diagnosis.findings.gap import (
-    draw_resamples,
-    gap_floor,
     gap_steps,
-    lone_poses,
+    judge_remainder,
     measure_gap,
+    name_in_two,
+    resampled,
+    stages_of,
 )
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.open_set import judge_remainder, name_in_two
 from tofcorr.diagnosis.findings.shares import attribute, explained_squares, parts_of
-from tofcorr.diagnosis.findings.where import stages_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.next.advice import minimum_detectable, next_recording
 from tofcorr.diagnosis.prepare import Prepared
@@ -45,7 +43,7 @@ def conclude(
     rendered = simulator is not None and given is None
     begin("naming effects")
     generator = torch.Generator().manual_seed(options.seed + 1)
-    resamples = draw_resamples(study, generator)
+    resamples = resampled(study.sums.num_units, options.bootstraps, generator)
     named = name_in_two(study, resamples)
 
     begin("measuring the gap")
@@ -57,17 +55,15 @@ def conclude(
     shares = attribute(parts, gap, resamples)
     begin("judging what remains")
     stages = stages_of(study, named, gap, residual)
-    remainder = judge_remainder(study, named, gap, stages[-1].found_where)
+    remainder = judge_remainder(study, named, gap, stages[-1])
     detectable = minimum_detectable(study, named, options.seed + 2)
-    missing = dict(study.candidates.missing)
 
     patterns = whole_patterns(study, named, given)
     with_effects = None if rendered else simulator_of(study, named, given)
     closure = transfer = degraded = None
     if options.simulate_anew:
         transfer = measure_transfer(study, named, given, generator, resamples)
-        floor = gap_floor(study, named).size
-        degraded = degraded_stage(study, named, with_effects, floor, resamples)
+        degraded = degraded_stage(study, named, with_effects, gap.floor, resamples)
         closure = check_in_simulator(study, named, given)
     frames = None
     if simulator is not None:
@@ -77,12 +73,11 @@ def conclude(
     if patterns and with_effects is not None:
         with_effects = simulator_of(study, named, given, patterns)
 
-    alone = lone_poses(study, gap.floor)
     given_effects = () if given is None else given.effects
     return DiagnosisResult(
         verdict=write_verdict(named, gap, remainder, shares),
         causes=list_causes(study, named, shares),
-        remarks=list_remarks(named, gap, alone, remainder, detectable, list(missing)),
+        remarks=list_remarks(study, named, gap, remainder, detectable),
         simulator_kind="fitted" if simulator is None else simulator.kind,
         stages=stages,
         shares=shares,
@@ -96,11 +91,10 @@ def conclude(
         tested=named.tested,
         gap=gap,
         gap_steps=tuple(gap_steps(study, named, gap, resamples)),
-        where=stages[1].found_where,
         remainder=remainder,
         outliers=prepared.outliers,
-        ranking=rank_effects(study, named),
-        missing=missing,
+        ranking=tuple(named.first.ordered()),
+        missing=dict(study.candidates.missing),
         detectable=detectable,
         advice=tuple(next_recording(study, named)),
         closure=closure,

@@ -1,29 +1,41 @@
-"""Tests of all effects side by side, as additions to one model.
+"""Tests of all effects side by side, as additions to one model, and which of them are alike.
 
 Each is tested by the units that suit it: what it gains, and what chance would.
+
+A catalogue holds some forms of an effect, and a camera or a room has its own. If an effect is the
+cause of C, its columns explain at least C / (1 + e^2), where e is its `form_error`. The rest is
+left, looks like scatter of the poses, or is named as another effect. So two findings follow:
+
+- An effect that closes less than the named one, by no more than is left or taken for scatter of
+  the poses, is not excluded (`cause_set`).
+- Nor is one that closes, in the place of several that are named, not significantly less of what
+  they close together than the cause of it would (`one_cause`).
+
+Neither is said of an effect that fits worse than such an error explains (`fits_too_badly`).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import torch
+from scipy import special
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.gains import (
-    HeldOutSquares,
-    NullScores,
-    flipped_gains,
-    student_gains,
-)
-from tofcorr.diagnosis.sums.linear_system import Sums, tile_sums
+from tofcorr.diagnosis.sums.gains import HeldOutSquares, NullScores, flipped_gains, student_gains
+from tofcorr.diagnosis.sums.linear_system import NUM_POSE, Sums, tile_sums
 from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
+from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.estimation.statistics import student_quantile
+from tofcorr.simulation.effects import CATALOGUE
+from tofcorr.simulation.effects.inputs import VELOCITY
 from tofcorr.simulation.effects.numerics import by_frame
 
-NORMAL_95 = 1.6449
+NORMAL_95 = float(special.ndtri(0.95))
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
 
 
@@ -77,7 +89,12 @@ class EffectTest:
         fitted without the few poses that determine it. Median and standard deviation include the
         observed gain.
         """
-        return float(self._standardised[-1])
+        return float(self._scores[-1])
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the upper half of the null distribution."""
+        return float(_middle_and_spread(self.null)[1])
 
     @property
     def p_value(self) -> float:
@@ -85,7 +102,7 @@ class EffectTest:
 
         The two tests share the level (Bonferroni, weighted).
         """
-        p_value = float((1 + (self.null >= self.gain).sum()) / (len(self.null) + 1))
+        p_value = share_of(self.null, self.gain)
         if self.null_closed is None:
             return p_value
         closed = self.closed_scores()
@@ -93,7 +110,7 @@ class EffectTest:
 
     def null_scores(self, least: float = -math.inf) -> Tensor:
         """Return the scores of the draws, shape (B,); none where less is closed, m^2."""
-        scores = self._standardised[:-1]
+        scores = self._scores[:-1]
         if self.null_closed is None:
             return scores
         return torch.where(self.null_closed >= least, scores, -math.inf)
@@ -106,18 +123,22 @@ class EffectTest:
         if self.null_closed is None:
             return torch.full((len(self.null) + 1,), -math.inf, dtype=torch.float64)
         closed = torch.cat([self.null_closed, self.closed.sum()[None]])
-        return torch.where(closed >= least, _scores(closed, self.least_spread_closed), -math.inf)
+        middle, spread = _middle_and_spread(closed)
+        scores = (closed - middle) / spread.clamp(min=self.least_spread_closed)
+        return torch.where(closed >= least, scores, -math.inf)
 
     @cached_property
-    def _standardised(self) -> Tensor:
+    def _scores(self) -> Tensor:
         """Scores of the draws, then that of the gain, shape (B + 1,); many rules ask for them."""
-        return _scores(torch.cat([self.null, self.null.new_tensor([self.gain])]), self.least_spread)
+        gains = torch.cat([self.null, self.null.new_tensor([self.gain])])
+        middle, spread = _middle_and_spread(gains)
+        return (gains - middle) / spread.clamp(min=self.least_spread)
 
 
-def _scores(values: Tensor, least_spread: float) -> Tensor:
-    """Return values above their median, in standard deviations of their upper half."""
-    middle, high = torch.quantile(values, values.new_tensor([0.5, 0.95]))
-    return (values - middle) / ((high - middle) / NORMAL_95).clamp(min=least_spread)
+def _middle_and_spread(values: Tensor, high: float = 0.95) -> tuple[Tensor, Tensor]:
+    """Return the median, and the standard deviation of normal values with this high quantile."""
+    middle, end = torch.quantile(values, values.new_tensor([0.5, high]))
+    return middle, (end - middle) / float(special.ndtri(high))
 
 
 def either(by_gain: float, by_closed: float, share: float = 0.8) -> float:
@@ -135,6 +156,11 @@ def either(by_gain: float, by_closed: float, share: float = 0.8) -> float:
 def share_of(best: Tensor, score: float | Tensor) -> float:
     """Return the share of draws, (B,), that reach a score; the data count as one of them."""
     return float((1 + (best >= score).sum()) / (len(best) + 1))
+
+
+def _best(scores: Iterable[Tensor]) -> Tensor:
+    """Return the highest score of every draw, shape (B,)."""
+    return torch.stack(list(scores)).amax(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,11 +186,8 @@ class EffectComparison:
 
         A probe is compared with the best of all effects and probes.
         """
-        family = list(self.tests.values())
-        if name in self.probes:
-            family += self.probes.values()
-        best = torch.stack([test.null_scores() for test in family]).amax(0)
-        return share_of(best, (self.probes.get(name) or self.tests[name]).score)
+        family = self.tests | self.probes if name in self.probes else self.tests
+        return share_of(_best(one.null_scores() for one in family.values()), family[name].score)
 
     def naming_p_value(self, name: str) -> float:
         """Return the probability that chance would name an effect with at least this score.
@@ -173,19 +196,19 @@ class EffectComparison:
         does not close enough itself is compared with all. It must be significant alone as well.
         The score of what is closed is compared in the same way, and the two tests share the level.
         """
-        test = self.tests[name]
+        test, tests = self.tests[name], self.tests.values()
         if test.total < self.least:
             return self.family_p_value(name)
         p_value = share_of(self._best_named(), test.score)
-        drawn = [one for one in self.tests.values() if one.null_closed is not None]
+        drawn = [one for one in tests if one.null_closed is not None]
         if drawn:
-            best = torch.stack([one.closed_scores(self.least)[:-1] for one in drawn]).amax(0)
+            best = _best(one.closed_scores(self.least)[:-1] for one in drawn)
             p_value = either(p_value, share_of(best, test.closed_scores()[-1]))
         return max(p_value, test.p_value)
 
     def _best_named(self) -> Tensor:
         """Return the highest score of every draw among effects that close enough, shape (B,)."""
-        return torch.stack([test.null_scores(self.least) for test in self.tests.values()]).amax(0)
+        return _best(test.null_scores(self.least) for test in self.tests.values())
 
     def ordered(self) -> list[EffectTest]:
         """Return the tests of effects in descending order of what they close."""
@@ -196,7 +219,7 @@ class EffectComparison:
 
         It is at least that of an effect which is significant by itself.
         """
-        best = self._best_named().clamp(min=NORMAL_95)
+        best = self._best_named().clamp(min=float(special.ndtri(1 - level)))
         return float(torch.quantile(best, 1 - level))
 
 
@@ -221,11 +244,11 @@ def compare_effects(
         seed_of_draws: Added to the diagnosis' seed for the draws of null distributions; others add
             1 to 3.
     """
-    sums, candidates = study.sums, study.candidates
+    sums, candidates, tiles = study.sums, study.candidates, study.tiles
     squares = HeldOutSquares(sums.ols, chosen, study.folds)
-    others = [name for name in sums.layout.effects if name not in chosen]
-    most = [name for name in others if not candidates.is_tested_by_tiles(name)]
-    few = [name for name in others if candidates.is_tested_by_tiles(name)]
+    sizes = {n: high - low for n, (low, high) in sums.layout.effects.items() if n not in chosen}
+    few = list(filter(candidates.is_tested_by_tiles, sizes))
+    most = [name for name in sizes if name not in few]
     null, by_chance = None, {}
     if flips:
         null = NullScores(sums, study.folds, len(study.signs), study.options.seed + seed_of_draws)
@@ -233,12 +256,22 @@ def compare_effects(
             by_chance = squares.closed_by_chance(most, null.even_of_folds())
     gains = student_gains(sums.gls, chosen, most, study.folds, null)
     closed = {name: squares.closed(name) for name in most}
-    if few:
-        closed_by_tiles, gains_by_tiles = _by_tiles(study, chosen, few, flips=flips)
-        closed, gains = closed | closed_by_tiles, gains | gains_by_tiles
+    if few and tiles is not None:
+        own = tile_sums(study.system, [*chosen, *few], tiles, study.fit)
+        of_tiles = HeldOutSquares(own.ols, chosen, tiles.folds)
+        closed |= {name: tiles.per_pose(of_tiles.closed(name), sums.num_units) for name in few}
+        gains |= dict.fromkeys(few, torch.full((1,), torch.nan, dtype=torch.float64))
+        if flips:
+            gains |= flipped_gains(own.gls, chosen, few, tiles.folds, tiles.signs)
     if maps and candidates.maps:
-        closed_by_maps, gains_by_maps = _of_maps(study, chosen, squares, flips=flips)
-        closed, gains = closed | closed_by_maps, gains | gains_by_maps
+        # The bend that an ordinary fit leaves in every image would pass for a map.
+        residual = study.system.residual_of(chosen, gls=True)
+        left_out = left_out_residual(study, chosen, sums.gls) if flips else None
+        for name, effect in candidates.maps.items():
+            gain = map_gain(study, effect, residual, left_out)
+            closed[name] = squares.squares - _squares_without(study, chosen, gain.values)
+            gains[name] = torch.cat([gain.gain.sum()[None], gain.null])
+            sizes[name] = effect.num_cells(effect.shape)
     tests = {
         name: EffectTest(
             name=name,
@@ -246,10 +279,10 @@ def compare_effects(
             gain=float(gains[name][0]),
             null=gains[name][1:],
             null_closed=by_chance.get(name),
-            size=_size(study, name),
-            by_tiles=candidates.is_tested_by_tiles(name),
+            size=size,
+            by_tiles=name in few,
         )
-        for name in [*others, *(name for name in closed if name in candidates.maps)]
+        for name, size in sizes.items()
     }
     least = (study.material_mm / 1000) ** 2 * float(sums.count.sum())
     return EffectComparison(
@@ -259,38 +292,6 @@ def compare_effects(
         probes={name: test for name, test in tests.items() if name in candidates.probes},
         least=-math.inf if chosen else least,
     )
-
-
-def _by_tiles(
-    study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return what each effect closes of every pose, and its gains; tiles are the units."""
-    tiles = study.tiles
-    assert tiles is not None
-    sums = tile_sums(study.system, [*chosen, *names], tiles, study.fit)
-    squares = HeldOutSquares(sums.ols, chosen, tiles.folds)
-    closed = {name: tiles.per_pose(squares.closed(name), study.sums.num_units) for name in names}
-    if flips:
-        return closed, flipped_gains(sums.gls, chosen, names, tiles.folds, tiles.signs)
-    return closed, dict.fromkeys(names, torch.full((1,), torch.nan, dtype=torch.float64))
-
-
-def _of_maps(
-    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return what each effect with one value a cell closes of every pose, and its gains.
-
-    The residual is that of the generalised fit: the bend that an ordinary fit leaves in every image
-    would pass for a map.
-    """
-    residual = study.system.residual_of(chosen, gls=True)
-    left_out = left_out_residual(study, chosen, study.sums.gls) if flips else None
-    closed, gains = {}, {}
-    for name, effect in study.candidates.maps.items():
-        gain = map_gain(study, effect, residual, left_out)
-        closed[name] = squares.squares - _squares_without(study, chosen, gain.values)
-        gains[name] = torch.cat([gain.gain.sum()[None], gain.null])
-    return closed, gains
 
 
 def _squares_without(study: Study, chosen: Sequence[str], values: Tensor) -> Tensor:
@@ -319,13 +320,11 @@ def left_out_residual(study: Study, chosen: Sequence[str], sums: Sums) -> Tensor
         chosen: Effects of the model.
         sums: Ordinary or generalised sums of every pose, by which the model is fitted.
     """
-    system, observations = study.system, study.observations
-    parts = system.of(chosen)
-    theta = sums.left_out_solutions(chosen)[observations.unit][:, :, None]
+    parts, left = study.system.of(chosen), study.system.residual
+    theta = sums.left_out_solutions(chosen)[study.observations.unit][:, :, None]
     of_parts = theta.split([part.shape[1] for part in parts], dim=1)
-    left = system.residual
     for part, own in zip(parts, of_parts, strict=True):
-        left = left - by_frame(part, own, observations.frame)[:, 0]
+        left = left - by_frame(part, own, study.observations.frame)[:, 0]
     return left
 
 
@@ -339,29 +338,188 @@ def held_out_squares(study: Study, chosen: Sequence[str]) -> Tensor:
     return HeldOutSquares(study.sums.ols, chosen, study.folds).squares
 
 
-def _size(study: Study, name: str) -> int:
-    """Return the number of an effect's columns or cells."""
-    if name in study.candidates.maps:
-        effect = study.candidates.maps[name]
-        return effect.num_cells(effect.shape)
-    return len(range(*study.sums.layout.effects[name]))
-
-
 def closed_square(study: Study, test: EffectTest) -> float:
     """Return the fall of the held-out mean square by an effect, m^2."""
     return test.total / float(study.sums.count.sum())
 
 
-def least_p_value(study: Study, comparison: EffectComparison) -> float:
+def least_p_value(study: Study, comparison: EffectComparison, *, probes: bool = True) -> float:
     """Return the smallest p-value of all effects and probes that close `material_mm`; 1 if none.
 
     Significant but tiny effects are not counted.
     """
-    least = (study.material_mm / 1000) ** 2
-    found = [1.0]
+    least, found = (study.material_mm / 1000) ** 2, [1.0]
     for p_value, tests in (
         (comparison.naming_p_value, comparison.tests),
-        (comparison.family_p_value, comparison.probes),
+        (comparison.family_p_value, comparison.probes if probes else {}),
     ):
         found += [p_value(one.name) for one in tests.values() if closed_square(study, one) >= least]
     return min(found)
+
+
+def closed_gap(study: Study, first: EffectComparison, test: EffectTest) -> tuple[float, float]:
+    """Return by how much an effect lowers the gap, metres, and its share of the squared gap.
+
+    Args:
+        study: The recording, before any effect was named.
+        first: All effects as additions to the base model.
+        test: Of the effect; where it makes predictions worse, the first number is negative.
+    """
+    total = float(first.squares.sum() / study.sums.count.sum())
+    before, closed = max(total - study.fit.floor**2, 0.0), closed_square(study, test)
+    share = min(max(closed / before, 0.0), 1.0) if before > 0 else 0.0
+    return before**0.5 - max(before - closed, 0.0) ** 0.5, share
+
+
+def cause_set(
+    comparison: EffectComparison,
+    winner: str,
+    level: float,
+    share: float,
+    missed: float = 0.0,
+    unexplained: float = 0.0,
+    gains: Callable[[str], Tensor] | None = None,
+) -> list[str]:
+    """Return the effects that these data cannot distinguish from the winner, itself first.
+
+    An effect belongs to the set if it closes more than half of what the winner closes and not
+    significantly less (a t-test, paired over poses) or at least `share` of it. So does one that
+    closes two thirds of it, and less by no more than the form of an effect may miss: multipath by a
+    renderer closed nine tenths. Where the winner explains less than half of what there is, its form
+    says little of the cause: then less than two thirds are enough, in proportion. So does an effect
+    that is at least as likely: what an effect closes is uncertain where poses scatter and are few,
+    and the likelihood knows how much.
+
+    Whatever it closes, an effect does not belong to the set if it gains significantly less in
+    likelihood than any error in its form explains (`fits_too_badly`).
+
+    Args:
+        comparison: All effects.
+        winner: The effect or probe that is compared.
+        level: Of the t-test.
+        share: See above.
+        missed: Sum of squares that the form of an effect may miss, m^2.
+        unexplained: Sum of squares that stays unexplained, m^2.
+        gains: Falls of chi-squared of each pose by an effect, shape (U,); None: not asked for.
+    """
+    best = comparison.probes.get(winner) or comparison.tests[winner]
+    explained = best.total / max(best.total + unexplained, TINY)
+    least = max(best.total - missed, 2 / 3 * min(explained / 0.5, 1.0) * best.total)
+
+    def belongs(test: EffectTest) -> bool:
+        """Return whether an effect may be the cause in the place of the winner."""
+        if test.gain >= best.gain and not best.by_tiles:
+            return True
+        alike = test.total >= least
+        if not alike and test.total > 0.5 * best.total:
+            alike = test.total >= share * best.total
+            alike = alike or not_significantly_less(test.closed, best.closed, level)
+        if not alike or gains is None or not comparable(test, best):
+            return alike
+        return not fits_too_badly(test, gains(test.name), gains(winner), level)
+
+    others = (test for test in comparison.ordered() if test.name != winner)
+    return [winner, *(test.name for test in others if belongs(test))]
+
+
+def comparable(test: EffectTest, *named: EffectTest) -> bool:
+    """Return whether the likelihood of poses can say that a cause is not this effect.
+
+    It cannot where what is named has more columns: they also fit what the form of a simpler cause
+    misses. On a simulated recording `multipath` fitted a clear layer, which is another form of
+    `incidence_angle`, better than that effect's two columns did. Nor can it of effects that are
+    tested by tiles, or that have one value a cell.
+
+    Args:
+        test: The effect.
+        named: What is named in its place.
+    """
+    form = all(CATALOGUE[one.name].form_error > 0 and not one.by_tiles for one in (test, *named))
+    return form and sum(one.size for one in named) <= test.size
+
+
+def fits_too_badly(test: EffectTest, gains: Tensor, of_cause: Tensor, level: float) -> bool:
+    """Return whether an effect gains significantly less than if it were the cause of a gap.
+
+    Of what the cause explains, the columns of an effect of that kind explain at least
+    1 / (1 + e^2), with e its `form_error`. That holds for chi-squared as for millimetres, and the
+    cause explains no less than what is named.
+
+    Args:
+        test: The effect.
+        gains: Fall of chi-squared of each pose by it, shape (U,).
+        of_cause: By what is named, shape (U,).
+        level: Of the t-test, paired over poses.
+    """
+    most = (1 + CATALOGUE[test.name].form_error ** 2) * gains
+    return not not_significantly_less(most, of_cause, level)
+
+
+def not_significantly_less(closed: Tensor, other: Tensor, level: float) -> bool:
+    """Return whether one sum over poses is not significantly less than another.
+
+    Args:
+        closed: Of every pose, shape (U,).
+        other: What it is compared with, shape (U,).
+        level: Of the t-test, paired over poses.
+    """
+    less = other - closed
+    error = float(less.std()) / len(less) ** 0.5
+    return float(less.mean()) <= student_quantile(1 - level, len(less) - 1) * max(error, TINY)
+
+
+def one_cause(
+    comparison: EffectComparison,
+    together: Tensor,
+    level: float,
+    excluded: Callable[[EffectTest], bool] = lambda _: False,
+) -> list[str]:
+    """Return the effects of which several named ones may be parts.
+
+    Args:
+        comparison: Effects as additions to the model without the parts.
+        together: What the parts close of every pose in that place, shape (U,), m^2.
+        level: Of the test whether an effect closes less than the cause would.
+        excluded: Whether an effect fits too badly for that.
+    """
+    found = []
+    for test in comparison.ordered():
+        error = CATALOGUE[test.name].form_error
+        most = (1 + error**2) * test.closed
+        large = error > 0 and float(most.sum()) > 0.5 * float(together.sum())
+        if large and not_significantly_less(most, together, level) and not excluded(test):
+            found.append(test.name)
+    return found
+
+
+def vary_alike(name: str, other: str) -> bool:
+    """Return whether two effects both shift whole images or not, and follow the velocity or not.
+
+    An error that is the same in all pixels of a frame is no form of one that is not, nor the other
+    way round, unless that one displaces camera or target, which mostly shifts whole images.
+    """
+    one, two = CATALOGUE[name], CATALOGUE[other]
+    moved = (one.of_frame and two.moves_images) or (two.of_frame and one.moves_images)
+    alike = moved or one.of_frame == two.of_frame
+    return alike and (VELOCITY in one.needs) == (VELOCITY in two.needs)
+
+
+def unexplained_squares(
+    study: Study, comparison: EffectComparison, *, at_least: bool = False
+) -> float:
+    """Return the sum of squares that a model leaves beside noise and pose scatter, m^2.
+
+    Args:
+        study: The recording.
+        comparison: What could be added to the model.
+        at_least: Whether the noise counts as large as it may be, so that it is no form error.
+    """
+    most = (1 + FLOOR_ERROR) * study.fit.noise.most if at_least else 1.0
+    noise = float(study.sums.count.sum()) * (most * study.fit.floor) ** 2
+    return max(float(comparison.squares.sum()) - noise - pose_scatter_squares(study), 0.0)
+
+
+def pose_scatter_squares(study: Study) -> float:
+    """Return the sum of squares that a model takes for scatter of the poses, m^2."""
+    columns = study.sums.plain.diagonal(dim1=1, dim2=2)[:, -1 - NUM_POSE : -1].sum(0)
+    return float((study.sums.pose_sd**2 * columns).sum())

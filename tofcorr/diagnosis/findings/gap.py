@@ -1,4 +1,4 @@
-"""The gap before and after the effects: its size, its parts, and the resamples of its intervals.
+"""The gap before and after the effects: its size, its parts, and whether some of it is unknown.
 
 Each pose is predicted by a fit to all others. To first order a sum of such squares varies only by
 the poses that are drawn: the fit is where they are least. So nothing is fitted to a resample, whose
@@ -6,42 +6,64 @@ few different poses would predict far worse; but the effects are selected again,
 is large enough. Poses differ in their noise, which is subtracted as it is there. A pose that alone
 shows a range of distances or angles is missed by any amount: the model is not wrong there, but
 unknown.
+
+The tests behind `unknown` ask whether more remains than poses, noise and the target gap allow. Each
+has a null hypothesis of its own; a weighted Bonferroni correction joins them. Four of them ask
+whether anything remains. With nothing missing their p-values are uniform, and they have nearly all
+of the level, so that the cause is then called unknown about as often as the level says. The others
+ask whether more remains than matters.
+
+What was shown to be smaller than half of the target gap is not unknown, however significant. Where
+effects are named, neither is what was not shown to be larger than matters: the forms of effects are
+never quite right.
+
+Effects are named a second time where a gap is certain and no single effect was significant. With
+few poses a test of twenty effects has little power: a cause must be far beyond what each of them
+reaches by chance. That guards against a name where nothing is missing. The tests behind `unknown`
+ask the same of the recording as a whole, at the same level. Where they find that something is
+missing, nothing is left to guard against, and an effect need be significant by itself only (a
+gatekeeping procedure; Dmitrienko, Offen and Westfall 2003).
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
+from scipy import special
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import compare_effects
-from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.effect_comparison import (
+    NORMAL_95,
+    compare_effects,
+    held_out_squares,
+    least_p_value,
+)
+from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.structure import (
     Coherence,
     NoiseFloor,
     coherence,
     noise_floor,
-    noise_of_poses,
+    unlike_waves,
 )
+from tofcorr.diagnosis.findings.where import (
+    Estimated,
+    Region,
+    Stage,
+    binned_covariates,
+    find_where,
+)
+from tofcorr.diagnosis.sums.observations import hand_eye_columns
 from tofcorr.diagnosis.sums.study import Study
-
-Interval = tuple[float, float]
-TWO_SIDED = 1.96
-"""Standard deviations of a normal distribution on either side that hold 95 %. A mathematical
-constant."""
-
-
-def draw_resamples(study: Study, generator: torch.Generator) -> Tensor:
-    """Draw how often each resample holds each pose, shape (B, U)."""
-    return resampled(study.sums.num_units, study.options.bootstraps, generator)
 
 
 def resampled(units: int, count: int, generator: torch.Generator) -> Tensor:
     """Draw how often each of some resamples holds each unit, shape (count, units)."""
-    picked = [torch.randint(0, units, (units,), generator=generator) for _ in range(count)]
-    return torch.stack([torch.bincount(own, minlength=units) for own in picked]).double()
+    picked = torch.randint(0, units, (count, units), generator=generator)
+    counts = torch.zeros(count, units, dtype=torch.float64)
+    return counts.scatter_add(1, picked, torch.ones_like(counts))
 
 
 def studentised(
@@ -83,150 +105,38 @@ def _ratio(total: Tensor, count: Tensor, weights: Tensor) -> tuple[Tensor, Tenso
     return ratio, (freedom * (weights * deviations**2).sum(1)).sqrt() / sums
 
 
-def interval_of(draws: Sequence[float], estimate: float, *, level: float = 0.95) -> Interval:
-    """Return the percentile interval, widened to contain the estimate.
-
-    Args:
-        draws: Of a quantity.
-        estimate: Of the same quantity.
-        level: Coverage of all intervals. The usual convention.
-    """
-    low, high = np.quantile(list(draws), [(1 - level) / 2, (1 + level) / 2])
-    return min(float(low), estimate), max(float(high), estimate)
-
-
-def hull(intervals: Iterable[Interval]) -> Interval:
-    """Return the least interval that contains all."""
-    lows, highs = zip(*intervals, strict=True)
-    return min(lows), max(highs)
-
-
-def squared_gaps(
-    study: Study, named: NamedEffects, floor: NoiseFloor, resamples: Tensor
-) -> list[tuple[float, float]]:
-    """Return squared gaps before and after the effects in every resample, m^2.
-
-    The floor has one error for all squared gaps of a resample, and holds structure in half of them.
-    No floor is below zero, so that no gap is larger than what is left.
-
-    Args:
-        study: The recording, before any effect was named.
-        named: The effects named.
-        floor: Noise that is no gap.
-        resamples: How often each resample holds each pose, shape (B, U).
-    """
-    draws = _resampled(study, named, floor.size, resamples)
-    random, most = np.random.default_rng(study.options.seed), floor.size**2
-    excess = floor.error * random.standard_normal(len(draws))
-    excess += min(floor.structure, most) * random.uniform(-1, 1, len(draws)).clip(min=0)
-    draws = draws + np.minimum(excess, most)[:, None]
-    return [(before, after) for before, after in draws.tolist()]
-
-
-def squared_gaps_of(study: Study, squares: Tensor, floor: float, resamples: Tensor) -> Tensor:
-    """Return the squared gap in every resample, with this floor, (B,), m^2.
-
-    Args:
-        study: The recording.
-        squares: What a model leaves of each pose, shape (U,), m^2.
-        floor: Noise that is no gap, metres.
-        resamples: How often each resample holds each pose, shape (B, U).
-    """
-    return studentised(squares - noise_of_poses(study, floor), study.sums.count, resamples)
-
-
-def _resampled(study: Study, named: NamedEffects, floor: float, resamples: Tensor) -> np.ndarray:
-    """Return squared gaps before and after in every resample, (B, 2), m^2."""
-    before = squared_gaps_of(study, study.left_out_squares(()), floor, resamples)
-    after = before.clone()
-    if named.names or named.refined_terms:
-        rivals = _rivals(named)
-        chosen = [_chosen_again(named, rivals, weights) for weights in resamples]
-        for names in dict.fromkeys(chosen):
-            own = torch.tensor([each == names for each in chosen])
-            squares = named.study.left_out_squares(names)
-            after[own] = squared_gaps_of(study, squares, floor, resamples[own])
-    return torch.stack([before, after], dim=1).numpy()
-
-
-def _rivals(named: NamedEffects) -> dict[str, dict[str, Tensor]]:
-    """Return what each named effect and its cause set close in its place, (U,) each."""
-    rivals = {}
-    for name, members in zip(named.names, named.cause_sets, strict=True):
-        if name not in named.study.candidates.effects:
-            continue
-        others = [n for n in named.columns if n != name]
-        tests = compare_effects(named.study, others, flips=False, maps=False).tests
-        rivals[name] = {n: test.closed for n, test in tests.items() if n in members}
-    return rivals
-
-
-def _chosen_again(
-    named: NamedEffects, rivals: dict[str, dict[str, Tensor]], weights: Tensor
-) -> tuple[str, ...]:
-    """Select for each named effect the member of its cause set that closes most in a resample.
-
-    None is selected where none closes what an effect must close to be named.
-    """
-    chosen = [n for n in named.refined_terms if n in named.study.candidates.effects]
-    tests, count = named.study.options.tests, named.study.sums.count
-    size = tests.material_mm if len(named.names) == 1 else tests.further_mm
-    least = (size / 1000) ** 2 * float(weights @ count)
-    for gains in rivals.values():
-        left = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
-        best = max(left, key=lambda n: left[n])
-        if left[best] >= least:
-            chosen.append(best)
-    return tuple(chosen)
-
-
-@dataclass(frozen=True, kw_only=True)
-class GapDraws:
-    """The gap in every resample of the poses, metres.
-
-    Attributes:
-        as_given: Of the simulator as given; empty where none was given.
-        before, after: Without and with the named effects.
-    """
-
-    as_given: tuple[float, ...]
-    before: tuple[float, ...]
-    after: tuple[float, ...]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """The gap before and after the effects, in metres, with 95 % intervals.
+    """The gap before and after the effects, in metres.
 
     Attributes:
-        before, before_interval: With the base model refitted.
-        after, after_interval: With the named effects added.
+        before: With the base model refitted.
+        after: With the named effects added.
         floor: Noise of a pixel, root mean square; at most what the effects leave.
         floor_from_repeats: Whether repeated frames gave the floor; else it is an upper bound.
-        closed, closed_interval: 1 - after^2 / before^2.
-        as_given, as_given_interval: Of the simulator as given; None where none was given.
+        closed: 1 - after^2 / before^2.
+        as_given: Of the simulator as given; None where none was given.
         structure: Of the residual of the base fit.
         between_images, fixed_pattern, within_images: Components of `before`; their squares add up.
         hand_eye_shift: How far the effects move the hand-eye transform, metres and radians.
-        draws: What the intervals come from.
     """
 
-    before: float
-    before_interval: Interval
-    after: float
-    after_interval: Interval
+    before: Estimated
+    after: Estimated
     floor: float
     floor_from_repeats: bool
-    closed: float
-    closed_interval: Interval
-    as_given: float | None
-    as_given_interval: Interval | None
+    closed: Estimated
+    as_given: Estimated | None
     structure: Coherence
     between_images: float
     fixed_pattern: float
     within_images: float
     hand_eye_shift: tuple[float, float]
-    draws: GapDraws
+
+    @property
+    def whole(self) -> Estimated:
+        """The gap to the simulator under diagnosis, or to the one fitted."""
+        return self.before if self.as_given is None else self.as_given
 
 
 def measure_gap(
@@ -246,156 +156,440 @@ def measure_gap(
             simulator was given. The gap as given is that and what they leave, so that no noise must
             be subtracted.
     """
-    before = study.left_out_mean_square(())
-    noise = gap_floor(study, named)
-    floor = noise.size
-    before, after = before - floor**2, _left_by(study, named) - floor**2
-    draws = squared_gaps(study, named, noise, resamples)
-    closed = _closed(before, after) if named.names else 0.0
-    fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
-    structure = coherence(study, study.system.residual_of(()))
-    components = _components(structure, max(before, 0.0))
-    as_given, given_draws = None, []
+    left = study.left_out_mean_square(()), named.study.left_out_mean_square(named.columns)
+    noise = noise_floor(named)
+    noise = noise._replace(size=min(noise.size, left[1] ** 0.5))
+    squares = np.array(left)[None] - noise.size**2
+    squares = np.concatenate([squares, squared_gaps(study, named, noise, resamples)])
+    (before, *befores), (after, *afters) = np.sqrt(squares.clip(min=0)).T.tolist()
+    closed = np.zeros(len(squares))
+    if named.names:
+        known = squares[:, 0] > 0
+        ratio = squares[known, 1].clip(min=0) / squares[known, 0]
+        closed[known] = (1 - ratio).clip(0, 1)
+    as_given = None
     if explained is not None:
-        left = torch.tensor([after, *(a for _, a in draws)], dtype=torch.float64).clamp(min=0)
-        own, least, most = explained.T
-        squares = torch.minimum(torch.maximum(own + left, least), most.clamp(min=0))
-        as_given, *given_draws = map(_root, squares.tolist())
+        own, least, most = explained.numpy().T
+        given = np.minimum(np.maximum(own + squares[:, 1].clip(min=0), least), most.clip(min=0))
+        whole, *draws = np.sqrt(given.clip(min=0)).tolist()
+        as_given = Estimated(whole, draws)
+    structure = coherence(study, study.system.residual_of(()))
+    between = float(np.clip(structure.between, 0.0, before**2))
+    fixed = float(np.clip(structure.fixed, 0.0, before**2 - between))
+    count = study.fit.model.num_hand_eye if named.columns else 0
+    change = named.study.sums.ols.solve(named.columns)[:count] - study.sums.ols.solve(())[:count]
     return Gap(
-        before=_root(before),
-        before_interval=interval_of([_root(b) for b, _ in draws], _root(before)),
-        after=_root(after),
-        after_interval=interval_of([_root(a) for _, a in draws], _root(after)),
-        floor=floor,
+        before=Estimated(before, befores),
+        after=Estimated(after, afters),
+        floor=noise.size,
         floor_from_repeats=study.fit.noise.repeats > 0,
-        closed=closed,
-        closed_interval=interval_of(list(fractions), closed),
+        closed=Estimated(closed[0], closed[1:].tolist()),
         as_given=as_given,
-        as_given_interval=None if as_given is None else interval_of(given_draws, as_given),
         structure=structure,
-        between_images=components[0],
-        fixed_pattern=components[1],
-        within_images=components[2],
-        hand_eye_shift=hand_eye_shift(study, named),
-        draws=GapDraws(
-            as_given=tuple(given_draws),
-            before=tuple(_root(b) for b, _ in draws),
-            after=tuple(_root(a) for _, a in draws),
-        ),
+        between_images=between**0.5,
+        fixed_pattern=fixed**0.5,
+        within_images=max(before**2 - between - fixed, 0.0) ** 0.5,
+        hand_eye_shift=(float(change[:3].norm()), float(change[3:].norm())),
     )
 
 
-def gap_floor(study: Study, named: NamedEffects) -> NoiseFloor:
-    """Return the noise that the gap is in excess of; it is at most what the final model leaves."""
-    noise = noise_floor(named)
-    return noise._replace(size=min(noise.size, float(np.sqrt(_left_by(study, named)))))
+def squared_gaps(
+    study: Study, named: NamedEffects, floor: NoiseFloor, resamples: Tensor
+) -> np.ndarray:
+    """Return squared gaps before and after the effects in every resample, (B, 2), m^2.
+
+    The floor has one error for all squared gaps of a resample, and holds structure in half of them.
+    No floor is below zero, so that no gap is larger than what is left.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        floor: Noise that is no gap.
+        resamples: How often each resample holds each pose, shape (B, U).
+    """
+    before = _squared_gap(study, study.left_out_squares(()), floor.size, resamples)
+    after = before.clone()
+    if named.adds_something:
+        rivals = _rivals(named)
+        chosen = [_chosen_again(named, rivals, weights) for weights in resamples]
+        for names in dict.fromkeys(chosen):
+            own = torch.tensor([each == names for each in chosen])
+            squares = named.study.left_out_squares(names)
+            after[own] = _squared_gap(study, squares, floor.size, resamples[own])
+    random, most = np.random.default_rng(study.options.seed), floor.size**2
+    excess = floor.error * random.standard_normal(len(before))
+    excess += min(floor.structure, most) * random.uniform(-1, 1, len(before)).clip(min=0)
+    return torch.stack([before, after], dim=1).numpy() + np.minimum(excess, most)[:, None]
 
 
-def _left_by(study: Study, named: NamedEffects) -> float:
-    """Return the mean square that the final model leaves held out, m^2."""
-    if named.names or named.refined_terms:
-        return named.study.left_out_mean_square(named.columns)
-    return study.left_out_mean_square(())
+def _squared_gap(study: Study, squares: Tensor, floor: float, resamples: Tensor) -> Tensor:
+    """Return the squared gap in every resample, with this floor, (B,), m^2.
+
+    Args:
+        study: The recording.
+        squares: What a model leaves of each pose, shape (U,), m^2.
+        floor: Noise that is no gap, metres; each pixel has its own share of it.
+        resamples: How often each resample holds each pose, shape (B, U).
+    """
+    fit, count = study.fit, study.sums.count
+    own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
+    return studentised(squares - (floor / fit.floor) ** 2 * own, count, resamples)
+
+
+def _rivals(named: NamedEffects) -> list[dict[str, Tensor]]:
+    """Return what each named effect and its cause set close in its place, (U,) each."""
+    rivals = []
+    for name, members in named.sets.items():
+        if name in named.columns:
+            others = [other for other in named.columns if other != name]
+            tests = compare_effects(named.study, others, flips=False, maps=False).tests
+            rivals.append({n: test.closed for n, test in tests.items() if n in members})
+    return rivals
+
+
+def _chosen_again(
+    named: NamedEffects, rivals: Sequence[dict[str, Tensor]], weights: Tensor
+) -> tuple[str, ...]:
+    """Select for each named effect the member of its cause set that closes most in a resample.
+
+    None is selected where none closes what an effect must close to be named.
+    """
+    chosen = [name for name in named.columns if name in named.refined_terms]
+    tests, count = named.study.options.tests, named.study.sums.count
+    size = tests.material_mm if len(named.names) == 1 else tests.further_mm
+    least = (size / 1000) ** 2 * float(weights @ count)
+    for gains in rivals:
+        left = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
+        best = max(left, key=lambda n: left[n])
+        if left[best] >= least:
+            chosen.append(best)
+    return tuple(chosen)
 
 
 def gap_steps(
     study: Study, named: NamedEffects, gap: Gap, resamples: Tensor
-) -> list[tuple[str, float, Interval]]:
-    """Return the gap after each named effect in turn and its 95 % interval, metres.
+) -> list[tuple[str, Estimated]]:
+    """Return the gap after each named effect in turn, metres.
 
     Maps are subtracted in every step. Effects are not chosen anew in resamples.
     """
-    steps = []
+    steps, count = [], float(study.sums.count.sum())
     base = float(study.left_out_squares(()).sum())
-    count = float(study.sums.count.sum())
     for position, name in enumerate(named.names[:-1]):
-        present = [n for n in named.names[: position + 1] if n in named.study.candidates.effects]
+        present = [n for n in named.names[: position + 1] if n in named.columns]
         squares = named.study.left_out_squares(present)
-        size = _root(gap.before**2 - (base - float(squares.sum())) / count)
-        gaps = squared_gaps_of(study, squares, gap.floor, resamples)
-        draws = [_root(square) for square in gaps.tolist()]
-        steps.append((name, size, interval_of(draws, size)))
-    if named.names:
-        steps.append((named.names[-1], gap.after, gap.after_interval))
-    return steps
+        size = max(gap.before**2 - (base - float(squares.sum())) / count, 0.0) ** 0.5
+        gaps = _squared_gap(study, squares, gap.floor, resamples).clamp(min=0).sqrt()
+        steps.append((name, Estimated(size, gaps.tolist())))
+    return [*steps, (named.names[-1], gap.after)] if named.names else []
 
 
-def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:
-    """Return how far the effects move the hand-eye transform, metres and radians."""
-    count = study.fit.model.num_hand_eye
-    if not count or not named.columns:
-        return 0.0, 0.0
-    without = study.sums.ols.solve(())[:count]
-    added = named.study.sums.ols.solve(named.columns)[:count]
-    change = added - without
-    return float(change[:3].norm()), float(change[3:].norm())
-
-
-def _closed(before: float, after: float) -> float:
-    if before <= 0:
-        return 0.0
-    return float(np.clip(1.0 - max(after, 0.0) / before, 0.0, 1.0))
-
-
-def _root(square: float) -> float:
-    return float(np.sqrt(max(square, 0.0)))
-
-
-def _components(structure: Coherence, before: float) -> tuple[float, float, float]:
-    """Split the squared gap: between images, fixed pattern, within images; return the roots."""
-    between = float(np.clip(structure.between, 0.0, before))
-    fixed = float(np.clip(structure.fixed, 0.0, before - between))
-    return _root(between), _root(fixed), _root(before - between - fixed)
-
-
-class LonePoses(NamedTuple):
-    """Poses that no other pose predicts.
-
-    Attributes:
-        frames: The first frame of each.
-        distance: Nearest and farthest distance that they show, metres.
-        share: What they make of the squared gap.
-        others: The gap of all other poses, metres.
-    """
-
-    frames: tuple[int, ...]
-    distance: tuple[float, float]
-    share: float
-    others: float
-
-
-def lone_poses(
-    study: Study, floor: float, *, alone_limit: float = 8.0, most: float = 0.5
-) -> LonePoses | None:
-    """Return the poses that make most of the base model's gap because they are alone, or None.
+def stages_of(
+    study: Study, named: NamedEffects, gap: Gap, residual: Tensor | None
+) -> tuple[Stage, Stage, Stage]:
+    """Return the three stages.
 
     Args:
         study: The recording, before any effect was named.
-        floor: Noise of a pixel that is no gap, metres.
-        alone_limit: A pose is alone if a fit to all others misses it by so many times the mean
-            square that the fit to all poses leaves in it. Chosen: with 20 poses that are alike the
-            ratio is below 3.
-        most: Share of the squared gap, at least, that such poses make where they are worth a line.
-            Chosen.
+        named: The effects named.
+        gap: Before and after them.
+        residual: Of the simulator as given, shape (M,), metres; None: none was given.
     """
-    square, count = study.left_out_squares(()), study.sums.count
-    alone = square > alone_limit * _left_by_all(study)
-    gap = float(square.sum() - floor**2 * count.sum())
-    share = float(square[alone].sum() - floor**2 * count[alone].sum()) / gap if gap > 0 else 0.0
-    if not share > most or bool(alone.all()):
-        return None
-    mean = float(square[~alone].sum() / count[~alone].sum())
-    distance = study.inputs.radial_distance[alone[study.unit_of_pixel]]
-    unit = study.observations.unit
-    return LonePoses(
-        frames=tuple(int((unit == pose).nonzero()[0]) for pose in alone.nonzero()[:, 0].tolist()),
-        distance=(float(distance.min()), float(distance.max())),
-        share=min(share, 1.0),
-        others=max(mean - floor**2, 0.0) ** 0.5,
+    binned, as_given = binned_covariates(study), Stage(name="as_given")
+    if residual is not None:
+        as_given = find_where(study, "as_given", residual=residual, binned=binned)
+    recalibrated = find_where(study, "recalibrated", binned=binned)
+    with_effects = replace(recalibrated, name="with_effects")
+    if named.adds_something:
+        with_effects = find_where(named.study, "with_effects", named.columns, binned=binned)
+    return (
+        replace(as_given, gap=gap.as_given),
+        replace(recalibrated, gap=gap.before),
+        replace(with_effects, gap=gap.after),
     )
 
 
-def _left_by_all(study: Study) -> Tensor:
-    """Return the ordinary sum of squares that the fit to all poses leaves in each, (U,), m^2."""
-    ols = study.sums.ols
-    return ols.squares_at((), ols.solve(()).expand(study.sums.num_units, -1))
+@dataclass(frozen=True, kw_only=True)
+class OpenSet:
+    """What remains after the named effects.
+
+    Class attributes:
+        weights: What each test has of the level. Chosen: nearly all for those that are uniform with
+            nothing missing; the others reject then almost never, and otherwise by far. Of 299
+            draws, p-values are multiples of 1/300: the shares of 5 % are four, one and five of
+            these.
+        least_poses: With fewer poses nothing is called unknown. Two of the tests take standard
+            errors over poses as known: of 60 recordings with four to seven poses and nothing
+            missing seven would be.
+        most_scatter: Scatter of poses that is no gap in itself, metres, and radians of their turn.
+            A prior: robots repeat to 0.02 to 2 mm, and to as many mrad; a survey places a target to
+            1 to 3 mm. What depends on anything recorded is no scatter.
+        least_variance: Least variance that others are divided by, m^2: a micrometre squared.
+            Chosen, below any noise.
+
+    Attributes:
+        unknown: Whether a gap remains that no effect explains.
+        score: How large and how unexplained the remainder is, from 0 to 1, for ranking.
+        after: Structure of the residual with the named effects.
+        remaining_share: Squared structure after over before.
+        fingerprint: What the remainder looks like: clauses that follow "It".
+        p_value: Probability of such a remainder if none is larger than what does not matter.
+        p_values: Of each test by itself.
+    """
+
+    weights: ClassVar[Mapping[str, float]] = {
+        "probes": 0.27,
+        "effects": 0.08,
+        "covariates": 0.34,
+        "waves": 0.28,
+        "structure": 0.01,
+        "poses": 0.01,
+        "size": 0.01,
+    }
+    least_poses: ClassVar[int] = 8
+    most_scatter: ClassVar[float] = 0.003
+    least_variance: ClassVar[float] = 1e-12
+
+    unknown: bool
+    score: float
+    after: Coherence
+    remaining_share: float
+    fingerprint: tuple[str, ...]
+    p_value: float
+    p_values: Mapping[str, float]
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of the poses by offset and tilts, over the image, metres."""
+        return max(self.after.between, 0.0) ** 0.5
+
+
+def judge_remainder(
+    study: Study,
+    named: NamedEffects,
+    gap: Gap,
+    where: Stage | None = None,
+    *,
+    half_size: float = 0.0007,
+    significant: float = 3.0,
+) -> OpenSet:
+    """Test whether more remains than poses, noise and the target gap allow.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        gap: Before and after them.
+        where: Bias of what they leave along all covariates; None: it is computed.
+        half_size: Size of an unknown gap at which the score is a half, metres. Chosen.
+        significant: Structure counts for the score from this many standard errors on. The usual
+            convention.
+    """
+    options, tiny = study.options, OpenSet.least_variance
+    theta, system = named.study.sums.ols.solve(named.with_probes), named.study.system
+    known = len(system.sums.layout.of(named.columns))
+    left = system.residual - system.times(named.columns, theta[:known])
+    after = coherence(named.study, left)
+    allowed = allowed_scatter(study, after)
+    p_values = unknown_p_values(study, named, gap, after, where)
+    p_value = joined(p_values)
+
+    def size(structure: Coherence) -> float:
+        """Return the variance of significant structure beyond the repeatability of poses, m^2."""
+        clear = structure.within > significant * structure.within_error
+        inside = max(structure.within, 0.0) if clear else 0.0
+        return inside + max(structure.between - allowed, 0.0)
+
+    share = float(np.clip(size(after) / max(size(gap.structure), tiny), 0.0, 1.0))
+    score = share * size(after) / (size(after) + half_size**2)
+    if named.probes:
+        without, probed, before = (
+            float(held_out_squares(own, names).sum() / study.sums.count.sum())
+            for own, names in (
+                (named.study, named.columns),
+                (named.study, named.with_probes),
+                (study, ()),
+            )
+        )
+        whole = max(before - study.fit.floor**2, before - probed, tiny)
+        closed = max(without - probed, 0.0)
+        score = max(score, min(closed / whole, 1.0) * closed / (closed + half_size**2))
+    enough = named.tested and study.sums.num_units >= OpenSet.least_poses
+    return OpenSet(
+        unknown=enough and p_value <= options.tests.level,
+        score=score,
+        after=after,
+        remaining_share=share,
+        fingerprint=tuple(_fingerprint(named, left, after)),
+        p_value=p_value,
+        p_values=p_values,
+    )
+
+
+def allowed_scatter(study: Study, after: Coherence) -> float:
+    """Return the variance of the poses that is no gap, m^2: stated, or what the data show.
+
+    That is at most the variance of the distance by the largest usual errors of the poses.
+    """
+    if study.options.pose_repeatability_mm != "auto":
+        return (study.options.pose_repeatability_mm / 1000) ** 2
+    _, columns = hand_eye_columns(study.observations, study.fit.tool_from_camera)
+    share = study.fit.share
+    arm = float((share * columns[:, 3:].square().sum(1)).sum() / share.sum())
+    return min(max(after.between, 0.0), OpenSet.most_scatter**2 * (1 + arm))
+
+
+def unknown_p_values(
+    study: Study,
+    named: NamedEffects,
+    gap: Gap,
+    after: Coherence,
+    where: Stage | None = None,
+    *,
+    least_structure: float = 0.0003,
+) -> dict[str, float]:
+    """Return the p-value of each test, by name.
+
+    - probes: one belongs to the model, or is significant where nothing is named;
+    - effects: nothing is named, yet one is significant: it explains too little of what remains;
+    - covariates: some of them show a bias;
+    - waves: slow waves over the image have unlike energies;
+    - structure: more is left within images than matters, or than right causes leave (normal);
+    - poses: they scatter more than they may (chi-squared);
+    - size: more remains than target and poses together, and much of what there was (normal).
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        gap: Before and after them.
+        after: Structure of what they leave.
+        where: Bias of that along all covariates; None: it is computed.
+        least_structure: The right causes leave little structure inside images: at most a third of
+            what there was before, and this size, metres. Chosen.
+    """
+    options, tiny, poses = study.options, OpenSet.least_variance, study.sums.num_units
+    # A part of the gap matters from half of the target on: enough where effects are named.
+    half = options.target_gap_mm / 2000
+    target, least = (half, half) if named.names else (2 * half, 0.0)
+    allowed = scatter = allowed_scatter(study, after)
+    if options.pose_repeatability_mm != "auto" and not named.names:
+        scatter += target**2
+
+    def beyond_poses(size: float, structure: Coherence) -> float:
+        """Return the square of a gap without the pose variance that is no gap, m^2."""
+        return max(size**2 - float(np.clip(structure.between, 0.0, allowed)), 0.0)
+
+    def within(size: float) -> float:
+        """Return the square of the structure within images that matters, m^2."""
+        right = max(gap.structure.within / 3, least_structure**2)
+        return min(size**2, right) if named.names else size**2
+
+    left, before = beyond_poses(gap.after, after), beyond_poses(gap.before, gap.structure)
+    spread = float(np.std(np.square(gap.after.draws)))
+    p_values = dict.fromkeys(OpenSet.weights, 1.0) | {
+        "structure": special.ndtr(-(after.within - within(target)) / max(after.within_error, tiny)),
+        "poses": special.chdtrc(poses, poses * max(after.between, 0.0) / max(scatter, tiny)),
+    }
+    if left > options.unknown_share * before:
+        p_values["size"] = special.ndtr(-(left - target**2) / max(spread, tiny))
+    if beyond_poses(gap.after.interval[1], after) > half**2:
+        found = list(named.probes.values())
+        if not named.names and named.last.probes:
+            alone = replace(named.last, tests={})
+            best = max(alone.probes.values(), key=lambda test: test.score)
+            found.append(alone.family_p_value(best.name))
+        p_values["probes"] = min(found, default=1.0)
+        if not named.names and left > half**2:
+            p_values["effects"] = least_p_value(named.study, named.last, probes=False)
+        waves = unlike_waves(named.study, named.columns)
+        p_values["waves"] = waves.p_value if waves.square > within(least) else 1.0
+        where = where or find_where(named.study, "with_effects", named.columns)
+        p_values["covariates"] = bias_p_value(where.by_covariate(), least)
+    return {name: float(value) for name, value in p_values.items()}
+
+
+def joined(p_values: Mapping[str, float]) -> float:
+    """Return the p-value of all tests together (Bonferroni, weighted)."""
+    return min(1.0, *(value / OpenSet.weights[name] for name, value in p_values.items()))
+
+
+def bias_p_value(regions: Mapping[str, Sequence[Region]], target: float) -> float:
+    """Return the p-value of a bias along some covariate that is larger than a target, metres.
+
+    Those of the regions are adjusted for their number. Their intervals are simultaneous, wider than
+    those of one.
+    """
+    found = [1.0]
+    for own in regions.values():
+        squares = [
+            one.bias**2 - ((one.bias.interval[1] - one.bias.interval[0]) / (4 * NORMAL_95)) ** 2
+            for one in own
+        ]
+        bins = [square for square, one in zip(squares, own, strict=True) if not one.trend]
+        # Of a line from end to end.
+        lines = [square / 12 for square, one in zip(squares, own, strict=True) if one.trend]
+        if max([*lines, float(np.mean(bins)) if bins else 0.0]) > target**2:
+            found.append(min(region.p_value for region in own))
+    return min(found)
+
+
+def _fingerprint(
+    named: NamedEffects, left: Tensor, after: Coherence, *, mostly: float = 0.7
+) -> list[str]:
+    """Return what a residual (M,) looks like.
+
+    Args:
+        named: The effects named.
+        left: The residual, shape (M,), metres.
+        after: Its structure.
+        mostly: Structure lies between images if they hold more than this share of it, and within
+            images if these do. Chosen.
+    """
+    clauses = [named.study.candidates.probes[name].trace for name in named.probes]
+    share = after.between / max(after.total, OpenSet.least_variance)
+    if share > mostly:
+        clauses.append("shifts whole images")
+    elif share < 1 - mostly and after.within > 0:
+        form = "patches" if after.form == "squares" else after.form
+        clauses.append(f"is similar within {form} of an image")
+    lag = _lag_of_offsets(named.study, left)
+    return (
+        clauses
+        if lag is None
+        else [*clauses, f"correlates by {lag:+.2f} between successive images"]
+    )
+
+
+def _lag_of_offsets(
+    study: Study, left: Tensor, *, least_frames: int = 12, level: float = 0.01
+) -> float | None:
+    """Return the correlation of successive images' offsets, or None if it is not significant.
+
+    Args:
+        study: The recording.
+        left: A residual, shape (M,), metres.
+        least_frames: Frames that it is reported from. Chosen.
+        level: Of significance. Chosen.
+    """
+    weight, frame, frames = study.weight, study.observations.frame, study.observations.num_frames
+    count = torch.bincount(frame, weight, frames).clamp(min=OpenSet.least_variance)
+    offsets = torch.bincount(frame, weight * left, frames) / count
+    centred = offsets - offsets.mean()
+    square = float(centred.square().sum())
+    if frames < least_frames or square == 0:
+        return None
+    lag = float(centred[1:] @ centred[:-1]) / square
+    return lag if 2 * special.ndtr(-abs(lag) * frames**0.5) < level else None
+
+
+def name_in_two(study: Study, resamples: Tensor) -> NamedEffects:
+    """Name effects; where none is and a gap is certain, name the one that explains most of it.
+
+    Args:
+        study: The recording.
+        resamples: How often each resample holds each pose, shape (B, U); for the gap.
+    """
+    named = name_effects(study)
+    if named.names or not named.likeliest:
+        return named
+    remainder = judge_remainder(study, named, measure_gap(study, named, resamples))
+    return name_effects(study, certain=True) if remainder.unknown else named

@@ -29,11 +29,9 @@ each (`values_beside_base`). With one that would be wrong: each cause has a part
 found, and such fits give half of the share to an effect that is not there but varies alike.
 """
 
-# Long: one computation, from the causes and their parts to shares with intervals.
-
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, combinations
 from math import comb
@@ -43,17 +41,19 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.absorption import fitted_coefficients
-from tofcorr.diagnosis.findings.gap import TWO_SIDED, Gap, Interval, hull, interval_of
-from tofcorr.diagnosis.findings.naming import NamedEffects, least_of_hand_eye
+from tofcorr.diagnosis.findings.gap import Gap
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.where import Estimated, interval_of
 from tofcorr.diagnosis.sums.linear_system import BASE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.base import Term
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
 
-# The cause that a constant counts as: a wall cannot tell whose it is. See `parts`.
+# The cause that a constant counts as: a wall cannot tell whose it is.
 _OF_CONSTANT = "distance"
 HAND_EYE = "hand_eye"
 """The name of the hand-eye transform as a cause."""
@@ -61,15 +61,18 @@ HAND_EYE = "hand_eye"
 
 @dataclass(frozen=True)
 class Cause:
-    """One cause of the gap.
+    """One cause of the gap, and its share in the square of the gap.
 
     Attributes:
-        name: As in `diagnosis.json`.
+        name: `hand_eye`, a group of the base model's terms, an effect, or `unexplained`.
         kind: Parameter of the simulator, effect, or the unexplained.
         members: Numbers of its columns.
         offset: What it adds beyond its columns, shape (M,), metres: what is not linear, or was
             estimated otherwise; None: nothing.
         fixed: Number of the column of `offset`, whose coefficient is one.
+        share: All shares sum to one; negative where a cause cancels part of another.
+        of_constant: What a constant over all pixels contributes to the share, whichever cause has
+            it; None for causes that have none.
     """
 
     name: str
@@ -77,6 +80,8 @@ class Cause:
     members: tuple[int, ...] = ()
     offset: Tensor | None = None
     fixed: int | None = None
+    share: Estimated = field(default_factory=Estimated)
+    of_constant: float | None = None
 
 
 def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Cause]:
@@ -87,39 +92,29 @@ def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Ca
         named: The effects named.
         parameters: Whether the simulator's own parameters are causes.
     """
-    layout = named.study.sums.layout.only(named.columns)
-    places = {name: range(*place) for name, place in layout.effects.items()}
-    causes = _parameters(study, named, places) if parameters else {}
-    for name in named.names:
-        before = causes.pop(name, Cause(name=name, kind="effect"))
-        members = (*before.members, *places.get(name, ()))
-        offset = _beyond_columns(study, named, name)
-        causes[name] = replace(before, kind="effect", members=members, offset=offset)
-    return list(causes.values())
-
-
-def _parameters(
-    study: Study, named: NamedEffects, places: Mapping[str, Sequence[int]]
-) -> dict[str, Cause]:
-    """Return hand-eye transform, groups of base terms, and the base model's fixed pattern."""
-    model, causes = study.fit.model, {}
-    if model.num_hand_eye:
-        members, offset = tuple(range(model.num_hand_eye)), _beyond_linear(study)
-        causes[HAND_EYE] = Cause(HAND_EYE, "parameter", members, offset)
-    groups: dict[str, list[int]] = {_OF_CONSTANT: [model.num_geometry]}
-    start = model.num_geometry + 1
-    for term in model.terms:
-        end = start + len(term.symbols)
-        groups.setdefault(_cause_of(term), []).extend(range(start, end))
-        start = end
-    for name in named.refined_terms:
-        groups.setdefault(name, []).extend(places.get(name, ()))
-    causes |= {name: Cause(name, "parameter", tuple(own)) for name, own in groups.items()}
-    if study.pattern is not None:
-        name, offset = study.pattern.name, study.fit.residual - study.system.residual
-        before = causes.pop(name, Cause(name, "parameter"))
-        causes[name] = replace(before, offset=offset)
-    return causes
+    layout, model = named.study.sums.layout.only(named.columns), study.fit.model
+    places = {name: tuple(range(*place)) for name, place in layout.effects.items()}
+    members: dict[str, tuple[int, ...]] = {}
+    offsets: dict[str, Tensor | None] = {}
+    if parameters:
+        if model.num_hand_eye:
+            members[HAND_EYE], offsets[HAND_EYE] = (*range(model.num_hand_eye),), _bent(study)
+        members[_OF_CONSTANT] = (model.num_geometry,)
+        start = model.num_geometry + 1
+        for term in model.terms:
+            name, end = _cause_of(term), start + len(term.symbols)
+            members[name] = (*members.get(name, ()), *range(start, end))
+            start = end
+        for name in named.refined_terms:
+            members[name] = (*members.get(name, ()), *places.get(name, ()))
+        if study.pattern is not None:
+            members.setdefault(study.pattern.name, ())
+            offsets[study.pattern.name] = study.fit.residual - study.system.residual
+    for name in named.names:  # They come last.
+        members[name] = (*members.pop(name, ()), *places.get(name, ()))
+        offsets[name] = _beyond_columns(study, named, name)
+    kinds = dict.fromkeys(named.names, "effect")
+    return [Cause(n, kinds.get(n, "parameter"), own, offsets.get(n)) for n, own in members.items()]
 
 
 def _cause_of(term: Term) -> str:
@@ -130,16 +125,14 @@ def _cause_of(term: Term) -> str:
     return next(known, term.group)
 
 
-def _beyond_linear(study: Study) -> Tensor | None:
+def _bent(study: Study) -> Tensor | None:
     """Return what a change of the hand-eye transform adds beyond its columns, (M,), metres."""
-    known = study.fit.known
-    if known is None:
+    if study.fit.known is None:
         return None
-    here, there = study.fit.tool_from_camera, known.tool_from_camera
-    observations = study.observations
-    whole = predicted_distance(observations, here) - predicted_distance(observations, there)
+    poses = study.fit.tool_from_camera, study.fit.known.tool_from_camera
+    here, there = (predicted_distance(study.observations, pose) for pose in poses)
     twist = twist_of(study)
-    return whole - study.system.columns[BASE][:, : len(twist)] @ twist
+    return here - there - study.system.columns[BASE][:, : len(twist)] @ twist
 
 
 def twist_of(study: Study) -> Tensor:
@@ -154,18 +147,17 @@ def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | No
     """Return a named map's values, or what an effect adds beyond its columns, (M,), metres."""
     if name in named.maps:
         return named.maps[name]
-    effect = study.candidates.effects[name]
-    if effect.linear:
+    effects = study.candidates.effects
+    if effects[name].linear:
         return None
-    bent = [n for n in named.columns if not study.candidates.effects[n].linear]
-    if bent == [name]:
+    if [n for n in named.columns if not effects[n].linear] == [name]:
         # What the fit itself subtracted: its last linearisation, not a step beyond it, where a
         # signal near saturation may jump.
         kept = named.study.system.residual + sum(named.maps.values())
         return study.system.residual - kept
     own = fitted_coefficients(named.study, named.columns)[name]
     slope = named.study.system.columns[name]
-    return effect.shift(study.inputs, own) - slope @ (own / effect.prior_sd())
+    return effects[name].shift(study.inputs, own) - slope @ (own / effects[name].prior_sd())
 
 
 def held_solution(normal: Tensor, score: Tensor, start: Tensor, held: Sequence[int]) -> Tensor:
@@ -202,29 +194,21 @@ def unchanged(
         groups: Columns of each parameter that may stay as it is.
         least: What a change of each must close, in the unit of `normal`.
     """
-    if not groups:
-        return frozenset()
     best, covariance = held_solution(normal, score, start, ()), torch.linalg.inv(normal)
 
     def excess(columns: Sequence[int]) -> float:
         own = torch.tensor(columns, dtype=torch.int64)
         return float(best[own] @ torch.linalg.solve(covariance[own][:, own], best[own]))
 
-    held: list[str] = []
-    columns: list[int] = []
-    while len(held) < len(groups):
+    others, columns = dict(groups), list[int]()
+    while others:
         base = excess(columns)
-        needed = {
-            name: (excess([*columns, *own]) - base) / least[name]
-            for name, own in groups.items()
-            if name not in held
-        }
+        needed = {n: (excess([*columns, *own]) - base) / least[n] for n, own in others.items()}
         name = min(needed, key=lambda each: needed[each])
         if needed[name] >= 1:
             break
-        held.append(name)
-        columns += groups[name]
-    return frozenset(held)
+        columns += others.pop(name)
+    return frozenset(groups.keys() - others.keys())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,11 +217,10 @@ class Parts:
 
     Attributes:
         causes: The causes whose shares are wanted.
-        products: Of all columns and, in the last place, of the residual, with every pixel counting
-            as it does in the gap that is shared out, shape (U, Q, Q), m^2. Columns that are fitted
-            come first, then those with the coefficient one.
-        means: Sum of each column over a pose, shape (U, Q), metres.
-        counts: Pixels of each pose, shape (U,).
+        products: Of all columns, the residual, and ones in the last place, with every pixel
+            counting as it does in the gap that is shared out, shape (U, Q + 1, Q + 1), metres where
+            a column meets ones, m^2 where columns meet. Columns that are fitted come first, then
+            those with the coefficient one.
         noise: Sum of the variances of a pose's pixels, shape (U,), m^2.
         start: Coefficients of the fitted columns that lead from the simulator to the base fit.
         fitted: A_u, b_u and the prior precision of what the final model adds to them.
@@ -249,8 +232,6 @@ class Parts:
 
     causes: tuple[Cause, ...]
     products: Tensor
-    means: Tensor
-    counts: Tensor
     noise: Tensor
     start: Tensor
     fitted: tuple[Tensor, Tensor, Tensor]
@@ -266,36 +247,35 @@ class Parts:
             sparse: Whether parameters of the simulator stay as they are unless the data require a
                 change.
         """
-        count = (weights * self.counts).sum()
-        products = torch.tensordot(weights, self.products, dims=1) / count
-        means = (weights @ self.means) / count
+        products = torch.tensordot(weights, self.products, dims=1)
+        products = products / products[-1, -1]
         gram, score, prior = self.fitted
         normal, right = torch.tensordot(weights, gram, dims=1) + prior, weights @ score
-        groups = {c.name: c.members for c in self.causes if c.name in self.least and c.members}
         held: frozenset[str] = frozenset()
-        if sparse:
+        groups = {c.name: c.members for c in self.causes if c.name in self.least and c.members}
+        if sparse and groups:
             least = {name: float(weights @ self.least[name]) for name in groups}
             held = unchanged(normal, right, self.start, groups, least)
         columns = [column for name in held for column in groups[name]]
         theta = held_solution(normal, right, self.start, columns)
-        coefficients = torch.zeros(len(self.causes), len(means) - 1, dtype=torch.float64)
-        coefficients[:, : len(theta)] = self._owned * theta
+        coefficients = torch.zeros(len(self.causes), len(products) - 2, dtype=torch.float64)
+        coefficients[:, : len(theta)] = self.owned * theta
         for row, cause in zip(coefficients, self.causes, strict=True):
             if cause.fixed is not None and cause.name not in held:
                 row[cause.fixed] = 1.0
         owner = [self.constant in cause.members for cause in self.causes]
         if any(owner):
-            mean = coefficients @ means[:-1]
+            mean = coefficients @ products[-1, :-2]
             mean[owner.index(True)] -= mean.sum()
             coefficients[:, self.constant] -= mean
         else:
             # The base model is refitted to each part: what it absorbs is no part of what it leaves.
             base, parts = self.base, coefficients[:, : len(normal)]
             parts[:, base] = -torch.linalg.solve(normal[base][:, base], normal[base] @ parts.T).T
-        return Refitted(products, means, coefficients)
+        return Refitted(products, coefficients)
 
     @cached_property
-    def _owned(self) -> Tensor:
+    def owned(self) -> Tensor:
         """One where a fitted column belongs to a cause, else zero, (causes, columns)."""
         owned = torch.zeros(len(self.causes), len(self.start), dtype=torch.float64)
         for row, cause in zip(owned, self.causes, strict=True):
@@ -305,32 +285,36 @@ class Parts:
     @cached_property
     def base(self) -> list[int]:
         """Numbers of the fitted columns that belong to no cause."""
-        return (self._owned.sum(0) == 0).nonzero()[:, 0].tolist()
+        return (self.owned.sum(0) == 0).nonzero()[:, 0].tolist()
 
 
 class Refitted(NamedTuple):
     """All parts, fitted to some poses.
 
     Attributes:
-        products: Mean products of columns and, in the last place, of the residual, (Q, Q), m^2.
-        means: Their means, shape (Q,), metres.
+        products: Mean products of columns, the residual and ones, shape (Q + 1, Q + 1).
         coefficients: Of every part over the columns, shape (K, Q - 1).
     """
 
     products: Tensor
-    means: Tensor
     coefficients: Tensor
 
     @property
     def values(self) -> Tensor:
         """Shapley value of each part in the fall of the square, shape (K,), m^2."""
-        return shapley_values(self.products, self.coefficients)
+        return shapley_values(self.products[:-1, :-1], self.coefficients)
+
+    @property
+    def centred(self) -> Tensor:
+        """Covariances of columns and, in the last place, of the residual, shape (Q, Q), m^2."""
+        means = self.products[-1, :-1]
+        return self.products[:-1, :-1] - means[:, None] * means
 
     @property
     def constant(self) -> float:
         """What a constant over all pixels contributes to the value of the part that has it, m^2."""
-        mean = self.coefficients.sum(0) @ self.means[:-1]
-        return float(mean * (2 * self.means[-1] - mean))
+        mean = self.coefficients.sum(0) @ self.products[-1, :-2]
+        return float(mean * (2 * self.products[-1, -2] - mean))
 
 
 def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
@@ -340,9 +324,8 @@ def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
         gram: Inner products of the columns and, in the last place, of the residual, (Q, Q).
         coefficients: Of every part over the columns, shape (K, Q - 1).
     """
-    whole = coefficients.sum(0)
     # g_k . (r + e), with e = r - sum of all parts.
-    return coefficients @ (2 * gram[:-1, -1] - gram[:-1, :-1] @ whole)
+    return coefficients @ (2 * gram[:-1, -1] - gram[:-1, :-1] @ coefficients.sum(0))
 
 
 def parts_of(
@@ -359,53 +342,41 @@ def parts_of(
             calls a gap. The hand-eye transform needs as much as a second effect: it resembles most
             what models miss.
     """
-    model, sums = study.fit.model, named.study.sums.ols
-    members = sums.layout.of(named.columns)
-    columns = named.study.system.of(named.columns)
-    causes = causes_of(study, named, parameters=residual is not None)
-    start = torch.zeros(len(members), dtype=torch.float64)
+    model, sums, tests = study.fit.model, named.study.sums.ols, study.options.tests
+    fitted, columns = sums.of(named.columns), named.study.system.of(named.columns)
+    start = torch.zeros(len(fitted[2]), dtype=torch.float64)
     # The gap as given is of all pixels alike; after recalibration noisy ones count less.
-    weight = study.fit.trust
-    if residual is None:
-        residual, weight = study.system.residual, study.fit.share
+    weight, shared = study.fit.trust, residual
+    if shared is None:
+        shared, weight = study.system.residual, study.fit.share
     else:
         start[: model.num_hand_eye] = twist_of(study)
         start[model.num_geometry : model.num_columns] = study.fit.coefficients
-    kept: list[Tensor] = []
-    for place, cause in enumerate(causes):
+    causes = list[Cause]()
+    for cause in causes_of(study, named, parameters=residual is not None):
+        fixed = None
         if cause.offset is not None:
-            causes[place] = replace(cause, fixed=len(members) + len(kept))
-            kept.append(cause.offset[:, None])
-    fitted = sums.of(named.columns)
-    products, means, counts = _sums(study, [*columns, *kept, residual[:, None]], weight)
-    second = least_of_hand_eye(study)
-    term = min(second, least_of_term**2)
-    pose = sums.scale * study.sums.count
+            fixed = sum(part.shape[1] for part in columns)
+            columns.append(cause.offset[:, None])
+        causes.append(replace(cause, fixed=fixed))
+    everything = torch.cat([*columns, shared[:, None], torch.ones_like(shared[:, None])], dim=1)
+    gap = study.left_out_mean_square(()) - study.fit.floor**2
+    second = max((tests.further_mm / 1000) ** 2, tests.material_share * gap)
+    pose, least = sums.scale * study.sums.count, min(second, least_of_term**2)
     return Parts(
         causes=tuple(causes),
-        products=products,
-        means=means,
-        counts=counts,
-        noise=torch.zeros_like(counts).index_add(
-            0, study.unit_of_pixel, weight * study.fit.sigma**2
-        ),
+        products=study.observations.products(everything, everything * weight[:, None]),
+        noise=torch.bincount(study.unit_of_pixel, weight * study.fit.sigma**2, len(pose)),
         start=start,
         fitted=fitted,
         prior=fitted[2] / sums.scale,
         constant=model.num_geometry,
         least={
-            cause.name: pose * (second if cause.name == HAND_EYE else term)
+            cause.name: pose * (second if cause.name == HAND_EYE else least)
             for cause in causes
             if cause.kind == "parameter"
         },
     )
-
-
-def _sums(study: Study, parts: Sequence[Tensor], weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return products of all columns, their sums, and the pixels of each pose; `weight` (M,)."""
-    everything = torch.cat([*parts, torch.ones_like(parts[-1])], dim=1)
-    sums = study.observations.products(everything, everything * weight[:, None])
-    return sums[:, :-1, :-1], sums[:, :-1, -1], sums[:, -1, -1]
 
 
 def hidden_shares(
@@ -420,23 +391,24 @@ def hidden_shares(
         ridge_limit: Added to the diagonal of a cause's products, as a share of its mean, so that
             they are regular.
     """
-    means, whole = refitted.means, float(refitted.products[-1, -1])
-    centred = refitted.products - means[:, None] * means
-    square = float(centred[-1, -1])
+    centred, whole, widths = refitted.centred, float(refitted.products[-2, -2]), []
     if whole <= 0:
         return [0.0] * len(parts.causes)
-    reach = TWO_SIDED * math.sqrt(unexplained / (len(means) - 1) / whole)
-    widths = []
+    reach = _two_sided() * math.sqrt(unexplained / (len(centred) - 1) / whole)
     for cause in parts.causes:
-        known = square
+        known = square = float(centred[-1, -1])
         if cause.kind == "parameter":
-            fixed = [] if cause.fixed is None else [cause.fixed]
-            own = torch.tensor([*cause.members, *fixed])
+            own = [*cause.members, *([] if cause.fixed is None else [cause.fixed])]
             gram, right = centred[own][:, own], centred[own, -1]
             ridge = ridge_limit * gram.diagonal().mean() * torch.eye(len(own), dtype=torch.float64)
             known = min(float(right @ torch.linalg.solve(gram + ridge, right)), square)
         widths.append(reach * math.sqrt(max(known, 0.0)))
     return widths
+
+
+def _two_sided(level: float = 0.95) -> float:
+    """Return the standard deviations on either side that hold a share of normal values."""
+    return student_quantile((1 + level) / 2, math.inf)
 
 
 def shrinkage_of_values(parts: Parts, refitted: Refitted) -> list[float]:
@@ -448,21 +420,13 @@ def shrinkage_of_values(parts: Parts, refitted: Refitted) -> list[float]:
     """
     gram, _, prior = parts.fitted
     covariance = torch.linalg.inv(gram.sum(0) + prior)
-    covariance = covariance @ prior @ covariance
-    fitted = len(covariance)
+    covariance, fitted = covariance @ prior @ covariance, len(covariance)
     # Every part has mean zero but that of the constant, which the data determine.
-    means = refitted.means
-    centred = refitted.products - means[:, None] * means
-    inner, right = centred[:-1, :-1], centred[:-1, -1]
+    inner, right = refitted.centred[:-1, :-1], refitted.centred[:-1, -1]
     rest = 2 * right - inner @ refitted.coefficients.sum(0)
-    widths = []
-    for cause, own in zip(parts.causes, refitted.coefficients, strict=True):
-        slope = -inner @ own
-        members = list(cause.members)
-        slope[members] += rest[members]
-        slope = slope[:fitted]
-        widths.append(TWO_SIDED * float((slope @ covariance @ slope).clamp(min=0).sqrt()))
-    return widths
+    slopes = (parts.owned * rest[:fitted]) - (refitted.coefficients @ inner)[:, :fitted]
+    variances = torch.einsum("kp,pq,kq->k", slopes, covariance, slopes)
+    return (_two_sided() * variances.clamp(min=0).sqrt()).tolist()
 
 
 def values_beside_base(parts: Parts, weights: Tensor) -> Tensor:
@@ -473,18 +437,15 @@ def values_beside_base(parts: Parts, weights: Tensor) -> Tensor:
         weights: How often each resample holds each pose, shape (B, U).
     """
     products = torch.tensordot(weights, parts.products, dims=1)
-    count = len(parts.causes)
-    every = range(count)
-    left = {
-        chosen: _left(parts, products, [parts.causes[k] for k in chosen])
-        for chosen in chain.from_iterable(combinations(every, size) for size in range(count + 1))
-    }
+    count, every = len(parts.causes), range(len(parts.causes))
+    subsets = chain.from_iterable(combinations(every, size) for size in range(count + 1))
+    left = {chosen: _left(parts, products, [parts.causes[k] for k in chosen]) for chosen in subsets}
     values = torch.zeros(len(weights), count, dtype=torch.float64)
     for before, more in left.items():
         for effect in set(every) - set(before):
             less = left[tuple(sorted((*before, effect)))]
             values[:, effect] += (more - less) / (count * comb(count - 1, len(before)))
-    return values / (weights @ parts.counts)[:, None]
+    return values / products[:, -1:, -1]
 
 
 def _left(parts: Parts, products: Tensor, causes: list[Cause]) -> Tensor:
@@ -492,13 +453,13 @@ def _left(parts: Parts, products: Tensor, causes: list[Cause]) -> Tensor:
 
     Args:
         parts: Columns and sums.
-        products: Of all columns and the residual in each resample, shape (B, Q, Q), m^2.
+        products: As in `Parts`, of each resample, shape (B, Q + 1, Q + 1).
         causes: The effects.
     """
     fitted = [*parts.base, *chain.from_iterable(cause.members for cause in causes)]
     # The residual less what the effects add with a coefficient of one.
     rest = torch.zeros(products.shape[-1], dtype=torch.float64)
-    rest[-1] = 1.0
+    rest[-2] = 1.0
     rest[[cause.fixed for cause in causes if cause.fixed is not None]] = -1.0
     right = products @ rest
     square, right = right @ rest, right[:, fitted]
@@ -507,31 +468,7 @@ def _left(parts: Parts, products: Tensor, causes: list[Cause]) -> Tensor:
     return square - (theta * (2 * right - (gram @ theta[..., None])[..., 0])).sum(1)
 
 
-UNEXPLAINED = Cause("unexplained", "unexplained")
-"""What no cause explains."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Share:
-    """The share of one cause in the square of the gap.
-
-    Attributes:
-        cause: `hand_eye`, a group of the base model's terms, an effect, or `unexplained`.
-        kind: What sort of cause it is.
-        share: All shares sum to one; negative where a cause cancels part of another.
-        interval: 95 %.
-        of_constant: What a constant over all pixels contributes to the share, whichever cause has
-            it; None for causes that have none.
-    """
-
-    cause: str
-    kind: Literal["parameter", "effect", "unexplained"]
-    share: float
-    interval: Interval
-    of_constant: float | None = None
-
-
-def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
+def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Cause, ...]:
     """Share out the square of the gap as given; without a simulator, of the gap of the base model.
 
     Args:
@@ -542,48 +479,42 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     Returns:
         Parameters, effects in the order named, then what is unexplained.
     """
-    once = torch.ones_like(weights[:1])
+    once, total = torch.ones_like(weights[:1]), gap.whole
     best = parts.refitted(once[0], sparse=True)
+    shrunk = [0.0] * len(parts.causes)
     if gap.as_given is None:
-        before, befores = gap.before, gap.draws.before
         own, drawn = values_beside_base(parts, once)[0], [values_beside_base(parts, weights)]
-        shrunk = [0.0] * len(parts.causes)
     else:
-        before, befores, own = gap.as_given, gap.draws.as_given, best.values
-        drawn = [
-            torch.stack([parts.refitted(w, sparse=sparse).values for w in weights])
-            for sparse in (True, False)
-        ]
-        square = before**2 if before > 0 else math.inf
-        shrunk = [width / square for width in shrinkage_of_values(parts, best)]
-    shares, rate = scaled_shares(own, before, gap.after)
+        own, drawn = (
+            best.values,
+            [
+                torch.stack([parts.refitted(w, sparse=sparse).values for w in weights])
+                for sparse in (True, False)
+            ],
+        )
+        if total > 0:
+            shrunk = [width / total**2 for width in shrinkage_of_values(parts, best)]
+    shares, rate = scaled_shares(own, total, gap.after)
     draws = []
     for values in drawn:
-        rows = zip(values, befores, gap.draws.after, strict=True)
+        rows = zip(values, total.draws, gap.after.draws, strict=True)
         draws.append(torch.stack([scaled_shares(*row)[0] for row in rows]))
     constant = 0.0
     if rate is not None:
-        constant = best.constant / before**2 + rate * abs(best.constant)
+        constant = best.constant / total**2 + rate * abs(best.constant)
     unexplained = float(shares[-1])
-    hidden = hidden_shares(parts, best, unexplained)
     # What resamples do not show is added in quadrature to either half of an interval.
-    beside = [*map(math.hypot, hidden, shrunk), 0.0]
+    beside = [*map(math.hypot, hidden_shares(parts, best, unexplained), shrunk), 0.0]
     found = []
-    for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
+    for place, cause in enumerate((*parts.causes, Cause("unexplained", "unexplained"))):
         share = float(shares[place])
-        low, high = hull(interval_of(each[:, place].tolist(), share) for each in draws)
-        below, above = (math.hypot(end - share, beside[place]) for end in (low, high))
+        ends = [end for each in draws for end in interval_of(each[:, place].tolist(), share)]
+        below, above = (math.hypot(end - share, beside[place]) for end in (min(ends), max(ends)))
         if cause.kind == "effect":  # What is unexplained may all belong to it.
             above += unexplained
-        found.append(
-            Share(
-                cause=cause.name,
-                kind=cause.kind,
-                share=share,
-                interval=(share - below, share + above),
-                of_constant=constant if parts.constant in cause.members else None,
-            )
-        )
+        estimated = Estimated(share, interval=(share - below, share + above))
+        of_constant = constant if parts.constant in cause.members else None
+        found.append(replace(cause, offset=None, share=estimated, of_constant=of_constant))
     return tuple(found)
 
 
@@ -594,14 +525,10 @@ def explained_squares(parts: Parts, weights: Tensor) -> Tensor:
     the other two: the mean square of the residual less that of the noise, which is known to
     `FLOOR_ERROR`.
     """
-    found = []
-    for own in weights:
-        refitted = parts.refitted(own)
-        noise = float((own @ parts.noise) / (own @ parts.counts))
-        whole = float(refitted.products[-1, -1])
-        bounds = (whole - noise * (1 + sign * FLOOR_ERROR) ** 2 for sign in (1, -1))
-        found.append([float(refitted.values.sum()), *bounds])
-    return torch.tensor(found, dtype=torch.float64)
+    explained = torch.stack([parts.refitted(own).values.sum() for own in weights])
+    whole, noise = weights @ parts.products[:, -2, -2], weights @ parts.noise
+    limits = [whole - noise * (1 + sign * FLOOR_ERROR) ** 2 for sign in (1, -1)]
+    return torch.stack([explained, *(x / (weights @ parts.products[:, -1, -1]) for x in limits)], 1)
 
 
 def scaled_shares(values: Tensor, total: float, left: float) -> tuple[Tensor, float | None]:

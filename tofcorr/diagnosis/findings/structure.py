@@ -27,7 +27,6 @@ or poses share. It is never more than what is left inside images, without the wa
 not make.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -42,9 +41,7 @@ from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR, brightness_of
 from tofcorr.diagnosis.sums.observations import TINY, small_tiles
 from tofcorr.diagnosis.sums.shared_noise import shared_noise
-from tofcorr.diagnosis.sums.study import (
-    Study,
-)
+from tofcorr.diagnosis.sums.study import Study
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +85,7 @@ def coherence_inside(study: Study, inside: Tensor, between: float) -> Coherence:
             mean -= known.share[form] * noise
             error = float(np.hypot(error, known.error[form] * noise))
         found.append((mean, error, form))
-    within, error, form = max(found, key=lambda each: each[0])
+    within, error, form = max(found)
     return Coherence(
         within=within,
         within_error=error,
@@ -147,62 +144,58 @@ def _fixed_square(study: Study, residual: Tensor) -> float:
     return float(products / pairs.clamp(min=TINY))
 
 
-# Cells that fewer poses show are not used. Chosen: three give three pairs.
-_LEAST_POSES = 3
-# Groups of pixels of like brightness. Chosen: over a range of 1 to 30 in amplitude they differ by
-# 9 %, far less than what errors of the amplitude need to change.
-_BRIGHTNESSES = 40
-
-
-class SharedByPoses(NamedTuple):
-    """Structure that poses share.
+class Structure(NamedTuple):
+    """Variance that is no noise.
 
     Attributes:
-        square: Its mean square over the pixels, m^2; 0 where it is not significant.
-        error: Standard error of `square`, by leaving out one pose at a time, m^2.
+        square: Its mean over the pixels, m^2; 0 where it is not significant.
+        error: Standard error of `square`, m^2.
+        p_value: Probability of as much by chance.
     """
 
-    square: float
-    error: float
+    square: float = 0.0
+    error: float = 0.0
+    p_value: float = 1.0
 
 
-NOTHING_SHARED = SharedByPoses(0.0, 0.0)
-"""Where poses share nothing."""
-
-
-def shared_by_poses(study: Study, residual: Tensor, *, significant: float = 3.0) -> SharedByPoses:
+def shared_by_poses(
+    study: Study,
+    residual: Tensor,
+    *,
+    significant: float = 3.0,
+    least_poses: int = 3,
+    brightnesses: int = 40,
+) -> Structure:
     """Return the largest of what poses share by pixel, place on the target, and brightness.
 
     Args:
         study: The recording.
         residual: Without each pose's offset and tilts, shape (M,), metres.
         significant: Structure counts from this many standard errors on. The usual convention.
+        least_poses: Cells that fewer poses show are not used. Chosen: three give three pairs.
+        brightnesses: Groups of pixels of like brightness. Chosen: over a range of 1 to 30 in
+            amplitude they differ by 9 %, far less than what errors of the amplitude need to change.
     """
-    groups = study.observations.pixel, _places(study), _brightnesses(study)
-    found = [_by_pairs_of_poses(study, residual, cells) for cells in groups]
-    sure = [each for each in found if each.square > significant * each.error]
-    return max(sure, key=lambda each: each.square, default=NOTHING_SHARED)
-
-
-def _by_pairs_of_poses(study: Study, residual: Tensor, cells: Tensor) -> SharedByPoses:
-    """Compare all pairs of poses cell by cell, shape (M,)."""
-    units, share = study.sums.num_units, study.fit.share
-    own, count = _per_cell(study.unit_of_pixel, cells, share * residual, share)
-    used = (count > 0).sum(0) >= _LEAST_POSES
-    own, count = own[:, used], count[:, used]
-    if not bool(used.any()):
-        return NOTHING_SHARED
-    # All poses at first, then all but one at a time.
-    total, weight = (torch.cat([x.sum(0)[None], x.sum(0) - x]) for x in (own, count))
-    squares, weights = (
-        torch.cat([x.sum(0)[None], x.sum(0) - x]) for x in (own.square(), count.square())
-    )
-    pairs = (weight.square() - weights).clamp(min=torch.finfo(torch.float64).tiny)
-    mean = ((total.square() - squares) / pairs * weight).sum(1) / weight.sum(1)
-    spread = mean[1:] - mean[1:].mean()
-    return SharedByPoses(
-        float(mean[0]), float(((units - 1) / units * spread.square().sum()).sqrt())
-    )
+    units, share, found = study.sums.num_units, study.fit.share, Structure()
+    order = brightness_of(study.observations).argsort().argsort()
+    for cells in (study.observations.pixel, _places(study), order * brightnesses // len(order)):
+        own, count = _per_cell(study.unit_of_pixel, cells, share * residual, share)
+        used = (count > 0).sum(0) >= least_poses
+        if not bool(used.any()):
+            continue
+        # All poses at first, then all but one at a time.
+        total, weight, squares, weights = (
+            torch.cat([x.sum(0)[None], x.sum(0) - x])
+            for x in (own[:, used], count[:, used], own[:, used] ** 2, count[:, used] ** 2)
+        )
+        pairs = (weight.square() - weights).clamp(min=torch.finfo(torch.float64).tiny)
+        mean = ((total.square() - squares) / pairs * weight).sum(1) / weight.sum(1)
+        spread = mean[1:] - mean[1:].mean()
+        error = float(((units - 1) / units * spread.square().sum()).sqrt())
+        square = float(mean[0])
+        if square > max(significant * error, found.square):
+            found = Structure(square, error)
+    return found
 
 
 def _places(study: Study) -> Tensor:
@@ -217,115 +210,95 @@ def _places(study: Study) -> Tensor:
     return torch.unique(cells, return_inverse=True)[1]
 
 
-def _brightnesses(study: Study) -> Tensor:
-    """Return the group of like brightness of each pixel."""
-    brightness = brightness_of(study.observations)
-    order = torch.argsort(torch.argsort(brightness))
-    return order * _BRIGHTNESSES // len(order)
-
-
-# Least length of a wave, pixels: filters of 3 to 7 taps leave at least 80 % of the noise's energy
-# at it. Derived for a Gaussian of 1.2 pixels.
-_LEAST_LENGTH = 16.0
-# Most half waves along one side. Chosen to bound the time: 20 waves.
-_MOST_HALF_WAVES = 5
-# Pixels that are used, at most, evenly spread. Chosen: 50 ms.
-_MOST_PIXELS = 100_000
 # Combinations of waves with a smaller share of their own square left, beside one another and the
 # pose, are not seen by a pose. Chosen: a pose that shows half of the image sees all.
 _LEAST_SEEN = 0.05
-# Added to the pose's equations, as a share of their diagonal, so that they can be solved for poses
-# of few pixels. Chosen, far above rounding.
-_WAVE_RIDGE = 1e-6
 
 
-class Waves(NamedTuple):
-    """Whether waves have unlike energies.
-
-    Attributes:
-        p_value: Of the strongest, adjusted for their number.
-        square: Mean square that they add beyond what each of them has by noise, m^2.
-    """
-
-    p_value: float
-    square: float
-
-
-def unlike_waves(study: Study, chosen: Sequence[str]) -> Waves:
-    """Test what a model leaves, fitted by likelihood.
+def unlike_waves(study: Study, chosen: Sequence[str]) -> Structure:
+    """Test whether waves in what a model leaves, fitted by likelihood, have unlike energies.
 
     Args:
         study: The recording.
         chosen: Effects of the model.
+
+    Returns:
+        The p-value of the strongest, adjusted for their number; and the mean square that they add
+        beyond what each of them has by noise.
     """
     squares, seen, weight = _energies(study, study.system.residual_of(chosen, gls=True))
     own = squares.sum(1) / seen.sum(1).clamp(min=_LEAST_SEEN)
     known = own > 0
     if seen.shape[1] < 2 or not bool(known.any()):
-        return Waves(p_value=1.0, square=0.0)
+        return Structure()
     squares, seen, own, weight = squares[known], seen[known], own[known], weight[known]
     total, numbers = (squares / own[:, None]).sum(0), seen.sum(0)
+    others = numbers.sum() - numbers
     energy = total / numbers.clamp(min=_LEAST_SEEN)
-    rest = (total.sum() - total) / (numbers.sum() - numbers).clamp(min=_LEAST_SEEN)
-    tails = special.fdtrc(
-        numbers.numpy(), (numbers.sum() - numbers).numpy(), (energy / rest).numpy()
-    )
+    rest = (total.sum() - total) / others.clamp(min=_LEAST_SEEN)
+    tails = special.fdtrc(numbers.numpy(), others.numpy(), (energy / rest).numpy())
     beyond = (energy - energy.median()).clamp(min=0).sum()
     p_value = min(1.0, len(total) * float(tails.min()))
-    return Waves(p_value=p_value, square=float(beyond * (own / weight).mean()))
+    return Structure(float(beyond * (own / weight).mean()), p_value=p_value)
 
 
-def _energies(study: Study, left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _energies(
+    study: Study, left: Tensor, *, most_pixels: int = 100_000, ridge: float = 1e-6
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return squared scores of every pose and wave, what is seen of each, and summed weights.
 
     Args:
         study: The recording.
         left: The residual, shape (M,), metres.
+        most_pixels: Pixels that are used, at most, evenly spread. Chosen: 50 ms.
+        ridge: Added to the pose's equations, as a share of their diagonal, so that they can be
+            solved for poses of few pixels. Chosen, far above rounding.
 
     Returns:
         (U, K), with mean `seen` under white noise of the level assumed; (U, K), 0 to 1; and (U,),
         1 / m^2.
     """
-    step = slice(None, None, max(1, len(left) // _MOST_PIXELS))
-    observations = study.observations.at(step)
+    step = slice(None, None, max(1, len(left) // most_pixels))
+    observations, weight = study.observations.at(step), study.weight[step]
     pose, count = study.system.pose[step], study.system.pose.shape[1]
     columns = torch.cat([pose, _waves(study, step), left[step, None]], dim=1)
-    weight = study.weight[step]
     sums = observations.products(columns * weight[:, None], columns)
     size = sums.diagonal(dim1=1, dim2=2).clamp(min=TINY).sqrt()
     sums = sums / (size[:, :, None] * size[:, None, :])
+    inner = sums[:, :count, :count] + ridge * torch.eye(count, dtype=torch.float64)
     across = sums[:, :count, count:]
-    inner = sums[:, :count, :count] + _WAVE_RIDGE * torch.eye(count, dtype=torch.float64)
     sums = sums[:, count:, count:] - across.mT @ torch.linalg.solve(inner, across)
     values, vectors = torch.linalg.eigh(sums[:, :-1, :-1])
     root = torch.where(values > _LEAST_SEEN, values.clamp(min=_LEAST_SEEN).rsqrt(), 0.0)
-    white = (vectors * root[:, None, :]) @ vectors.mT
-    scores = (white @ sums[:, :-1, -1:])[..., 0] * size[:, -1:]
+    scores = (vectors @ (root[:, :, None] * (vectors.mT @ sums[:, :-1, -1:])))[..., 0]
     seen = (vectors**2 * (root > 0)[:, None, :]).sum(2)
-    units = observations.unit[observations.frame]
-    whole = torch.zeros(len(scores), dtype=torch.float64).index_add(0, units, weight)
-    return scores**2, seen, whole.clamp(min=TINY)
+    whole = torch.bincount(study.unit_of_pixel[step], weight, len(scores))
+    return (scores * size[:, -1:]) ** 2, seen, whole.clamp(min=TINY)
 
 
-def _waves(study: Study, step: slice) -> Tensor:
-    """Return all waves but a pose's own offset and tilts, (M, K)."""
+def _waves(study: Study, step: slice, *, least: float = 16.0, most: int = 5) -> Tensor:
+    """Return all waves but a pose's own offset and tilts, (M, K).
+
+    Args:
+        study: The recording.
+        step: Which pixels.
+        least: Length of a wave, pixels: filters of 3 to 7 taps leave at least 80 % of the noise's
+            energy at it. Derived for a Gaussian of 1.2 pixels.
+        most: Half waves along one side, at most. Chosen to bound the time: 20 waves.
+    """
     camera, inputs = study.inputs.camera, study.inputs
-    most = [
-        max(1, min(_MOST_HALF_WAVES, int(2 * pixels / _LEAST_LENGTH)))
-        for pixels in (camera.width, camera.height)
+    sides = (camera.width, inputs.columns), (camera.height, inputs.rows)
+    across, down = (max(1, min(most, int(2 * pixels / least))) for pixels, _ in sides)
+    of_x, of_y = (
+        [torch.cos(k * torch.pi / 2 * (place[step] + 1)) for k in range(most + 1)]
+        for _, place in sides
+    )
+    waves = [
+        of_x[i] * of_y[j]
+        for i, j in product(range(across + 1), range(down + 1))
+        if i + j > 1 and (i / across) ** 2 + (j / down) ** 2 <= 1
     ]
-    sides = [
-        [torch.cos(math.pi * k * (place[step] + 1) / 2) for k in range(count + 1)]
-        for place, count in zip((inputs.columns, inputs.rows), most, strict=True)
-    ]
-    chosen = [
-        sides[0][i] * sides[1][j]
-        for i, j in product(range(most[0] + 1), range(most[1] + 1))
-        if i + j > 1 and (i / most[0]) ** 2 + (j / most[1]) ** 2 <= 1
-    ]
-    if not chosen:
-        return torch.zeros(len(sides[0][0]), 0, dtype=torch.float64)
-    return torch.stack(chosen, dim=1)
+    return torch.stack(waves, dim=1) if waves else of_x[0].new_zeros(len(of_x[0]), 0)
 
 
 class NoiseFloor(NamedTuple):
@@ -389,10 +362,3 @@ def _known_noise(named: NamedEffects, left: Tensor) -> tuple[Study, tuple[float,
         _, assumed, _ = fit.noise.limits(fit.shared.level)
         least, _, most = (limit / assumed for limit in fit.noise.limits(found.level))
     return study, ((1 - FLOOR_ERROR) * least * fit.floor, (1 + FLOOR_ERROR) * most * fit.floor)
-
-
-def noise_of_poses(study: Study, floor: float) -> Tensor:
-    """Return the sum of the squared noise over the pixels of every pose, with this floor, (U,)."""
-    fit, count = study.fit, study.sums.count
-    own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
-    return (floor / fit.floor) ** 2 * own

@@ -8,9 +8,9 @@ recalibrated, and with the effects named.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -18,28 +18,44 @@ from torch import Tensor
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
 from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
-from tofcorr.diagnosis.findings.gap import Gap, Interval
-from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects.inputs import is_clock
 
-# Bins of a covariate, and values of it that are looked at first. Chosen: few enough bins that each
-# holds many poses; of most covariates the first values already tell that there are many levels.
-_BINS, _FEW = 8, 1000
-# Rows and columns of tiles in the image, and the number of poses that a bin needs for a test.
-# Chosen: few enough that each bin holds many poses.
-_TILES = (6, 8)
-_LEAST_UNITS = 4
-# Pixels that tell how much of a sum a fit takes, at most, evenly spread. Chosen: a sum over a tenth
-# of them is known to 2 %.
-_MOST_PIXELS = 20_000
-# Least standard deviation of a sum that the model was fitted to, over that of residuals that it was
-# not. Chosen: what the model absorbs so far shows no bias, and how far is known to 2 %.
-_LEAST_LEFT = 0.1
-# Relative difference of two statistics that counts as none. A bin of few poses has flips that give
-# what was observed; rounding, some 1e-15, must not decide about them. Chosen.
-_ROUNDING = 1e-9
+Interval = tuple[float, float]
+StageName = Literal["as_given", "recalibrated", "with_effects"]
+
+
+def interval_of(draws: Sequence[float], estimate: float, *, level: float = 0.95) -> Interval:
+    """Return the percentile interval, widened to contain the estimate.
+
+    Args:
+        draws: Of a quantity.
+        estimate: Of the same quantity.
+        level: Coverage of all intervals. The usual convention.
+    """
+    low, high = np.quantile(list(draws), [(1 - level) / 2, (1 + level) / 2])
+    return min(float(low), estimate), max(float(high), estimate)
+
+
+class Estimated(float):
+    """A number with its draws and its 95 % interval, which contains it.
+
+    Attributes:
+        draws: Of the number; none where the interval was given.
+        interval: Lower and upper end.
+    """
+
+    draws: Sequence[float]
+    interval: Interval
+
+    def __new__(
+        cls, value: float = 0.0, draws: Sequence[float] = (), interval: Interval | None = None
+    ) -> "Estimated":
+        """Return a number with the interval given, or else that of its draws."""
+        made = super().__new__(cls, value)
+        made.draws, made.interval = draws, interval or interval_of(draws or [value], float(value))
+        return made
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +65,7 @@ class Region:
     Attributes:
         covariate: Its name.
         low, high: Its ends, in the unit of the covariate.
-        bias: Mean residual, metres.
-        interval: 95 %, simultaneous over all regions.
+        bias: Mean residual, metres; its interval is simultaneous over all regions.
         p_value: Adjusted for the number of regions.
         trend: Whether this is the change along the whole covariate, fitted by a line, not one bin.
     """
@@ -58,27 +73,35 @@ class Region:
     covariate: str
     low: float
     high: float
-    bias: float
-    interval: tuple[float, float]
+    bias: Estimated
     p_value: float
     trend: bool = False
 
 
+_TILES = (6, 8)
+"""Rows and columns of tiles in the image. Chosen: few enough that each holds many poses."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class Where:
-    """The bias along all covariates, and over the image.
+class Stage:
+    """The gap at one stage, and the bias there along all covariates and over the image.
 
     Attributes:
+        name: Which stage.
+        gap: Root mean square in excess of the noise, metres; None at the stage as given if no
+            simulator was: nothing else is known of it.
         regions: Bins and trends of covariates, the most significant first.
         tiles: Bias of each tile of the image, shape (rows, columns), metres.
         tile_p_values: Their adjusted p-values, shape (rows, columns).
         offsets: Mean residual of each pose, shape (U,), metres.
     """
 
-    regions: tuple[Region, ...]
-    tiles: np.ndarray
-    tile_p_values: np.ndarray
-    offsets: np.ndarray
+    name: StageName
+    gap: Estimated | None = None
+    regions: tuple[Region, ...] = ()
+    tiles: np.ndarray = field(default_factory=lambda: np.full(_TILES, np.nan))
+    tile_p_values: np.ndarray = field(default_factory=lambda: np.ones(_TILES))
+    offsets: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def by_covariate(self) -> dict[str, list[Region]]:
         """Return the bins of each covariate in order; the most significant covariate is first."""
@@ -99,7 +122,7 @@ def binned_covariates(study: Study) -> list[Binned]:
     """Return the covariates that have more than one value, in bins."""
     binned: list[Binned] = []
     for name, values in covariates(study).items():
-        edges = _edges(values)
+        edges = _edges(values.numpy())
         if len(edges) < 3:
             continue
         place = torch.bucketize(values.contiguous(), torch.from_numpy(edges[1:-1]), right=True)
@@ -110,8 +133,7 @@ def binned_covariates(study: Study) -> list[Binned]:
 
 def covariates(study: Study) -> dict[str, Tensor]:
     """Return what a bias may depend on, for each pixel, by name; units as in the recording."""
-    inputs, facts = study.inputs, study.inputs.facts
-    camera = inputs.camera
+    inputs, facts, camera = study.inputs, study.inputs.facts, study.inputs.camera
     found = {
         "distance_m": inputs.radial_distance,
         "row": (inputs.rows + 1) / 2 * (camera.height - 1),
@@ -123,34 +145,33 @@ def covariates(study: Study) -> dict[str, Tensor]:
         found["amplitude"] = inputs.amplitude
     if inputs.modulation_frequency is not None:
         found["phase_quarter_deg"] = torch.rad2deg(torch.remainder(4 * inputs.phase, 2 * torch.pi))
-    found |= _of_frames(study)
+    if is_clock(facts.timestamp):
+        found[condition("timestamp").covariate] = inputs.of_frame(facts.timestamp)
+    for each in OPTIONAL_CONDITIONS:
+        if (values := getattr(facts, each.name)) is not None:
+            found[each.covariate] = inputs.of_frame(each.in_file(values))
+    found["frame"] = inputs.frame.double()
     if study.observations.recording.moves:
         found["target_x_m"], found["target_y_m"] = inputs.target_xy.unbind(1)
         place = inputs.of_frame(facts.world_from_tool[:, :3, 3])
-        found["tool_x_m"], found["tool_y_m"], found["tool_z_m"] = place.unbind(1)
+        found |= {f"tool_{axis}_m": own for axis, own in zip("xyz", place.unbind(1), strict=True)}
     return {name: values for name, values in found.items() if bool(values.isfinite().all())}
 
 
-def _of_frames(study: Study) -> dict[str, Tensor]:
-    inputs, facts = study.inputs, study.inputs.facts
-    known = {}
-    if is_clock(facts.timestamp):
-        known[condition("timestamp").covariate] = facts.timestamp
-    for each in OPTIONAL_CONDITIONS:
-        values = getattr(facts, each.name)
-        if values is not None:
-            known[each.covariate] = each.in_file(values)
-    known["frame"] = torch.arange(len(facts.timestamp)).double()
-    return {name: inputs.of_frame(values) for name, values in known.items()}
+def _edges(values: np.ndarray, *, bins: int = 8, few: int = 1000) -> np.ndarray:
+    """Return edges of bins with equally many pixels; a covariate of few levels gets a bin each.
 
-
-def _edges(values: Tensor) -> np.ndarray:
-    """Return edges of bins with equally many pixels; a covariate of few levels gets a bin each."""
-    levels = np.unique(values[:_FEW].numpy())
-    if len(levels) <= _BINS:
-        levels = np.unique(values.numpy())
-    if len(levels) > _BINS:
-        return np.unique(np.quantile(values.numpy(), np.linspace(0, 1, _BINS + 1)))
+    Args:
+        values: Of the covariate, shape (M,).
+        bins: At most so many. Chosen: few enough that each holds many poses.
+        few: Values that are looked at first. Chosen: of most covariates they already tell that
+            there are many levels.
+    """
+    levels = np.unique(values[:few])
+    if len(levels) <= bins:
+        levels = np.unique(values)
+    if len(levels) > bins:
+        return np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
     if len(levels) < 2:
         return levels
     return np.concatenate([levels[:1], (levels[:-1] + levels[1:]) / 2, levels[-1:]])
@@ -167,12 +188,18 @@ class Flips:
         study: The recording.
         residual: Shape (M,), metres.
         chosen: Effects of the model that was fitted; None: the residual is of no fit.
+
+    Class attributes:
+        most_pixels: Pixels that tell how much of a sum a fit takes, at most, evenly spread. Chosen:
+            a sum over a tenth of them is known to 2 %.
     """
+
+    most_pixels: ClassVar[int] = 20_000
 
     def __init__(self, study: Study, residual: Tensor, chosen: Sequence[str] | None = None) -> None:
         # The first column is the observed residual.
         self._signs = torch.cat([torch.ones_like(study.signs[:1]), study.signs]).T
-        self._step = max(1, len(residual) // _MOST_PIXELS)
+        self._step = max(1, len(residual) // self.most_pixels)
         self._theta = None
         if chosen is None:
             return
@@ -203,146 +230,104 @@ class Flips:
 
 def find_where(
     study: Study,
-    chosen: tuple[str, ...] = (),
+    name: StageName,
+    chosen: Sequence[str] = (),
+    *,
     residual: Tensor | None = None,
     binned: Sequence[Binned] | None = None,
-) -> Where:
+) -> Stage:
     """Test all covariates and the image map for a bias.
 
     Args:
         study: The recording.
+        name: Which stage.
         chosen: Effects of the model whose residual is tested.
         residual: The residual to test instead, of what was not fitted, shape (M,), metres.
         binned: The covariates in bins, where they are known; None: they are computed.
     """
+    fitted = None if residual is not None else chosen
     if residual is None:
         residual = left_out_residual(study, chosen, study.sums.ols)
-        flips = Flips(study, residual, chosen)
-    else:
-        flips = Flips(study, residual)
+    flips = Flips(study, residual, fitted)
     weight, unit, units = study.weight, study.unit_of_pixel, study.sums.num_units
-    ones, parts = torch.ones_like(weight), list[tuple[Tensor, Tensor, Tensor]]()
+    places, regions = list[tuple[Tensor, int, Tensor]](), list[tuple[str, float, float, bool]]()
+    one_bin, ones = torch.zeros_like(unit), torch.ones_like(weight)
+    for covariate, edges, place, scaled in binned or binned_covariates(study):
+        # Around the weighted mean, the coefficient of a line is its end minus its start.
+        line = scaled - (weight @ scaled) / weight.sum()
+        places += [(place, len(edges) - 1, ones), (one_bin, 1, line)]
+        regions += [(covariate, low, high, False) for low, high in pairwise(edges)]
+        regions.append((covariate, edges[0], edges[-1], True))
+    tile = one_bin
+    for count, position in zip(_TILES, (study.inputs.rows, study.inputs.columns), strict=True):
+        tile = tile * count + ((position + 1) / 2 * count).long().clamp(max=count - 1)
+    places += [(tile, _TILES[0] * _TILES[1], ones), (one_bin, 1, ones)]
 
     def per_pose(values: Tensor, place: Tensor, bins: int) -> Tensor:
         flat = torch.zeros(bins * units, dtype=torch.float64)
         return flat.index_add(0, place * units + unit, values).reshape(bins, units)
 
-    def add(place: Tensor, bins: int, along: Tensor) -> None:
+    parts = []
+    for place, bins, along in places:
         own = per_pose(weight * residual * along, place, bins)
         counts = per_pose(weight * along**2, place, bins)
         parts.append((own, flips.of(own, place, along), counts))
-
-    regions: list[tuple[str, float, float, bool]] = []
-    for name, edges, place, scaled in binned_covariates(study) if binned is None else binned:
-        add(place, len(edges) - 1, ones)
-        regions += [(name, low, high, False) for low, high in pairwise(edges)]
-        # Around the weighted mean, the coefficient of a line is its end minus its start.
-        add(torch.zeros_like(unit), 1, scaled - (weight @ scaled) / weight.sum())
-        regions.append((name, edges[0], edges[-1], True))
-    tile = torch.zeros_like(unit)
-    for count, position in zip(_TILES, (study.inputs.rows, study.inputs.columns), strict=True):
-        tile = tile * count + ((position + 1) / 2 * count).long().clamp(max=count - 1)
-    add(tile, _TILES[0] * _TILES[1], ones)
     sums, total, counts = (torch.cat(own) for own in zip(*parts, strict=True))
-    offsets = per_pose(weight * residual, torch.zeros_like(unit), 1)[0]
-    mean = offsets / per_pose(weight, torch.zeros_like(unit), 1)[0].clamp(min=TINY)
-    return _assembled(sums, total, counts, regions, mean)
+    offsets = sums[-1] / counts[-1].clamp(min=TINY)
+    return _assembled(name, sums[:-1], total[:-1], counts[:-1], regions, offsets)
 
 
 def _assembled(
+    name: StageName,
     sums: Tensor,
     total: Tensor,
     counts: Tensor,
     regions: Sequence[tuple[str, float, float, bool]],
     offsets: Tensor,
-) -> Where:
-    """Compare all bins with their maximum under flips.
+    least_left: float = 0.1,
+    rounding: float = 1e-9,
+) -> Stage:
+    """Compare all bins that four poses show with their maximum under flips.
 
     Args:
+        name: Which stage.
         sums: Weighted residuals of every bin and pose, shape (R, U).
         total: Observed, then of every flip, shape (R, 1 + B).
         counts: Sums of the weights, shape (R, U).
         regions: Covariate, ends and whether it is a trend, of all bins but the image's.
         offsets: Mean residual of each pose, shape (U,), metres.
+        least_left: Least standard deviation of a sum that the model was fitted to, over that of
+            residuals that it was not. Chosen: what the model absorbs so far shows no bias, and how
+            far is known to 2 %.
+        rounding: Relative difference of two statistics that counts as none: a bin of few poses has
+            flips that give what was observed. Chosen, far above the rounding of sums.
     """
     spread = sums.square().sum(1).sqrt()
-    enough = ((counts > 0).sum(1) >= min(_LEAST_UNITS, sums.shape[1])) & (spread > 0)
-    spread = torch.maximum(total[:, 1:].square().mean(1).sqrt(), _LEAST_LEFT * spread)
+    enough = ((counts > 0).sum(1) >= min(4, sums.shape[1])) & (spread > 0)
+    spread = torch.maximum(total[:, 1:].square().mean(1).sqrt(), least_left * spread)
     scaled = torch.where(enough[:, None], total.abs() / spread.clamp(min=TINY)[:, None], 0.0)
     observed, largest = scaled[:, 0], scaled[:, 1:].amax(0)
-    p_values = (1 + (largest >= (1 - _ROUNDING) * observed[:, None]).sum(1)) / (len(largest) + 1)
+    p_values = (1 + (largest >= (1 - rounding) * observed[:, None]).sum(1)) / (len(largest) + 1)
     critical, weight = float(torch.quantile(largest, 0.95)), counts.sum(1).clamp(min=TINY)
     bias, half = total[:, 0] / weight, critical * spread / weight
-    found = [
-        Region(
-            covariate=name,
+    found = []
+    for place in observed[: len(regions)].argsort(descending=True, stable=True).tolist():
+        covariate, low, high, trend = regions[place]
+        size, reach = float(bias[place]), float(half[place])
+        shown = Region(
+            covariate=covariate,
             low=low,
             high=high,
-            bias=float(bias[i]),
-            interval=(float(bias[i] - half[i]), float(bias[i] + half[i])),
-            p_value=float(p_values[i]),
+            bias=Estimated(size, interval=(size - reach, size + reach)),
+            p_value=float(p_values[place]),
             trend=trend,
         )
-        for i, (name, low, high, trend) in enumerate(regions)
-        if bool(enough[i])
-    ]
-    scores = observed[: len(regions)][enough[: len(regions)]].tolist()
-    order = sorted(range(len(found)), key=lambda place: -scores[place])
+        found += [shown] if bool(enough[place]) else []
     tiles = slice(len(regions), None)
-    return Where(
-        regions=tuple(found[place] for place in order),
+    return Stage(
+        name=name,
+        regions=tuple(found),
         tiles=torch.where(enough, bias, torch.nan)[tiles].reshape(_TILES).numpy(),
         tile_p_values=p_values[tiles].reshape(_TILES).numpy(),
         offsets=offsets.numpy(),
-    )
-
-
-StageName = Literal["as_given", "recalibrated", "with_effects"]
-
-
-@dataclass(frozen=True)
-class Stage:
-    """The gap at one stage.
-
-    Attributes:
-        name: Which stage.
-        gap, interval: Root mean square in excess of the noise, metres, with 95 % interval; None at
-            the stage as given if no simulator was.
-        where: The bias along all covariates and over the image; None likewise.
-    """
-
-    name: StageName
-    gap: float | None
-    interval: Interval | None
-    where: Where | None
-
-    @property
-    def found_where(self) -> Where:
-        """Where the bias lies, at a stage that exists."""
-        if self.where is None:
-            raise ValueError(f"There is no stage {self.name}: no simulator was given.")
-        return self.where
-
-
-def stages_of(
-    study: Study, named: NamedEffects, gap: Gap, residual: Tensor | None
-) -> tuple[Stage, Stage, Stage]:
-    """Return the three stages.
-
-    Args:
-        study: The recording, before any effect was named.
-        named: The effects named.
-        gap: Before and after them.
-        residual: Of the simulator as given, shape (M,), metres; None: none was given.
-    """
-    binned, as_given = binned_covariates(study), None
-    if residual is not None:
-        as_given = find_where(study, residual=residual, binned=binned)
-    recalibrated = with_effects = find_where(study, binned=binned)
-    if named.names or named.refined_terms:
-        with_effects = find_where(named.study, named.columns, binned=binned)
-    return (
-        Stage("as_given", gap.as_given, gap.as_given_interval, as_given),
-        Stage("recalibrated", gap.before, gap.before_interval, recalibrated),
-        Stage("with_effects", gap.after, gap.after_interval, with_effects),
     )

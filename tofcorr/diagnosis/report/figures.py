@@ -1,6 +1,7 @@
 """Figures of a diagnosis: the gap, the residual, the effects and the poses."""
 
 import io
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -10,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from tofcorr.diagnosis.findings.gap import TWO_SIDED, Interval
-from tofcorr.diagnosis.findings.where import Region, Stage
+from tofcorr.diagnosis.findings.absorption import absorption_table
+from tofcorr.diagnosis.findings.where import Interval, Region, Stage
 from tofcorr.diagnosis.report.words import (
     SHARE_ENDS,
     SIGNIFICANT,
@@ -19,10 +20,14 @@ from tofcorr.diagnosis.report.words import (
     axis_label,
     cause_words,
     effect_words,
+    least_p,
     most_biased,
     p_words,
+    pose_errors,
     share_words,
+    stages_shown,
 )
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.observables.figures import BLUE, FAINT, GREY, RED, line_across, panels
 from tofcorr.observables.figures import drawings as observable_drawings
 
@@ -39,7 +44,7 @@ _LONG = 22
 
 def all_figures(result: "DiagnosisResult") -> dict[str, Figure]:
     """Return every figure that the findings allow, by its name on the report page."""
-    left_out = () if result.stages[0].where else ("where_as_given",)
+    left_out = ("where_as_given",) if result.stages[0].gap is None else ()
     own = {name: draw(result) for name, draw in FIGURES.items() if name not in left_out}
     return own | {name: draw() for name, draw in observable_drawings(result.observables).items()}
 
@@ -54,25 +59,25 @@ def svg_of(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-Bar = tuple[str, float, Interval | None, str, str]
+Bar = tuple[str, float, Interval, str, str]
 """Name, length, interval, colour, and the text at the right."""
 
 
 def stage_bars(result: "DiagnosisResult") -> Figure:
     """Draw the gap at each stage and after each named effect in turn, and the noise of a pixel."""
 
-    def bar(name: str, size: float, interval: Interval | None, colour: str) -> Bar:
-        ends = None if interval is None else (1e3 * interval[0], 1e3 * interval[1])
+    def bar(name: str, size: float, interval: Interval, colour: str) -> Bar:
+        ends = 1e3 * interval[0], 1e3 * interval[1]
         return name, 1e3 * size, ends, colour, f"{1e3 * size:.1f} mm"
 
     bars = [
-        bar(STAGE_WORDS[one.name], one.gap, one.interval, STAGE_COLOURS[one.name])
-        for one in result.stages_known
+        bar(STAGE_WORDS[one.name], one.gap, one.gap.interval, STAGE_COLOURS[one.name])
+        for one in stages_shown(result)
         if one.gap is not None
     ]
     steps = [
-        bar(f"+ {effect_words(result.evidence.study, name)}", size, interval, BLUE)
-        for name, size, interval in result.gap_steps
+        bar(f"+ {effect_words(result.evidence.study, name)}", size, size.interval, BLUE)
+        for name, size in result.gap_steps
     ]
     bars[-1:-1] = steps[:-1]
     if steps:  # Its bar is that of the stage. Three lines would touch the next bar's.
@@ -104,7 +109,7 @@ def attribution_bars(result: "DiagnosisResult") -> Figure:
         (
             cause_words(result.evidence.study, one),
             100 * one.share,
-            (100 * max(one.interval[0], SHARE_ENDS[0]), 100 * min(one.interval[1], SHARE_ENDS[1])),
+            tuple(100 * np.clip(one.share.interval, *SHARE_ENDS)),
             _KIND_COLOURS[one.kind],
             share_words(one.share),
         )
@@ -122,9 +127,8 @@ def _bars(bars: Sequence[Bar], label: str) -> tuple[Figure, Axes]:
     axes.barh(places, [bar[1] for bar in bars], color=[bar[3] for bar in bars])
     ends = [0.0]
     for place, (_, value, interval, _, text) in zip(places, bars, strict=True):
-        ends += [value, *(interval or ())]
-        if interval is not None:
-            axes.plot(interval, [place, place], color="black", marker="|")
+        ends += [value, *interval]
+        axes.plot(interval, [place, place], color="black", marker="|")
         where = ("axes fraction", "data")
         axes.annotate(f"  {text}", (1, place), xycoords=where, va="center", fontsize=9)
     margin = (max(ends) - min(ends)) / 30
@@ -136,6 +140,10 @@ def _bars(bars: Sequence[Bar], label: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
+def _fitted(result: "DiagnosisResult") -> list[Stage]:
+    return [stage for stage in stages_shown(result) if stage.name != "as_given"]
+
+
 def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figure:
     """Draw the bias along the covariates of `most_biased` at the first of the stages.
 
@@ -144,7 +152,7 @@ def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figu
         least_p: The smallest p-value that the test can give.
         most: Covariates that are drawn at most.
     """
-    by_stage = [one.found_where.by_covariate() for one in stages]
+    by_stage = [one.by_covariate() for one in stages]
     groups = most_biased(by_stage[0])[:most]
     rows = max(1, -(-len(groups) // 2))
     figure, found = panels(2 * rows, rows, 2)
@@ -168,24 +176,22 @@ def _strip(axes: Axes, regions: Sequence[Region], colour: str, *, band: bool) ->
     middle = [(region.low + region.high) / 2 for region in regions]
     axes.plot(middle, [1e3 * r.bias for r in regions], "o-", color=colour, markersize=3)
     if band:
-        low, high = ([1e3 * region.interval[side] for region in regions] for side in (0, 1))
+        low, high = ([1e3 * one.bias.interval[side] for one in regions] for side in (0, 1))
         axes.fill_between(middle, low, high, color=colour, alpha=FAINT, linewidth=0)
 
 
 def image_maps(result: "DiagnosisResult") -> Figure:
     """Draw the mean residual over the image at each stage, each with a scale of its own."""
-    stages = result.stages_known
+    stages = stages_shown(result)
     figure, found = panels(2, 1, len(stages))
     for axes, stage in zip(found, stages, strict=True):
-        where = stage.found_where
+        tiles = 1e3 * stage.tiles
         # A least limit, so that noise does not look like structure.
-        limit = max(float(np.nanmax(np.abs(1e3 * where.tiles), initial=0.0)), 0.5)
-        shown = axes.imshow(
-            1e3 * where.tiles, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto"
-        )
+        limit = max(float(np.nanmax(np.abs(tiles), initial=0.0)), 0.5)
+        shown = axes.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto")
         axes.set_title(STAGE_WORDS[stage.name], color=STAGE_COLOURS[stage.name], fontsize=9)
         axes.set_axis_off()
-        rows, columns = np.nonzero(where.tile_p_values <= SIGNIFICANT)
+        rows, columns = np.nonzero(stage.tile_p_values <= SIGNIFICANT)
         axes.plot(columns, rows, "k.", markersize=3)
         bar = figure.colorbar(shown, ax=axes, orientation="horizontal")
         bar.ax.tick_params(labelsize=8)
@@ -197,9 +203,9 @@ def image_maps(result: "DiagnosisResult") -> Figure:
 def pose_series(result: "DiagnosisResult") -> Figure:
     """Draw the mean residual of each pose in the order of the recording."""
     figure, (axes,) = panels(2)
-    for stage in result.stages_fitted:
+    for stage in _fitted(result):
         colour, label = STAGE_COLOURS[stage.name], STAGE_WORDS[stage.name]
-        axes.plot(1e3 * stage.found_where.offsets, ".-", linewidth=1, color=colour, label=label)
+        axes.plot(1e3 * stage.offsets, ".-", linewidth=1, color=colour, label=label)
     line_across(axes)
     axes.set_xlabel("pose, in the order of the recording")
     axes.set_ylabel("mean residual, mm")
@@ -220,7 +226,7 @@ def effect_forest(result: "DiagnosisResult") -> Figure:
         named = test.name in result.effects
         colour = RED if named else BLUE if test.name in alike else GREY
         closed = 1e6 * test.closed.numpy() / count * len(test.closed)
-        error = TWO_SIDED * closed.std(ddof=1) / np.sqrt(len(closed))
+        error = student_quantile(0.975, math.inf) * closed.std(ddof=1) / len(closed) ** 0.5
         left.errorbar(
             closed.mean(), place, xerr=error, fmt="o", capsize=2, markersize=4, color=colour
         )
@@ -239,12 +245,12 @@ def effect_forest(result: "DiagnosisResult") -> Figure:
 
 def absorption_map(result: "DiagnosisResult") -> Figure:
     """Draw the share of each effect that calibration absorbs, then that other effects absorb."""
-    table = result.evidence.absorption
-    names = table.names
-    shares = np.concatenate([table.by_calibration[:, None], table.by_effect], axis=1)
+    names = tuple(result.evidence.study.candidates.effects)
     figure, (axes,) = panels(5)
     axes.set_facecolor("#f3e9e9")
-    shown = axes.imshow(shares, cmap="Greys", vmin=0, vmax=1, aspect="auto")
+    shown = axes.imshow(
+        absorption_table(result.evidence.study), cmap="Greys", vmin=0, vmax=1, aspect="auto"
+    )
     axes.axvline(0.5, color="white", linewidth=3)
     axes.set_xticks(range(len(names) + 1), ["calibration", *names], rotation=90)
     axes.set_yticks(range(len(names)), names)
@@ -259,7 +265,7 @@ def absorption_map(result: "DiagnosisResult") -> Figure:
 
 def paired_poses(result: "DiagnosisResult") -> Figure:
     """Draw the held-out error of each pose before and after the effects, and the noise."""
-    before, after = (1e3 * errors for errors in result.evidence.pose_errors)
+    before, after = (1e3 * errors for errors in pose_errors(result))
     figure, (axes,) = panels(4)
     axes.set_box_aspect(1)
     limit = max(before.max(), after.max())
@@ -272,8 +278,8 @@ def paired_poses(result: "DiagnosisResult") -> Figure:
 
 
 FIGURES: dict[str, Callable[["DiagnosisResult"], Figure]] = {
-    "where_as_given": lambda r: covariate_strips(r.stages_known[:1], r.least_p_value, most=4),
-    "where": lambda r: covariate_strips(r.stages_fitted, r.least_p_value, most=6),
+    "where_as_given": lambda r: covariate_strips(stages_shown(r)[:1], least_p(r), most=4),
+    "where": lambda r: covariate_strips(_fitted(r), least_p(r), most=6),
     "which": effect_forest,
     "aliases": absorption_map,
     "map": image_maps,

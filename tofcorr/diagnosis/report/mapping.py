@@ -3,23 +3,23 @@
 import math
 from typing import TYPE_CHECKING, Any
 
-from tofcorr.diagnosis.findings.absorption import RankedEffect
-from tofcorr.diagnosis.findings.where import Region
+from tofcorr.diagnosis.findings.absorption import absorbed_share
+from tofcorr.diagnosis.findings.effect_comparison import EffectTest, closed_gap
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.where import Stage
+from tofcorr.diagnosis.sums.study import Study
 
 if TYPE_CHECKING:
     from tofcorr.diagnosis.report.result import DiagnosisResult
-
-# Regions listed, the most significant first: of the gap, more than anyone reads; of each stage,
-# what fits beside a picture.
-_MOST_REGIONS, _REGIONS_OF_STAGE = 60, 5
-_GAPS = ("before", "after", "floor", "between_images", "fixed_pattern", "within_images")
-_TRAININGS = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
 
 
 def content_of(result: "DiagnosisResult") -> dict[str, Any]:
     """Return the content of `diagnosis.json`."""
     gap, remainder, named = result.gap, result.remainder, result.evidence.named
+    outliers, transfer, degraded = result.outliers, result.transfer, result.degraded
     untested = {"closes_mm": None, "closed_fraction": None, "p_value": None, "aliases": []}
+    lengths = "before", "after", "floor", "between_images", "fixed_pattern", "within_images"
+    trainings = "trained_on_sim", "trained_on_sim_with_effects", "trained_on_real"
     return {
         "format": "tofcorr-diagnosis",
         "version": 2,
@@ -28,30 +28,23 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
             {
                 "name": stage.name,
                 "gap_mm": _mm(stage.gap),
-                "ci": _mm(stage.interval),
-                "where": [
-                    _region(one)
-                    for one in (stage.where.regions[:_REGIONS_OF_STAGE] if stage.where else ())
-                ],
+                "ci": None if stage.gap is None else _mm(stage.gap.interval),
+                "where": _regions(stage, 5),  # What fits beside a picture.
             }
             for stage in result.stages
         ],
         "attribution": [
-            {
-                "cause": one.cause,
-                "kind": one.kind,
-                "share": round(one.share, 4),
-                "ci": [round(end, 4) for end in one.interval],
-            }
+            {"cause": one.name, "kind": one.kind, "share": round(one.share, 4)}
+            | {"ci": _rounded(one.share.interval)}
             | ({} if one.of_constant is None else {"of_constant": round(one.of_constant, 4)})
             for one in result.shares
         ],
         "gap_mm": {
-            **{name: _mm(getattr(gap, name)) for name in _GAPS},
-            "before_ci": _mm(gap.before_interval),
-            "after_ci": _mm(gap.after_interval),
+            **{name: _mm(getattr(gap, name)) for name in lengths},
+            "before_ci": _mm(gap.before.interval),
+            "after_ci": _mm(gap.after.interval),
             "closed_fraction": round(gap.closed, 4),
-            "closed_ci": [round(end, 4) for end in gap.closed_interval],
+            "closed_ci": _rounded(gap.closed.interval),
             "floor_is_upper_bound": not gap.floor_from_repeats,
         },
         "parameter_gap_mm": {"as_given": _mm(gap.as_given), "refitted": _mm(gap.before)},
@@ -61,34 +54,32 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
         "cause_sets": [list(members) for members in result.cause_sets],
         # What members close over what the first one closes.
         "cause_sets_close": [
-            {name: round(share, 3) for name, share in own.closes.items()} for own in named.sets
+            {name: round(share, 3) for name, share in own.items() if math.isfinite(share)}
+            for own in named.sets.values()
         ],
         "likeliest": list(result.likeliest),
-        "unknown": result.unknown,
+        "unknown": remainder.unknown,
         "unknown_p_value": round(remainder.p_value, 5),
         "outliers": {
-            "deleted_share": round(result.outliers.deleted, 6),
-            "reduced_share": round(result.outliers.reduced, 6),
-            "rms_mm": _mm(result.outliers.size),
-            "map": [  # A tile without pixels is null.
-                [None if math.isnan(share) else round(share, 4) for share in row]
-                for row in result.outliers.tiles.tolist()
-            ],
-            "where": result.outliers.place,
+            "deleted_share": round(outliers.deleted, 6),
+            "reduced_share": round(outliers.reduced, 6),
+            "rms_mm": _mm(outliers.size),
+            "map": [_rounded(row) for row in outliers.tiles.tolist()],
+            "where": outliers.place,
         },
         "ranking": [
-            *map(_ranked, result.ranking),
+            *(_ranked(result.evidence.study, named, test) for test in result.ranking),
             *(
                 {"effect": name, **untested, "available": False, "missing": missing}
                 for name, missing in result.missing.items()
             ),
         ],
-        "where": [_region(region) for region in result.where.regions[:_MOST_REGIONS]],
-        "transfer_mm": result.transfer
+        "where": _regions(result.stages[1], 60),  # More than anyone reads.
+        "transfer_mm": transfer
         and {
-            **{name: _mm(getattr(result.transfer, name)) for name in _TRAININGS},
-            "ci": dict(zip(_TRAININGS, map(_mm, result.transfer.intervals), strict=True)),
-            "gain_ci": _mm(result.transfer.gain_interval),
+            **{name: _mm(getattr(transfer, name)) for name in trainings},
+            "ci": dict(zip(trainings, map(_mm, transfer.intervals), strict=True)),
+            "gain_ci": _mm(transfer.gain_interval),
         },
         "fitted": [
             {name: getattr(one, name) for name in ("cause", "kind", "name", "unit")}
@@ -104,12 +95,12 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
             "with_effects": _mm(result.closure.with_effects),
             "frames": result.closure.frames,
         },
-        "degraded": result.degraded
+        "degraded": degraded
         and {
-            "gap_mm": _mm(result.degraded.gap),
-            "ci": _mm(result.degraded.interval),
-            "poses": result.degraded.poses,
-            "left_out": list(result.degraded.left_out),
+            "gap_mm": _mm(degraded.gap),
+            "ci": _mm(degraded.interval),
+            "poses": degraded.poses,
+            "left_out": list(degraded.left_out),
         },
         **result.observables.to_dict(),
         "hand_eye_shift_mm": _mm(gap.hand_eye_shift[0]),
@@ -125,33 +116,41 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
     }
 
 
-def _ranked(entry: RankedEffect) -> dict[str, Any]:
+def _ranked(study: Study, named: NamedEffects, test: EffectTest) -> dict[str, Any]:
     """Return the entry of a tested effect in `ranking`."""
+    closes, fraction = closed_gap(study, named.first, test)
+    members = next((own for own in named.cause_sets if test.name in own), ())
+    absorbed = None
+    if test.name in study.candidates.effects:
+        absorbed = round(absorbed_share(study, test.name), 3)
     return {
-        "effect": entry.name,
-        "closes_mm": _mm(entry.closes),
-        "closed_fraction": round(entry.closed_fraction, 4),
-        "p_value": round(entry.p_value, 5),
-        "aliases": list(entry.aliases),
+        "effect": test.name,
+        "closes_mm": _mm(closes),
+        "closed_fraction": round(fraction, 4),
+        "p_value": round(named.first.naming_p_value(test.name), 5),
+        "aliases": [name for name in members if name != test.name],
         "available": True,
         "missing": [],
-        "gain": round(entry.gain, 2),
-        "score": round(entry.score, 3),
-        "absorbed": None if entry.absorbed is None else round(entry.absorbed, 3),
+        "gain": round(test.gain, 2),
+        "score": round(test.score, 3),
+        "absorbed": absorbed,
     }
 
 
-def _region(region: Region) -> dict[str, Any]:
-    """Return an entry of `where`."""
-    return {
-        "covariate": region.covariate,
-        "from": region.low,
-        "to": region.high,
-        "bias_mm": _mm(region.bias),
-        "bias_ci": _mm(region.interval),
-        "p_value": round(region.p_value, 5),
-        "kind": "trend" if region.trend else "bin",
-    }
+def _regions(stage: Stage, most: int) -> list[dict[str, Any]]:
+    """Return entries of `where`, the most significant first."""
+    return [
+        {
+            "covariate": region.covariate,
+            "from": region.low,
+            "to": region.high,
+            "bias_mm": _mm(region.bias),
+            "bias_ci": _mm(region.bias.interval),
+            "p_value": round(region.p_value, 5),
+            "kind": "trend" if region.trend else "bin",
+        }
+        for region in stage.regions[:most]
+    ]
 
 
 def _mm(metres: float | tuple[float, float] | None) -> Any:  # noqa: ANN401 - as what is given
@@ -159,6 +158,11 @@ def _mm(metres: float | tuple[float, float] | None) -> Any:  # noqa: ANN401 - as
     if isinstance(metres, tuple):
         return [_mm(end) for end in metres]
     return None if metres is None else round(metres * 1e3, 4)
+
+
+def _rounded(shares: tuple[float, float] | list[float]) -> list[float | None]:
+    """Return shares to four digits; None: it is not known."""
+    return [None if math.isnan(share) else round(share, 4) for share in shares]
 
 
 def _finite(number: float) -> float | None:

@@ -17,8 +17,10 @@ from tofcorr.diagnosis.report.words import (
     STAGE_WORDS,
     biases_of,
     effect_words,
+    least_p,
     p_words,
     percent,
+    stages_shown,
 )
 from tofcorr.diagnosis.rerun.sensor import sensor_of
 from tofcorr.digits import decimals, known, known_interval
@@ -70,7 +72,7 @@ def render(result: DiagnosisResult) -> str:
         "known": known,
         "known_interval": known_interval,
         "percent": lambda share: "–" if share is None else percent(share),
-        "p": lambda p: "–" if p is None else p_words(p, result.least_p_value).removeprefix("= "),
+        "p": lambda p: "–" if p is None else p_words(p, least_p(result)).removeprefix("= "),
         "effect": partial(effect_words, result.evidence.study),
         "p_of_draws": lambda p: p_words(p, LEAST_P),
         "with_digits": _with_digits,
@@ -180,13 +182,12 @@ def write_events(result: DiagnosisResult, folder: Path | str) -> None:
     numbers = {f"stage_mm/{stage.name}": 1e3 * (stage.gap or 0.0) for stage in known_stages}
     numbers |= {f"gap_mm/{part}": 1e3 * getattr(gap, part) for part in ("before", "after", "floor")}
     numbers |= {f"score/{entry.name}": entry.score for entry in result.ranking}
-    numbers |= {f"share/{share.cause}": share.share for share in result.shares}
+    numbers |= {f"share/{cause.name}": cause.share for cause in result.shares}
     curves: dict[str, list[float]] = {}
-    for stage in result.stages_known:
-        where = stage.found_where
-        curves[f"pose_mm/{stage.name}"] = where.offsets.tolist()
-        for covariate, regions in where.by_covariate().items():
-            curves[f"bias_mm_{stage.name}/{covariate}"] = biases_of(regions)
+    for stage in stages_shown(result):
+        curves[f"pose_mm/{stage.name}"] = stage.offsets.tolist()
+        for covariate, regions in stage.by_covariate().items():
+            curves[f"bias_mm_{stage.name}/{covariate}"] = list(map(float, biases_of(regions)))
     with event_writer(folder) as writer:
         writer.add_text("verdict", result.verdict)
         for tag, number in numbers.items():

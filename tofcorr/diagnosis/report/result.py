@@ -2,19 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.absorption import AbsorptionTable, RankedEffect, absorption_table
-from tofcorr.diagnosis.findings.gap import Gap, Interval
+from tofcorr.diagnosis.findings.effect_comparison import EffectTest
+from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.findings.outliers import Outliers
-from tofcorr.diagnosis.findings.shares import Share
-from tofcorr.diagnosis.findings.where import Stage, Where
+from tofcorr.diagnosis.findings.shares import Cause
+from tofcorr.diagnosis.findings.where import Estimated, Stage
 from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.mapping import content_of
@@ -43,25 +40,6 @@ class Evidence:
     named: NamedEffects
     patterns: Mapping[str, Tensor] = field(default_factory=dict)
 
-    @cached_property
-    def absorption(self) -> AbsorptionTable:
-        """What calibration and other effects absorb of each effect."""
-        return absorption_table(self.study)
-
-    @cached_property
-    def pose_errors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Held-out error of each pose before and after the effects, (U,) each, metres."""
-        return (
-            _pose_errors(self.study, ()),
-            _pose_errors(self.named.study, self.named.columns),
-        )
-
-
-def _pose_errors(study: Study, names: tuple[str, ...]) -> np.ndarray:
-    """Return the held-out root mean square of each pose, shape (U,), metres."""
-    mean: Tensor = study.left_out_squares(names) / study.sums.count.clamp(min=1e-12)
-    return mean.clamp(min=0.0).sqrt().numpy()
-
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class DiagnosisResult:
@@ -86,8 +64,7 @@ class DiagnosisResult:
         refined_terms: Base terms that a higher-order form was added to, too small to report.
         tested: Whether there were enough poses for a test; if not, effects are only ranked.
         gap: Before and after the effects.
-        gap_steps: The gap after each named effect in turn, and its interval, metres.
-        where: Bias along all covariates, after recalibration.
+        gap_steps: The gap after each named effect in turn, metres.
         remainder: Whether a gap of unknown cause remains, and what it looks like.
         outliers: Pixels that gap and effects do not describe.
         ranking: Every tested effect as the first addition to the base model, the best first.
@@ -111,7 +88,7 @@ class DiagnosisResult:
     remarks: tuple[str, ...]
     simulator_kind: SimulatorKind
     stages: tuple[Stage, Stage, Stage]
-    shares: tuple[Share, ...]
+    shares: tuple[Cause, ...]
     warnings: tuple[str, ...]
     detected: bool
     p_value: float
@@ -121,11 +98,10 @@ class DiagnosisResult:
     refined_terms: tuple[str, ...]
     tested: bool
     gap: Gap
-    gap_steps: tuple[tuple[str, float, Interval], ...]
-    where: Where
+    gap_steps: tuple[tuple[str, Estimated], ...]
     remainder: OpenSet
     outliers: Outliers
-    ranking: tuple[RankedEffect, ...]
+    ranking: tuple[EffectTest, ...]
     missing: dict[str, list[str]]
     detectable: dict[str, float | None]
     advice: tuple[str, ...]
@@ -153,20 +129,9 @@ class DiagnosisResult:
         return content_of(self)
 
     @property
-    def least_p_value(self) -> float:
-        """The smallest p-value that the sign flips can give."""
-        return 1 / (self.options.tests.flips + 1)
-
-    @property
-    def stages_known(self) -> tuple[Stage, ...]:
-        """The stages that differ: no first one without simulator, no last one without effects."""
-        stages = self.stages if self.effects or self.refined_terms else self.stages[:2]
-        return tuple(stage for stage in stages if stage.where is not None)
-
-    @property
-    def stages_fitted(self) -> tuple[Stage, ...]:
-        """The same from recalibration on."""
-        return tuple(stage for stage in self.stages_known if stage.name != "as_given")
+    def where(self) -> Stage:
+        """Bias along all covariates, after recalibration."""
+        return self.stages[1]
 
     def all_figures(self) -> "dict[str, Figure]":
         """Return every figure, by its name on the report page."""

@@ -8,13 +8,13 @@ import numpy as np
 
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.diagnosis.findings.absorption import absorbed_share
-from tofcorr.diagnosis.findings.cause_sets import CauseSet
-from tofcorr.diagnosis.findings.gap import Gap, Interval, LonePoses
+from tofcorr.diagnosis.findings.effect_comparison import closed_gap
+from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.open_set import OpenSet
-from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
-from tofcorr.diagnosis.findings.where import Region
+from tofcorr.diagnosis.findings.shares import HAND_EYE, Cause
+from tofcorr.diagnosis.findings.where import Estimated, Interval, Region, Stage
 from tofcorr.diagnosis.rerun.simulator import solution_of
+from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.digits import known, known_interval
 from tofcorr.geometry import se3
@@ -56,13 +56,13 @@ def effect_words(study: Study, name: str) -> str:
     return f"{name} (higher order)" if refined else name
 
 
-def cause_words(study: Study, share: Share) -> str:
+def cause_words(study: Study, cause: Cause) -> str:
     """Return the name of a cause in an attribution: which kind of term it is."""
-    if share.cause == HAND_EYE:
+    if cause.name == HAND_EYE:
         return "hand-eye transform"
-    if share.cause in CATALOGUE and share.kind == "parameter":
-        return f"{share.cause} (base term)"
-    words = effect_words(study, share.cause)
+    if cause.name in CATALOGUE and cause.kind == "parameter":
+        return f"{cause.name} (base term)"
+    words = effect_words(study, cause.name)
     return words if study.fit.known is None else words.replace("(higher", "(base, higher")
 
 
@@ -75,6 +75,26 @@ def sized(size: float, interval: Interval) -> str:
     """Return a length in metres as millimetres with its interval, in the digits that are known."""
     in_mm = 1e3 * interval[0], 1e3 * interval[1]
     return f"{known(1e3 * size, in_mm)} mm [{', '.join(known_interval(in_mm))}]"
+
+
+def least_p(result: "DiagnosisResult") -> float:
+    """Return the smallest p-value that the sign flips can give."""
+    return 1 / (result.options.tests.flips + 1)
+
+
+def stages_shown(result: "DiagnosisResult") -> list[Stage]:
+    """Return the stages that differ: no first one without simulator, no last without effects."""
+    stages = result.stages if result.effects or result.refined_terms else result.stages[:2]
+    return [stage for stage in stages if stage.gap is not None]
+
+
+def pose_errors(result: "DiagnosisResult") -> tuple[np.ndarray, np.ndarray]:
+    """Return the held-out error of each pose before and after the effects, (U,) each, metres."""
+    study, named = result.evidence.study, result.evidence.named
+    squares = study.left_out_squares(()), named.study.left_out_squares(named.columns)
+    count = study.sums.count.clamp(min=TINY)
+    before, after = ((own / count).clamp(min=0.0).sqrt().numpy() for own in squares)
+    return before, after
 
 
 def percent(share: float) -> str:
@@ -110,7 +130,7 @@ def p_words(value: float, least: float) -> str:
 
 
 def write_verdict(
-    named: NamedEffects, gap: Gap, remainder: OpenSet, shares: Sequence[Share]
+    named: NamedEffects, gap: Gap, remainder: OpenSet, causes: Sequence[Cause]
 ) -> str:
     """Return the finding in three sentences: the gap as given, what it consists of, what remains.
 
@@ -118,59 +138,47 @@ def write_verdict(
         named: The effects named.
         gap: As given, before and after them.
         remainder: What they leave.
-        shares: The attribution of the gap.
+        causes: The attribution of the gap.
     """
     start = "The simulator as given"
     if gap.as_given is None:
         start = "No simulator was given, so one was fitted to the recording; it"
     bound = "" if gap.floor_from_repeats else " (an upper bound)"
     size = (
-        f"{start} differs from the recording by {sized(*_whole(gap))}, in excess of a noise of "
-        f"{mm(gap.floor)} mm{bound}."
+        f"{start} differs from the recording by {sized(gap.whole, gap.whole.interval)}, in excess "
+        f"of a noise of {mm(gap.floor)} mm{bound}."
     )
-    made_of = _made_of(named, gap, remainder, shares)
-    return " ".join(filter(None, [size, made_of, _remains(named, gap, remainder)]))
-
-
-def _whole(gap: Gap) -> tuple[float, Interval]:
-    """Return the gap to the simulator under diagnosis, or to the one fitted, and its interval."""
-    if gap.as_given is None or gap.as_given_interval is None:
-        return gap.before, gap.before_interval
-    return gap.as_given, gap.as_given_interval
-
-
-def _made_of(named: NamedEffects, gap: Gap, remainder: OpenSet, shares: Sequence[Share]) -> str:
-    if _whole(gap)[0] <= 0:
-        return "That is no more than the noise."
-    causes = [s for s in shares if s.kind != "unexplained" and abs(s.share) >= 1 / 100]
-    if causes:
-        words = [f"{one.cause} {percent(one.share)}" for one in _ordered(causes)]
-        left = next(one.share for one in shares if one.kind == "unexplained")
-        return f"Shares of its square: {', '.join(words)}; {share_words(left)} is unexplained."
-    return "" if named.names else _without_causes(named, gap, remainder)
+    shares = {one.name: one.share for one in causes if abs(one.share) >= 1 / 100}
+    left = next(one.share for one in causes if one.kind == "unexplained")
+    shares.pop("unexplained", None)
+    made_of = ""
+    if gap.whole <= 0:
+        made_of = "That is no more than the noise."
+    elif shares:
+        words = [f"{n} {percent(shares[n])}" for n in sorted(shares, key=lambda n: -shares[n])]
+        made_of = f"Shares of its square: {', '.join(words)}; {share_words(left)} is unexplained."
+    elif not named.names:
+        made_of = _without_causes(named, gap, remainder)
+    remains = _something_named if named.names else _nothing_named
+    return " ".join(filter(None, [size, made_of, remains(named, gap, remainder)]))
 
 
 def _without_causes(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
-    total, interval = _whole(gap)
-    if remainder.unknown and gap.as_given is not None:
-        return "No parameter and no effect explains it."
-    if remainder.unknown:
-        return f"None of the effects tested explains it{_nearest(named)}."
-    if named.likeliest:
-        return "No cause of it is significant."
-    if interval[0] <= 0:
-        return "Noise may be all of it."
-    if gap.as_given is None and remainder.scatter**2 > 0.5 * total**2:
-        scatter = mm(remainder.scatter)
-        return f"Poses of camera or target that scatter by {scatter} mm would explain it."
-    small = total < 1e-3 * named.study.options.target_gap_mm
-    size = "That is too small to show a cause."
-    return size if small else "None of the effects tested is significant."
-
-
-def _ordered(shares: Sequence[Share]) -> list[Share]:
-    """Return shares, the largest first."""
-    return sorted(shares, key=lambda one: -one.share)
+    poses = gap.as_given is None and remainder.scatter**2 > 0.5 * gap.whole**2
+    scatter = f"Poses of camera or target that scatter by {mm(remainder.scatter)} mm"
+    said = (
+        (remainder.unknown and gap.as_given is not None, "No parameter and no effect explains it."),
+        (remainder.unknown, f"None of the effects tested explains it{_nearest(named)}."),
+        (named.likeliest, "No cause of it is significant."),
+        (gap.whole.interval[0] <= 0, "Noise may be all of it."),
+        (poses, f"{scatter} would explain it."),
+        (
+            gap.whole < named.study.options.target_gap_mm / 1000,
+            "That is too small to show a cause.",
+        ),
+        (True, "None of the effects tested is significant."),
+    )
+    return next(sentence for holds, sentence in said if holds)
 
 
 def _nearest(named: NamedEffects, what: str = "nearest") -> str:
@@ -178,39 +186,36 @@ def _nearest(named: NamedEffects, what: str = "nearest") -> str:
     return f" ({what}: {words})" if words else ""
 
 
-def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
-    after = sized(gap.after, gap.after_interval)
-    given = gap.as_given is not None
-    if not named.names:
-        return _nothing_named(named, gap, remainder, after)
-    *first, last = [effect_words(named.study, name) for name in named.names]
+def _something_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
+    names = {name: effect_words(named.study, name) for name in named.names}
+    *first, last = names.values()
     many = f"{', '.join(first)} and {last}" if first else last
-    start = f"Recalibration leaves {sized(gap.before, gap.before_interval).split(' [')[0]}; with "
-    sentence = f"{start if given else 'With '}{many}{_or_fewer(named)} added, {after} remain"
+    # Some of these, of another form, may be the cause of several of them.
+    causes = {other for name, own in named.sets.items() for other in own if other != name}
+    fewer = " or ".join(words for name, words in names.items() if name in causes)
+    fewer = f" (or only {fewer}, of another form)" if fewer else ""
+    start, advice = "With ", "add"
+    if gap.as_given is not None:
+        before = sized(gap.before, gap.before.interval).split(" [")[0]
+        start, advice = f"Recalibration leaves {before}; with ", "calibrate it and add"
+    sentence = f"{start}{many}{fewer} added, {sized(gap.after, gap.after.interval)} remain"
     if remainder.unknown:
         sentence += ", which none of the effects tested explains."
     else:
-        sentence += f": {'calibrate it and add' if given else 'add'} {many}."
+        sentence += f": {advice} {many}."
     if not named.certain:
         return sentence
-    name = effect_words(named.study, named.names[0])
+    name = names[named.names[0]]
     return (
         f"{sentence} The gap is significant as a whole, and {name} explains most of it; but {name} "
         "would be significant only if no other effect had been tested. More poses would decide."
     )
 
 
-def _or_fewer(named: NamedEffects) -> str:
-    """Say which of the named effects, of another form, may be the cause of several of them."""
-    sets = zip(named.names, named.sets, strict=True)
-    causes = {other for name, own in sets for other in own.members if other != name}
-    words = [effect_words(named.study, name) for name in named.names if name in causes]
-    return f" (or only {' or '.join(words)}, of another form)" if words else ""
-
-
-def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet, after: str) -> str:
-    given = gap.as_given is not None
-    start = f"Recalibration leaves {after}" if given else "No effect is named"
+def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
+    given, start = gap.as_given is not None, "No effect is named"
+    if given:
+        start = f"Recalibration leaves {sized(gap.after, gap.after.interval)}"
     if remainder.unknown:  # Without a simulator that is said already.
         explained = f", and none of the effects tested explains that{_nearest(named)}."
         return start + explained if given else ""
@@ -226,22 +231,22 @@ def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet, after: str
     return f"{start}, and {nothing}{': calibrate it' if gap.as_given else ''}."
 
 
-def list_causes(study: Study, named: NamedEffects, shares: Sequence[Share]) -> tuple[str, ...]:
+def list_causes(study: Study, named: NamedEffects, causes: Sequence[Cause]) -> tuple[str, ...]:
     """Return a line for each cause, the largest share first."""
     # A parameter that was left as the simulator has it causes nothing.
-    causes = (one for one in shares if one.kind == "effect" or one.share or any(one.interval))
-    known_causes = [one for one in causes if one.kind != "unexplained"]
-    return tuple(_cause_line(study, named, one) for one in _ordered(known_causes))
+    shown = (one for one in causes if one.kind == "effect" or one.share or any(one.share.interval))
+    ordered = sorted(shown, key=lambda one: -one.share)
+    return tuple(_cause_line(study, named, one) for one in ordered if one.kind != "unexplained")
 
 
-def _cause_line(study: Study, named: NamedEffects, one: Share) -> str:
-    line = f"{cause_words(study, one)}: {share_words(one.share)} {interval_words(one.interval)}"
-    line += " of the squared gap"
+def _cause_line(study: Study, named: NamedEffects, one: Cause) -> str:
+    share = f"{share_words(one.share)} {interval_words(one.share.interval)}"
+    line = f"{cause_words(study, one)}: {share} of the squared gap"
     if one.of_constant is not None and one.of_constant > _SMALL:
         line += f" ({percent(one.of_constant)} by a constant offset, which any cause may have)"
     if one.kind == "effect":
-        return f"{line}; {effect_line(named, one.cause)}."
-    if one.cause != HAND_EYE or study.fit.known is None:
+        return f"{line}; {effect_line(named, one.name)}."
+    if one.name != HAND_EYE or study.fit.known is None:
         return f"{line}; a parameter of the simulator's error model."
     given = study.fit.known.tool_from_camera
     moved = se3.log(se3.inverse(given) @ solution_of(study, named)[0])
@@ -253,66 +258,59 @@ def _cause_line(study: Study, named: NamedEffects, one: Share) -> str:
 
 def effect_line(named: NamedEffects, name: str) -> str:
     """Return what a named effect is, what it may be instead, and what hides it."""
-    words = CATALOGUE[name].summary
-    if not named.study.fit.model.groups.isdisjoint(CATALOGUE[name].refines):
+    study, words = named.study, CATALOGUE[name].summary
+    if not study.fit.model.groups.isdisjoint(CATALOGUE[name].refines):
         words = f"the base model's {name} term, and a higher-order form of it"
-    own = named.sets[named.names.index(name)]
-    others = [member for member in own.members if member != name]
-    rivals = [_rival(named, own, member) for member in others if member not in named.names]
+    rivals, forms = [], []
+    for member, share in named.sets[name].items():
+        if member in named.names:
+            forms += [] if member == name else [effect_words(study, member)]
+            continue
+        closes = f" (closes {percent(share)} of what this one closes)" if share >= _SMALL else ""
+        rivals.append(effect_words(study, member) + closes)
     if rivals:
         words += f", which these data cannot distinguish from {', '.join(rivals)}"
-    causes = [effect_words(named.study, member) for member in others if member in named.names]
-    if causes:
-        words += f"; it may be an error in the form of {' or '.join(causes)}"
-    if name in named.study.candidates.effects:
-        absorbed = absorbed_share(named.study, name)
-        if absorbed > 0.2:
-            words += f"; calibration absorbs about {percent(absorbed)} of such an effect"
+    if forms:
+        words += f"; it may be an error in the form of {' or '.join(forms)}"
+    absorbed = absorbed_share(study, name) if name in study.candidates.effects else 0.0
+    if absorbed > 0.2:
+        words += f"; calibration absorbs about {percent(absorbed)} of such an effect"
     return words
 
 
-def _rival(named: NamedEffects, own: CauseSet, member: str) -> str:
-    """Return another member of a cause set, with what it closes in the place of the named one."""
-    share = own.closes.get(member, 0.0)
-    closes = f" (closes {percent(share)} of what this one closes)" if share >= _SMALL else ""
-    return effect_words(named.study, member) + closes
-
-
 def list_remarks(
+    study: Study,
     named: NamedEffects,
     gap: Gap,
-    alone: LonePoses | None,
     remainder: OpenSet,
     detectable: Mapping[str, float | None],
-    missing: Sequence[str],
 ) -> tuple[str, ...]:
     """Return what else must be said, a sentence or two each.
 
     Args:
+        study: The recording, before any effect was named.
         named: The effects named.
         gap: Before and after them.
-        alone: Poses that make most of the gap because no other pose predicts them; None: none do.
         remainder: What they leave.
         detectable: The smallest size of each effect that would have been found, metres.
-        missing: Untestable effects.
     """
-    remarks = ["" if alone is None else _alone(alone), _largest_component(gap, named)]
+    options, terms = study.options, named.refined_terms
+    remarks = [lone_poses(study, gap.floor), _largest_component(gap, named)]
     if not named.tested:
         remarks.append(
-            f"With {named.study.sums.num_units} poses effects are ranked but not tested; "
-            f"a test needs {named.study.options.tests.least_images}."
+            f"With {study.sums.num_units} poses effects are ranked but not tested; a test needs "
+            f"{options.tests.least_images}."
         )
     if named.names:
         remarks.append(_closed(gap))
     elif named.tested and not remainder.unknown:
         remarks.append(_nothing_found(detectable))
-    if len(named.refined_terms) == 1:
-        (term,) = named.refined_terms
-        remarks.append(f"A higher-order {term} term was added; too small to report.")
-    elif named.refined_terms:
-        terms = ", ".join(named.refined_terms)
-        remarks.append(f"Higher-order terms of {terms} were added; too small to report.")
-    small = remainder.scatter < named.study.options.target_gap_mm * 1e-3 / 2
+    if len(terms) == 1:
+        remarks.append(f"A higher-order {terms[0]} term was added; too small to report.")
+    elif terms:
+        many = ", ".join(terms)
+        remarks.append(f"Higher-order terms of {many} were added; too small to report.")
+    small = remainder.scatter < options.target_gap_mm / 2000
     if named.tested and not remainder.unknown and not small:
         remarks.append(
             f"The poses of camera or target scatter by {mm(remainder.scatter)} mm, which depends "
@@ -321,31 +319,50 @@ def list_remarks(
     remarks.append(moving_waves(named.study))
     if remainder.unknown and remainder.fingerprint:
         first, *more = remainder.fingerprint
-        remarks.append(
-            " ".join([f"The gap that remains {first}.", *(f"It {clause}." for clause in more)])
-        )
-    if missing:
-        remarks.append(f"Not tested (missing data): {', '.join(missing)}.")
+        clauses = [f"The gap that remains {first}.", *(f"It {clause}." for clause in more)]
+        remarks.append(" ".join(clauses))
+    if study.candidates.missing:
+        remarks.append(f"Not tested (missing data): {', '.join(study.candidates.missing)}.")
     return tuple(filter(None, remarks))
 
 
-def _alone(poses: LonePoses) -> str:
-    """Say that the gap is large because the recording says too little."""
-    frames, (near, far) = poses.frames, poses.distance
-    first, makes, these = f"Frame {frames[0]}", "makes", "this one"
-    if len(frames) > 1:
-        first = f"{len(frames)} poses, such as that of frame {frames[0]}"
+def lone_poses(study: Study, floor: float, *, alone_limit: float = 8.0, most: float = 0.5) -> str:
+    """Say which poses make most of the base model's gap because they are alone; else nothing.
+
+    Args:
+        study: The recording, before any effect was named.
+        floor: Noise of a pixel that is no gap, metres.
+        alone_limit: A pose is alone if a fit to all others misses it by so many times the mean
+            square that the fit to all poses leaves in it. Chosen: with 20 poses that are alike the
+            ratio is below 3.
+        most: Share of the squared gap, at least, that such poses make where they are worth a line.
+            Chosen.
+    """
+    square, count, ols = study.left_out_squares(()), study.sums.count, study.sums.ols
+    alone = square > alone_limit * ols.squares_at((), ols.solve(()).expand(len(count), -1))
+    beyond = square - floor**2 * count
+    gap = float(beyond.sum())
+    share = float(beyond[alone].sum()) / gap if gap > 0 else 0.0
+    if not share > most or bool(alone.all()):
+        return ""
+    others = max(float(beyond[~alone].sum() / count[~alone].sum()), 0.0) ** 0.5
+    distance = study.inputs.radial_distance[alone[study.unit_of_pixel]]
+    frame = int(alone[study.observations.unit].nonzero()[0])
+    start, makes, these = f"Frame {frame}", "makes", "this one"
+    if int(alone.sum()) > 1:
+        start = f"{int(alone.sum())} poses, such as that of frame {frame}"
         makes, these = "make", "these"
     return (
-        f"{first}, at {near:.1f} to {far:.1f} m, {makes} {percent(poses.share)} of the squared gap:"
-        f" the gap is what a fit to all other poses misses, and no other pose is like {these}. The "
-        f"others make {mm(poses.others)} mm. Record more poses there."
+        f"{start}, at {float(distance.min()):.1f} to {float(distance.max()):.1f} m, {makes} "
+        f"{percent(min(share, 1.0))} of the squared gap: the gap is what a fit to all other poses "
+        f"misses, and no other pose is like {these}. The others make {mm(others)} mm. Record more "
+        "poses there."
     )
 
 
 def _largest_component(gap: Gap, named: NamedEffects) -> str:
     # What noise may be all of, or is printed as 0.0 mm, is not shared out.
-    if float(mm(gap.before_interval[0])) == 0:
+    if float(mm(gap.before.interval[0])) == 0:
         return ""
     size, words = max(
         (gap.between_images, "shifts or tilts whole images"),
@@ -376,10 +393,10 @@ def moving_waves(study: Study) -> str:
 
 def _closed(gap: Gap) -> str:
     sentence = (
-        f"The effects close {percent(gap.closed)} {interval_words(gap.closed_interval)} of the "
+        f"The effects close {percent(gap.closed)} {interval_words(gap.closed.interval)} of the "
         "squared gap that recalibration leaves."
     )
-    if gap.closed_interval[0] <= 0:
+    if gap.closed.interval[0] <= 0:
         sentence += " Whether they help at all is not certain."
     if gap.hand_eye_shift[0] > 0:
         shift = mm(gap.hand_eye_shift[0])
@@ -408,20 +425,22 @@ def most_biased(groups: Mapping[str, Sequence[Region]]) -> list[tuple[str, Seque
     return sorted(groups.items(), key=order)
 
 
-def biases_of(regions: Sequence[Region]) -> list[float]:
+def biases_of(regions: Sequence[Region]) -> list[Estimated]:
     """Return the bias of each bin of a covariate, metres."""
     return [region.bias for region in regions if not region.trend]
-
-
-def _along(covariate: str, regions: Sequence[Region]) -> str:
-    """Return how the bias goes along a covariate; empty without a bin."""
-    biases, name = biases_of(regions), axis_label(covariate).split(",")[0]
-    return f"{name} it goes from {mm(min(biases))} to {mm(max(biases))} mm" if biases else ""
 
 
 def axis_label(covariate: str) -> str:
     """Return what a covariate is called on an axis, with its unit after a comma."""
     return _LABELS.get(covariate, covariate)
+
+
+def _along(covariate: str, regions: Sequence[Region], colon: str = "") -> str:
+    """Return how the bias goes along a covariate; by its trend without a bin."""
+    biases, name = biases_of(regions), axis_label(covariate).split(",")[0]
+    if not biases:
+        return f"{name}: it goes by {mm(regions[0].bias)} mm" if colon else ""
+    return f"{name}{colon} it goes from {mm(min(biases))} to {mm(max(biases))} mm"
 
 
 Finding = tuple[str, str]
@@ -430,9 +449,9 @@ Finding = tuple[str, str]
 
 def _stages(result: "DiagnosisResult") -> Finding:
     sizes = ", ".join(
-        f"{STAGE_WORDS[one.name]} {sized(one.gap, one.interval)}"
-        for one in result.stages_known
-        if one.gap is not None and one.interval is not None
+        f"{STAGE_WORDS[one.name]} {sized(one.gap, one.gap.interval)}"
+        for one in stages_shown(result)
+        if one.gap is not None
     )
     finding = f"The simulator differs from the recording by: {sizes}."
     if result.stages[0].gap is None:
@@ -444,31 +463,31 @@ def _stages(result: "DiagnosisResult") -> Finding:
 
 
 def _attribution(result: "DiagnosisResult") -> Finding:
-    study = result.evidence.study
-    shares = [f"{cause_words(study, one)} {share_words(one.share)}" for one in result.shares]
+    study, first = result.evidence.study, result.evidence.named.first
+    bars = [f"{cause_words(study, one)} {share_words(one.share)}" for one in result.shares]
     causes = [one for one in result.shares if one.kind != "unexplained"]
     finding = "No cause was found."
     if any(one.share for one in causes):
-        largest = _ordered(causes)[0]
-        finding = f"The largest cause is {cause_words(study, largest)} with "
-        finding += f"{share_words(largest.share)}."
+        largest = max(causes, key=lambda one: one.share)
+        words = cause_words(study, largest)
+        finding = f"The largest cause is {words} with {share_words(largest.share)}."
     if any(one.share < 0 and percent(one.share) != "0 %" for one in causes):
         finding += " A cause with a negative share cancels part of another."
-    closing = {entry.name: entry.closed_fraction for entry in result.ranking}
-    effects = [one for one in causes if one.kind == "effect" and one.cause in closing]
+    effects = [one for one in causes if one.kind == "effect" and one.name in first.tests]
     if any(abs(one.share) < _SMALL for one in effects) and result.stages[0].gap is not None:
-        each = [f"{effect_words(study, e.cause)} {share_words(closing[e.cause])}" for e in effects]
+        closed = {one.name: closed_gap(study, first, first.tests[one.name])[1] for one in effects}
+        each = [f"{effect_words(study, n)} {share_words(share)}" for n, share in closed.items()]
         finding += (
             " Effects are named for what recalibration leaves; of the square of that gap they "
             f"close, each alone: {', '.join(each)}."
         )
-    return finding, ", ".join(shares)
+    return finding, ", ".join(bars)
 
 
 def _where_as_given(result: "DiagnosisResult") -> Finding:
-    where = result.stages[0].found_where
-    finding = f"As given, the mean residual is {mm(float(where.offsets.mean()))} mm."
-    along = _along(*most_biased(where.by_covariate())[0])
+    stage = result.stages[0]
+    finding = f"As given, the mean residual is {mm(float(stage.offsets.mean()))} mm."
+    along = _along(*most_biased(stage.by_covariate())[0])
     return f"{finding} Along {along}." if along else finding, ""
 
 
@@ -476,17 +495,13 @@ def _where(result: "DiagnosisResult") -> Finding:
     strips = most_biased(result.where.by_covariate())
     if not strips or min(region.p_value for region in strips[0][1]) > SIGNIFICANT:
         return "After recalibration, the bias depends on no covariate at the 5 % level.", ""
-    covariate, regions = strips[0]
-    along = _along(covariate, regions).replace(" it goes", ": it goes")
-    if not along:
-        along = f"{axis_label(covariate).split(',')[0]}: it goes by {mm(regions[0].bias)} mm"
-    return f"After recalibration, the bias is clearest along {along}.", ""
+    return f"After recalibration, the bias is clearest along {_along(*strips[0], ':')}.", ""
 
 
 def _map(result: "DiagnosisResult") -> Finding:
     found = [
-        f"{STAGE_WORDS[one.name]} {int((one.found_where.tile_p_values <= SIGNIFICANT).sum())}"
-        for one in result.stages_known
+        f"{STAGE_WORDS[one.name]} {int((one.tile_p_values <= SIGNIFICANT).sum())}"
+        for one in stages_shown(result)
     ]
     tiles = int(np.isfinite(result.where.tiles).sum())
     sentence = f"Tiles that differ from zero, of {tiles} with data: {', '.join(found)}."
@@ -495,8 +510,9 @@ def _map(result: "DiagnosisResult") -> Finding:
 
 def _series(result: "DiagnosisResult") -> Finding:
     spread = [
-        f"{STAGE_WORDS[one.name]} {mm(float(one.found_where.offsets.std()))} mm"
-        for one in result.stages_fitted
+        f"{STAGE_WORDS[one.name]} {mm(float(one.offsets.std()))} mm"
+        for one in stages_shown(result)
+        if one.name != "as_given"
     ]
     return f"Standard deviation of the poses' means: {', '.join(spread)}.", ""
 
@@ -504,7 +520,7 @@ def _series(result: "DiagnosisResult") -> Finding:
 def _poses(result: "DiagnosisResult") -> Finding:
     if not result.effects:
         return "No effect is named, so all poses lie on the line.", ""
-    before, after = result.evidence.pose_errors
+    before, after = pose_errors(result)
     better = int((after < before).sum())
     return f"The effects bring {better} of {len(before)} held-out poses nearer.", ""
 

@@ -12,8 +12,8 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
-from tofcorr.diagnosis.findings.gap import Interval, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.where import Interval, interval_of
 from tofcorr.diagnosis.rerun.simulator import (
     fitted_distance,
     observed_by,

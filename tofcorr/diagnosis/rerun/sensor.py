@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording, RigidTransform
-from tofcorr.diagnosis.findings.gap import Interval, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE
+from tofcorr.diagnosis.findings.where import Interval, interval_of
 from tofcorr.diagnosis.rerun.checks import Excess, fitted_to
 from tofcorr.diagnosis.rerun.simulator import (
     NO_PATTERNS,
