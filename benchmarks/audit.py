@@ -263,8 +263,8 @@ def judge(name: str, case: Case, folder: Path) -> dict[str, Any]:
         return {"true": true, "refused": str(error), "judged": WARNING}
     gap = result.gap
     said = {
-        "before_mm": [1e3 * x for x in (gap.before, *gap.before_interval)],
-        "after_mm": [1e3 * x for x in (gap.after, *gap.after_interval)],
+        "before_mm": [1e3 * x for x in (gap.before, *gap.before.interval)],
+        "after_mm": [1e3 * x for x in (gap.after, *gap.after.interval)],
         "floor_mm": 1e3 * gap.floor,
         "sets": [list(members) for members in result.cause_sets],
         "likeliest": list(result.likeliest),

@@ -25,7 +25,7 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.findings.gap import TWO_SIDED, resampled
+from tofcorr.diagnosis.findings.gap import resampled
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.checks import Excess
@@ -42,6 +42,7 @@ from tofcorr.diagnosis.sums.noise import (
 from tofcorr.diagnosis.sums.observations import Observations, distance_images, effect_inputs
 from tofcorr.diagnosis.sums.observations import observe as observe_pixels
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.geometry.rays import radial_distance_from_z_depth, ray_directions
 from tofcorr.observables.dropouts import dropouts_of
 from tofcorr.observables.noise import noise_of
@@ -206,7 +207,7 @@ class DegradedGap:
         excess = self.degraded**2 - (most * self.with_effects) ** 2
         errors = (
             _error_of_square(self.degraded_interval),
-            most**2 * _error_of_square(stage.after_interval),
+            most**2 * _error_of_square(stage.after.interval),
             2 * FLOOR_ERROR * floor**2,
             2 * FLOOR_ERROR * (most * floor) ** 2,
         )
@@ -284,7 +285,7 @@ def degraded_gap(
 
 
 def _error_of_square(interval: tuple[float, float]) -> float:
-    return (interval[1] ** 2 - interval[0] ** 2) / (2 * TWO_SIDED)
+    return (interval[1] ** 2 - interval[0] ** 2) / (2 * student_quantile(0.975, math.inf))
 
 
 def _read(recording: Recording, frames: np.ndarray) -> Tensor:

@@ -86,9 +86,9 @@ def judge(case: Case, folder: Path) -> dict[str, Any]:
     before, after = true_gaps_mm(study, named, data.depth - case.truth.expected)
     true = {"before": before, "after": after, "closed": max(1 - (after / before) ** 2, 0.0)}
     said = {
-        "before": [1e3 * x for x in gap.before_interval],
-        "after": [1e3 * x for x in gap.after_interval],
-        "closed": list(gap.closed_interval),
+        "before": [1e3 * x for x in gap.before.interval],
+        "after": [1e3 * x for x in gap.after.interval],
+        "closed": list(gap.closed.interval),
     }
     held = {
         name: said[name][0] - EDGE_MM <= value <= said[name][1] + EDGE_MM

@@ -21,9 +21,15 @@ from benchmarks.renewed.geometry import Array
 from benchmarks.renewed.recording import read
 from benchmarks.sealed.answers import Outcome, entries_of, load
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.gap import Gap, draw_resamples, measure_gap
+from tofcorr.diagnosis.findings.gap import (
+    Gap,
+    OpenSet,
+    judge_remainder,
+    measure_gap,
+    name_in_two,
+    resampled,
+)
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder, name_in_two
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.linear_system import tile_sums
@@ -37,7 +43,8 @@ def diagnosed(
 ) -> tuple[Study, NamedEffects, Gap, OpenSet]:
     """Run the steps of `tofcorr diagnose` that name effects, measure gaps and judge the rest."""
     study = prepare(Recording.open(folder), options).study
-    resamples = draw_resamples(study, torch.Generator().manual_seed(options.seed + 1))
+    generator = torch.Generator().manual_seed(options.seed + 1)
+    resamples = resampled(study.sums.num_units, options.bootstraps, generator)
     named = name_in_two(study, resamples)
     gap = measure_gap(study, named, resamples)
     return study, named, gap, judge_remainder(study, named, gap)

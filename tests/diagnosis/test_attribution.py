@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.shares import (
-    Cause,
+    Share,
     Parts,
     scaled_shares,
     shapley_values,
@@ -85,15 +85,14 @@ def test_parts_that_cancel_share_what_is_explained_held_out() -> None:
 
 
 def _of_one_pose(
-    causes: list[Cause], columns: Tensor, residual: Tensor, prior: Tensor, *maps: Tensor
+    causes: list[Share], columns: Tensor, residual: Tensor, prior: Tensor, *maps: Tensor
 ) -> Parts:
     """Return parts of columns (size, columns) and maps (size,), and their fit to a residual."""
-    everything = torch.cat([columns, *(one[:, None] for one in maps), residual[:, None]], 1)
+    ones = torch.ones_like(residual)
+    everything = torch.stack([*columns.T, *maps, residual, ones], 1)
     return Parts(
         causes=tuple(causes),
         products=(everything.T @ everything)[None],
-        means=everything.sum(0)[None],
-        counts=torch.tensor([float(len(residual))]).double(),
         noise=torch.zeros(1).double(),
         start=torch.zeros(columns.shape[1]).double(),
         fitted=((columns.T @ columns)[None], (columns.T @ residual)[None], prior),
@@ -113,9 +112,9 @@ def _beside_base(
     causes = []
     for own in effects:
         ends.append(ends[-1] + own.shape[1])
-        causes.append(Cause(name="wiggling", kind="effect", members=tuple(range(*ends[-2:]))))
+        causes.append(Share(cause="wiggling", kind="effect", members=tuple(range(*ends[-2:]))))
     fixed = range(ends[-1], ends[-1] + len(maps))
-    causes += [Cause(name="fixed_pattern", kind="effect", fixed=place) for place in fixed]
+    causes += [Share(cause="fixed_pattern", kind="effect", fixed=place) for place in fixed]
     none = torch.zeros(columns.shape[1], columns.shape[1], dtype=torch.float64)
     return _of_one_pose(causes, columns, residual, none, *maps), residual
 
@@ -184,8 +183,8 @@ def _of_simulator(effects: list[Tensor], prior: float, residual: Tensor) -> Part
     precision = prior * torch.eye(columns.shape[1]).double()
     precision[0, 0] = 0.0
     names = [f"effect {k}" for k in range(1, columns.shape[1])]
-    causes = [Cause(name=n, kind="effect", members=(k,)) for k, n in enumerate(names, start=1)]
-    own = Cause(name="distance", kind="parameter", members=(0,))
+    causes = [Share(cause=n, kind="effect", members=(k,)) for k, n in enumerate(names, start=1)]
+    own = Share(cause="distance", kind="parameter", members=(0,))
     return _of_one_pose([own, *causes], columns, residual, precision)
 
 

@@ -70,7 +70,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_every_kind_of_term_can_be_the_base_of_a_diagnosis(kind: str, demo: Recording) -> None:
     found = diagnose(demo, config=_base(kind) | {"catalogue": ["wiggling", "lens"]})
     assert np.isfinite([found.gap.before, found.gap.after, found.gap.floor]).all()
-    assert {entry.name for entry in found.ranking} == {"wiggling", "lens"}
+    assert {test.name for test in found.ranking} == {"wiggling", "lens"}
     expected = ("lacks these terms", "as outliers")  # A base of one term misfits some pixels.
     assert all(any(words in warning for words in expected) for warning in found.warnings)
 

@@ -4,24 +4,23 @@ from dataclasses import replace
 
 import pytest
 import torch
-from diagnosis.comparisons import side_by_side
+from diagnosis.comparisons import effect_test, model_of, side_by_side
 
-from tofcorr.diagnosis.findings.cause_sets import (
-    GrowingModel,
-    _own_set,
-    _with_sizes,
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectComparison,
     cause_set,
     comparable,
-    significant_alone,
+    compare_effects,
     unexplained_squares,
     vary_alike,
 )
-from tofcorr.diagnosis.findings.effect_comparison import (
-    EffectComparison,
-    EffectTest,
-    compare_effects,
+from tofcorr.diagnosis.findings.naming import (
+    final_sets,
+    least_closed,
+    likeliest,
+    next_effect,
+    own_set,
 )
-from tofcorr.diagnosis.findings.naming import least_closed, likeliest, next_effect
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -108,24 +107,22 @@ def test_what_is_named_excludes_by_likelihood_what_is_no_simpler(
 def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study: Study) -> None:
     first = side_by_side({"distance": 8.0, "wiggling": 0.5})
     last = replace(first, squares=0 * first.squares)
-    alone = _own_set(GrowingModel(nothing_study, names=["distance"]), "distance", first, last)
-    both = GrowingModel(nothing_study, names=["distance", "wiggling"])
+    alone = own_set(model_of(nothing_study, names=("distance",)), "distance", first, last)
+    both = model_of(nothing_study, names=("distance", "wiggling"))
     beside = side_by_side({"distance": 8.0}, chosen=("wiggling",))
-    assert alone == _own_set(both, "distance", beside, last) == ["wiggling"]
+    assert alone == own_set(both, "distance", beside, last) == ["wiggling"]
 
 
-def test_a_set_says_what_each_member_closes_beside_the_first() -> None:
-    beside = side_by_side({"lens": 8.0, "pixel": 6.0}, chosen=("multipath",))
-    found = _with_sizes(["lens", "pixel", "multipath", "pixel"], beside)
-    assert found.members == ("lens", "pixel", "multipath")
-    assert found.closes == pytest.approx({"lens": 1.0, "pixel": 0.75})
-
-
-def test_a_cause_is_significant_by_itself_beside_one_of_the_models() -> None:
+def test_a_set_holds_what_is_significant_beside_a_model_and_says_what_each_closes(
+    nothing_study: Study,
+) -> None:
     """The gain is what an effect closes here; by chance it is at most one."""
-    before = side_by_side({"target_shape": 8.0, "lens": 0.5, "pixel": 0.9})
-    after = side_by_side({"lens": 1.5, "pixel": 0.5}, chosen=("target_shape",))
-    assert significant_alone([before, after], 0.05) == {"target_shape", "lens"}
+    before = side_by_side({"fixed_pattern": 8.0, "lens": 6.0, "pixel": 0.9, "multipath": 0.5})
+    after = side_by_side({"lens": 0.5, "pixel": 0.5, "multipath": 1.5}, chosen=("fixed_pattern",))
+    maps = {"fixed_pattern": ["fixed_pattern", "lens", "pixel", "multipath", "ambient_light"]}
+    model = model_of(nothing_study, names=("fixed_pattern",), map_sets=maps)
+    found = final_sets(model, [before, after])["fixed_pattern"]
+    assert found == pytest.approx({"fixed_pattern": 1.0, "lens": 0.75, "multipath": 0.0625})
 
 
 @pytest.mark.parametrize(
@@ -148,7 +145,6 @@ def test_the_likeliest_causes_are_large_and_significant_but_for_their_number(
     nothing_study: Study,
 ) -> None:
     square = nothing_study.system.sums.count * 1e-6
-    null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
     gains = {
         "lens": (4.0, 1.2),
         "pixel": (9.0, 0.8),
@@ -156,7 +152,7 @@ def test_the_likeliest_causes_are_large_and_significant_but_for_their_number(
         "amplitude": (0.5, 9.0),
     }
     tests = {
-        name: EffectTest(name=name, closed=closes * square, gain=gain, null=null, size=1)
+        name: effect_test(name, closes * square, gain=gain)
         for name, (closes, gain) in gains.items()
     }
     last = EffectComparison(chosen=(), squares=20 * square, tests=tests, probes={})
@@ -192,26 +188,25 @@ def test_a_weak_effect_beside_much_that_stays_unexplained_is_not_named(
     """It closes five square millimetres: more, or less, than a tenth of what then is left."""
     square = 1e-6 * nothing_study.system.sums.count
     noise = nothing_study.fit.floor**2 * nothing_study.system.sums.count
-    null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
-    lens = EffectTest(name="lens", closed=5 * square, gain=gain, null=null, size=5)
+    lens = effect_test("lens", 5 * square, gain=gain)
     compared = EffectComparison(
         chosen=(), squares=noise + (5 + left_mm2) * square, tests={"lens": lens}, probes={}
     )
-    found = next_effect(GrowingModel(nothing_study), compared, 1e-6)
+    found = next_effect(model_of(nothing_study, compared), 1e-6)
     assert (found is not None) == named
 
 
 def test_beside_an_effect_that_varies_alike_more_must_close_than_its_form_misses(
     nothing_study: Study,
 ) -> None:
-    model = GrowingModel(nothing_study, names=["multipath"])
+    model = model_of(nothing_study, names=("multipath",))
     gap = 1e-4  # Ten millimetres, squared.
     names = "target_shape", "multipath", "warm_up"
     large, itself, in_time = (least_closed(model, gap, name, further=True) for name in names)
     assert large == pytest.approx(gap / 16)
     tests = nothing_study.options.tests
     assert (itself, in_time) == pytest.approx(2 * ((tests.further_mm * 1e-3) ** 2,))
-    first = least_closed(GrowingModel(nothing_study), gap, "warm_up", further=False)
+    first = least_closed(model_of(nothing_study), gap, "warm_up", further=False)
     assert first == pytest.approx(gap * tests.material_share)
 
 
@@ -238,5 +233,5 @@ def test_what_an_effect_closes_beside_a_probe_may_be_a_form_of_the_unknown_cause
         lambda _, names: torch.tensor([4.0 if probe in names else 10.0]),
     )
     compared = side_by_side({name: closes}, chosen=(probe,))
-    found = next_effect(GrowingModel(nothing_study, probes={probe: 0.01}), compared, 1e-6)
+    found = next_effect(model_of(nothing_study, compared, probes={probe: 0.01}), 1e-6)
     assert (found is not None) == named

@@ -7,8 +7,6 @@ import torch
 
 from tofcorr.diagnosis.findings.gap import (
     Gap,
-    draw_resamples,
-    interval_of,
     measure_gap,
     resampled,
     squared_gaps,
@@ -16,13 +14,18 @@ from tofcorr.diagnosis.findings.gap import (
 )
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.structure import noise_floor
+from tofcorr.diagnosis.findings.where import interval_of
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.study import Study
 
 
+def _resamples(study: Study) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return resampled(study.sums.num_units, study.options.bootstraps, generator)
+
+
 def _measured(study: Study) -> Gap:
-    resamples = draw_resamples(study, torch.Generator().manual_seed(1))
-    return measure_gap(study, name_effects(study), resamples)
+    return measure_gap(study, name_effects(study), _resamples(study))
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +72,7 @@ def time_named(time_study: Study) -> NamedEffects:
 
 @pytest.fixture(scope="module")
 def time_gap(time_study: Study, time_named: NamedEffects) -> Gap:
-    resamples = draw_resamples(time_study, torch.Generator().manual_seed(1))
-    return measure_gap(time_study, time_named, resamples)
+    return measure_gap(time_study, time_named, _resamples(time_study))
 
 
 def test_a_floor_is_no_larger_than_what_is_left_inside_images(
@@ -90,18 +92,17 @@ def test_parts_of_the_gap_add_up_in_squares(time_gap: Gap) -> None:
 
 
 def test_resamples_scatter_around_the_gap_of_all_poses(time_gap: Gap) -> None:
-    assert np.median(time_gap.draws.before) == pytest.approx(time_gap.before, rel=0.05)
-    assert np.median(time_gap.draws.after) == pytest.approx(time_gap.after, abs=3e-4)
+    assert np.median(time_gap.before.draws) == pytest.approx(time_gap.before, rel=0.05)
+    assert np.median(time_gap.after.draws) == pytest.approx(time_gap.after, abs=3e-4)
 
 
 def test_no_gap_is_larger_than_what_is_left_with_the_noise(
     time_study: Study, time_named: NamedEffects
 ) -> None:
     """However little is known of the floor: it is not below zero."""
-    resamples = draw_resamples(time_study, torch.Generator().manual_seed(1))
     known = noise_floor(time_named)
     sure, unsure = (
-        np.array(squared_gaps(time_study, time_named, floor, resamples))
+        squared_gaps(time_study, time_named, floor, _resamples(time_study))
         for floor in (
             known._replace(error=0.0, structure=0.0),
             known._replace(error=9 * known.size**2, structure=9 * known.size**2),

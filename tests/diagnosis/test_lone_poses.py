@@ -1,6 +1,7 @@
 """A pose that alone shows a range of distances makes the gap large, and the report says so."""
 
 import csv
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,9 @@ from diagnosed_recordings import recorded
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.findings.gap import lone_poses
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.report.words import lone_poses
 
 # An error that the polynomials of the base model follow over some range, and miss beyond it.
 WIGGLING = {"name": "wiggling", "sin_4": 0.01}
@@ -54,20 +55,19 @@ def _with_one_more(far: Recording, near: Recording, folder: Path) -> Recording:
 
 def test_poses_that_others_are_like_are_not_alone(far: Recording) -> None:
     study = prepare(far, OPTIONS).study
-    assert lone_poses(study, study.fit.floor) is None
+    assert lone_poses(study, study.fit.floor) == ""
 
 
 def test_the_one_near_pose_is_named(far: Recording, tmp_path: Path) -> None:
     near = recorded(tmp_path / "near", 35, [WIGGLING], _changes((0.5, 0.55), 1))
     joined = _with_one_more(far, near, tmp_path / "joined")
-    study = prepare(joined, OPTIONS).study
-    found = lone_poses(study, study.fit.floor)
-    assert found is not None
-    assert found.frames == (far.num_frames,)
-    assert 0.4 < found.distance[0] < found.distance[1] < 1.0
-    assert found.share > 0.9
-
     result = diagnose(joined, config=OPTIONS)
-    assert found.others < result.gap.before / 3
     (words,) = [one for one in result.remarks if one.startswith(f"Frame {far.num_frames}, at")]
     assert "no other pose is like this one" in words
+    pattern = r"at ([0-9.]+) to ([0-9.]+) m, makes (\d+) % .* The others make ([0-9.]+) mm"
+    found = re.search(pattern, words)
+    assert found is not None
+    near, distant, share, others = map(float, found.groups())
+    assert 0.4 < near <= distant < 1.0
+    assert share > 90
+    assert others < 1e3 * result.gap.before / 3

@@ -8,23 +8,12 @@ import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosis.comparisons import effect_test, model_of
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.cause_sets import GrowingModel
-from tofcorr.diagnosis.findings.effect_comparison import (
-    EffectComparison,
-    EffectTest,
-    compare_effects,
-    least_p_value,
-)
-from tofcorr.diagnosis.findings.gap import draw_resamples, measure_gap
-from tofcorr.diagnosis.findings.naming import (
-    NamedEffects,
-    _refine,
-    name_effects,
-    simplest,
-)
-from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, least_p_value
+from tofcorr.diagnosis.findings.gap import OpenSet, judge_remainder, measure_gap, resampled
+from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects, refined, simplest
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.base_fit import SimulatorError
@@ -68,9 +57,9 @@ def test_an_error_carried_from_other_poses_hides_what_a_form_error_may_be(
 
 
 def _judged(study: Study, named: NamedEffects) -> OpenSet:
-    resamples = draw_resamples(study, torch.Generator().manual_seed(1))
-    gap = measure_gap(study, named, resamples)
-    return judge_remainder(study, named, gap)
+    generator = torch.Generator().manual_seed(1)
+    resamples = resampled(study.sums.num_units, study.options.bootstraps, generator)
+    return judge_remainder(study, named, measure_gap(study, named, resamples))
 
 
 @pytest.mark.parametrize(
@@ -100,36 +89,32 @@ def test_two_effects_are_both_named(tmp_path: Path) -> None:
 
 def test_nothing_is_named_where_nothing_is_missing(nothing_study: Study) -> None:
     named = name_effects(nothing_study)
-    assert (named.names, named.probes) == ((), ())
+    assert not (named.names or named.probes)
     assert not _judged(nothing_study, named).unknown
 
 
-def _test(name: str, closed: float, gain: float, size: int) -> EffectTest:
-    null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
-    half = torch.full((2,), closed / 2, dtype=torch.float64)
-    return EffectTest(name=name, closed=half, gain=gain, null=null, size=size)
-
-
 def test_of_causes_that_close_the_same_the_simplest_significant_one_is_named() -> None:
+    effects = {
+        "found": (1.0, 9.0, 7),
+        "simpler": (0.99, 8.0, 3),
+        "chance": (1.3, 0.2, 1),
+        "weaker": (0.7, 8.0, 1),
+    }
     tests = {
-        "found": _test("found", 1.0, 9.0, 7),
-        "simpler": _test("simpler", 0.99, 8.0, 3),
-        "chance": _test("chance", 1.3, 0.2, 1),
-        "weaker": _test("weaker", 0.7, 8.0, 1),
+        name: effect_test(name, closed * torch.ones(1).double(), gain=gain, size=size)
+        for name, (closed, gain, size) in effects.items()
     }
     comparison = EffectComparison(chosen=(), squares=torch.zeros(2), tests=tests, probes={})
     assert simplest(comparison, list(tests), 0.05) == "simpler"
 
 
 def test_a_refined_base_term_is_named_once_it_closes_much(time_study: Study) -> None:
-    model = GrowingModel(time_study, refined_terms=["integration_time", "distance"])
-    _refine(model, time_study.fit.floor**2)
-    assert (model.names, model.refined_terms) == (["integration_time"], ["distance"])
+    model = model_of(time_study, refined_terms=("integration_time", "distance"))
+    found = refined(model, time_study.fit.floor**2)
+    assert (found.names, found.refined_terms) == (("integration_time",), ("distance",))
 
 
 def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
-    from dataclasses import replace
-
     study = prepare(time_missing, DiagnosisOptions(), None).study
     options = study.options.model_copy(
         update={"tests": study.options.tests.model_copy(update={"least_images": 60})}
@@ -195,9 +180,7 @@ def test_a_significant_but_tiny_effect_is_no_gap(
 ) -> None:
     """Held-out likelihood may gain where millimetres do not."""
     closed = (closed_mm * 1e-3) ** 2 * nothing_study.system.sums.count
-    test = EffectTest(
-        name="lens", closed=closed, gain=50.0, null=torch.linspace(-1.0, 1.0, 19), size=4
-    )
+    test = effect_test("lens", closed, gain=50.0, null=torch.linspace(-1.0, 1.0, 19))
     comparison = EffectComparison(
         chosen=(), squares=nothing_study.system.sums.ols.square, tests={"lens": test}, probes={}
     )
@@ -205,25 +188,21 @@ def test_a_significant_but_tiny_effect_is_no_gap(
 
 
 def test_an_effect_that_comes_back_keeps_its_place(nothing_study: Study) -> None:
-    model = GrowingModel(nothing_study)
-    model.name("wiggling")
-    model.name("amplitude")
-    model.names.remove("wiggling")
-    model.name("wiggling")
-    assert model.names == ["wiggling", "amplitude"]
-    model.name("lens", instead_of="wiggling")
-    assert model.names == ["lens", "amplitude"]
-    model.name("wiggling")
-    assert model.names == ["wiggling", "lens", "amplitude"]
+    both = model_of(nothing_study).naming("wiggling").naming("amplitude")
+    again = replace(both, names=("amplitude",)).naming("wiggling")
+    assert again.names == ("wiggling", "amplitude")
+    swapped = again.naming("lens", instead_of="wiggling")
+    assert swapped.names == ("lens", "amplitude")
+    assert swapped.naming("wiggling").names == ("wiggling", "lens", "amplitude")
 
 
 def test_a_refined_base_term_is_not_named_without_being_significant(
     time_study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(EffectComparison, "family_p_value", lambda *_: 0.5)
-    model = GrowingModel(time_study, refined_terms=["integration_time"])
-    _refine(model, time_study.fit.floor**2)
-    assert (model.names, model.refined_terms) == ([], ["integration_time"])
+    model = model_of(time_study, refined_terms=("integration_time",))
+    found = refined(model, time_study.fit.floor**2)
+    assert (found.names, found.refined_terms) == ((), ("integration_time",))
 
 
 def test_an_effect_that_leads_back_to_an_earlier_model_is_not_tried_again(
@@ -232,32 +211,29 @@ def test_an_effect_that_leads_back_to_an_earlier_model_is_not_tried_again(
     """Two effects once dropped one another in turn, until the steps were spent."""
     steps: list[set[str]] = []
 
-    def dropping_the_other(model: GrowingModel, _: float) -> None:
+    def dropping_the_other(model: NamedEffects, _: float) -> NamedEffects:
         steps.append(set(model.names))
-        if len(model.names) > 1:
-            model.names.remove(model.order[0])
-            model.order.reverse()
+        first, *_ = model.order
+        left = tuple(name for name in model.names if name != first)
+        return replace(model, names=left, order=model.order[::-1])
 
-    def the_other(model: GrowingModel, *_: object, **__: object) -> tuple[EffectTest, bool] | None:
+    def the_other(model: NamedEffects, *_: object, **__: object) -> tuple[str, bool] | None:
         names = [name for name in ("saturation", "amplitude") if name not in model.names]
         names = [name for name in names if name not in model.rejected]
-        return (first.tests[names[0]], True) if names else None
+        return (names[0], True) if names else None
 
-    first = compare_effects(time_study, ())
     monkeypatch.setattr("tofcorr.diagnosis.findings.naming.next_effect", the_other)
-    monkeypatch.setattr("tofcorr.diagnosis.findings.naming._refine", dropping_the_other)
+    monkeypatch.setattr("tofcorr.diagnosis.findings.naming.refined", dropping_the_other)
     named = name_effects(time_study)
     assert named.names == ("amplitude",)
     assert steps == 2 * [{"saturation", "amplitude"}]
 
 
-@pytest.mark.parametrize(("p_value", "expected"), [(0.5, ["lens"]), (0.003, ["integration_time"])])
+@pytest.mark.parametrize(("p_value", "expected"), [(0.5, "lens"), (0.003, "integration_time")])
 def test_an_effect_is_swapped_for_a_better_one_only_if_that_is_significant(
-    p_value: float, expected: list[str], time_study: Study, monkeypatch: pytest.MonkeyPatch
+    p_value: float, expected: str, time_study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(EffectComparison, "family_p_value", lambda *_: p_value)
     monkeypatch.setattr("tofcorr.diagnosis.findings.naming.least_closed", lambda *_, **__: -1e9)
-    model = GrowingModel(time_study)
-    model.name("lens")
-    _refine(model, time_study.fit.floor**2)
-    assert model.names == expected
+    model = model_of(time_study).naming("lens")
+    assert refined(model, time_study.fit.floor**2).names == (expected,)

@@ -4,11 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from diagnosis.comparisons import effect_test, model_of
 
-from tofcorr.diagnosis.findings.cause_sets import GrowingModel
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.gap import name_in_two
 from tofcorr.diagnosis.findings.naming import next_effect
-from tofcorr.diagnosis.findings.open_set import name_in_two
 from tofcorr.diagnosis.sums.study import Study
 
 GAP = 4e-6  # Two millimetres, squared.
@@ -19,11 +19,10 @@ def _comparison(study: Study, closes: float, p_value: float) -> EffectComparison
     square = GAP * study.sums.count
     noise = study.fit.floor**2 * study.sums.count
     draws = torch.linspace(0.0, 1.0, 99, dtype=torch.float64)
-    lens = EffectTest(name="lens", closed=closes * square, gain=1.0 - p_value, null=draws, size=5)
+    lens = effect_test("lens", closes * square, gain=1.0 - p_value, null=draws)
     # It often gains more by chance than the lens does, in units of its own spread.
-    motion = EffectTest(
-        name="motion", closed=0 * square, gain=-1.0, null=draws.flip(0) ** 40 + draws**40, size=5
-    )
+    often = draws.flip(0) ** 40 + draws**40
+    motion = effect_test("motion", 0 * square, gain=-1.0, null=often)
     tests = {"lens": lens, "motion": motion}
     return EffectComparison(chosen=(), squares=noise + square, tests=tests, probes={})
 
@@ -42,14 +41,14 @@ def test_a_certain_gap_is_named_by_what_is_significant_alone_and_explains_most_o
 ) -> None:
     compared = _comparison(nothing_study, closes, p_value)
     assert compared.naming_p_value("lens") > 0.05
-    found = next_effect(GrowingModel(nothing_study), compared, GAP, certain=certain)
+    found = next_effect(model_of(nothing_study, compared), GAP, certain=certain)
     assert (found is not None) == named
 
 
 def test_a_second_effect_is_not_named_on_less_evidence(nothing_study: Study) -> None:
     compared = _comparison(nothing_study, 0.9, 0.02)
-    model = GrowingModel(nothing_study, names=["warm_up"])
-    assert next_effect(model, compared, GAP, certain=True) is None
+    model = model_of(nothing_study, compared, names=("warm_up",))
+    assert next_effect(model, GAP, certain=True) is None
 
 
 @pytest.mark.parametrize(
@@ -81,6 +80,6 @@ def test_effects_are_named_again_only_where_none_is_and_a_gap_is_certain(
         "judge_remainder": lambda *_: SimpleNamespace(unknown=unknown),
     }
     for name, function in replaced.items():
-        monkeypatch.setattr(f"tofcorr.diagnosis.findings.open_set.{name}", function)
+        monkeypatch.setattr(f"tofcorr.diagnosis.findings.gap.{name}", function)
     name_in_two(nothing_study, torch.ones(1, nothing_study.observations.num_units).double())
     assert asked == ([False, True] if again else [False])

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from tofcorr.diagnosis.findings.shares import Share
+from tofcorr.diagnosis.findings.where import Estimated
 from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.words import (
@@ -99,20 +100,22 @@ def looked_at(page: str, folder: Path) -> tuple[list[dict[str, Any]], str]:
 def with_simulator(result: DiagnosisResult) -> DiagnosisResult:
     """The same findings as if a simulator had been given, with many causes of long names."""
     _, second, third = result.stages
-    first = replace(second, name="as_given", gap=0.0336, interval=(0.0321, 0.0349))
+    given = Estimated(0.0336, interval=(0.0321, 0.0349))
+    first = replace(second, name="as_given", gap=given)
     names = ("distance", "row_column_pattern", "target_registration", "hand_eye", "pixel")
     shares = (1.2, 0.1, -0.2, -0.15, 0.04)
     known = [
-        Share(cause=name, kind="parameter", share=share, interval=(share - 0.1, share + 0.2))
+        Share(name, "parameter", share=Estimated(share, interval=(share - 0.1, share + 0.2)))
         for name, share in zip(names, shares, strict=True)
     ]
-    left = Share(cause="unexplained", kind="unexplained", share=0.01, interval=(0.0, 0.02))
+    share = Estimated(0.01, interval=(0.0, 0.02))
+    left = Share("unexplained", "unexplained", share=share)
     return replace(result, stages=(first, second, third), shares=(*known, left))
 
 
 def without_effects(result: DiagnosisResult) -> DiagnosisResult:
     """The same findings as if nothing had been named."""
-    left = Share(cause="unexplained", kind="unexplained", share=1.0, interval=(0.9, 1.0))
+    left = Share("unexplained", "unexplained", share=Estimated(1.0, interval=(0.9, 1.0)))
     return replace(result, effects=(), cause_sets=(), gap_steps=(), shares=(left,))
 
 
@@ -154,7 +157,7 @@ def test_the_browser_would_see_what_is_cut_silent_or_wrong(page: str, tmp_path: 
 def test_every_picture_of_every_kind_of_report_has_words(time_diagnosis: DiagnosisResult) -> None:
     for result in (with_simulator(time_diagnosis), without_effects(time_diagnosis), time_diagnosis):
         figures = result.all_figures()
-        assert ("where_as_given" in figures) == (result.stages[0].where is not None)
+        assert ("where_as_given" in figures) == (result.stages[0].gap is not None)
         assert FINDINGS.keys() - figures.keys() <= {"where_as_given"}
         shown = html.unescape(render(result))
         for name in figures:
@@ -181,8 +184,11 @@ def test_the_first_strip_is_the_one_that_the_text_beside_it_names(
     where = time_diagnosis.where
     times = [one for one in where.regions if one.covariate == "integration_time"]
     bins = [replace(one, p_value=0.003) for one in times if not one.trend]
-    line = replace(times[0], covariate="distance_m", trend=True, bias=1.0, p_value=0.003)
-    result = replace(time_diagnosis, where=replace(where, regions=(line, *bins)))
+    one = Estimated(1.0)
+    line = replace(times[0], covariate="distance_m", trend=True, bias=one, p_value=0.003)
+    given, _, last = time_diagnosis.stages
+    shown = replace(where, regions=(line, *bins))
+    result = replace(time_diagnosis, stages=(given, shown, last))
     told = FINDINGS["where"](result)[0]
     ends = [1e3 * pick(one.bias for one in bins) for pick in (min, max)]
     assert f"integration time: it goes from {ends[0]:.1f} to {ends[1]:.1f} mm." in told
@@ -234,9 +240,8 @@ def test_base_terms_and_their_higher_orders_have_names_of_their_own(
     study = time_diagnosis.evidence.study
     assert effect_words(study, "distance") == "distance (higher order)"
     assert effect_words(study, "wiggling") == "wiggling"
-    share = Share(cause="distance", kind="parameter", share=0.0004, interval=(0.0, 0.01))
-    assert cause_words(study, share) == "distance (base term)"
-    assert share_words(share.share) == "< 1 %"
+    assert cause_words(study, Share("distance", "parameter")) == "distance (base term)"
+    assert share_words(0.0004) == "< 1 %"
 
 
 def test_every_fitted_value_stands_on_the_page_as_in_the_sensor_file(

@@ -1,5 +1,6 @@
 """Flips of poses, with the model fitted to them again."""
 
+import pytest
 import torch
 
 from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
@@ -7,15 +8,16 @@ from tofcorr.diagnosis.findings.where import Flips, find_where
 from tofcorr.diagnosis.sums.study import Study
 
 
-def test_a_flip_is_the_sum_of_what_a_fit_to_flipped_pixels_leaves(time_study: Study) -> None:
+def test_a_flip_is_the_sum_of_what_a_fit_to_flipped_pixels_leaves(
+    time_study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Pixel by pixel, with the normal equations written out."""
     study, chosen = time_study, ()
     residual = left_out_residual(study, chosen, study.sums.ols)
     unit, weight = study.unit_of_pixel, study.weight
+    monkeypatch.setattr(Flips, "most_pixels", len(residual))
     flips = Flips(study, residual, chosen)
-    flips._step = 1
     columns = torch.cat(study.system.of(chosen), dim=1)
-    flips._weighted = columns * weight[:, None]
     layout, even = study.sums.layout, study.sums.scale
     share = even * study.fit.share[:, None] * columns
     place = (study.inputs.radial_distance > 1.0).long()
@@ -32,6 +34,6 @@ def test_a_flip_is_the_sum_of_what_a_fit_to_flipped_pixels_leaves(time_study: St
 
 def test_a_bias_that_the_model_absorbs_hides_none_that_it_does_not(time_study: Study) -> None:
     """An error of the exposure shows along it, and none along what the base model describes."""
-    found = find_where(time_study).by_covariate()
+    found = find_where(time_study, "recalibrated").by_covariate()
     assert min(region.p_value for region in found["integration_time"]) <= 0.02
     assert min(region.p_value for region in found["row"]) > 0.02

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.gap import draw_resamples
+from tofcorr.diagnosis.findings.gap import resampled
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
 from tofcorr.diagnosis.rerun.checks import fitted_to, measure_transfer, noisy_frames, observables_of
@@ -21,7 +21,11 @@ def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetr
 ) -> None:
     named = name_effects(nothing_study)
     generator = torch.Generator().manual_seed(1)
-    resamples = draw_resamples(nothing_study, torch.Generator().manual_seed(2))
+    resamples = resampled(
+        nothing_study.sums.num_units,
+        nothing_study.options.bootstraps,
+        torch.Generator().manual_seed(2),
+    )
     transfer = measure_transfer(nothing_study, named, None, generator, resamples)
     assert transfer is not None
     # Without an effect both simulators are one, and so are the corrections: also their noise.

@@ -4,14 +4,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.gap import hull
-from tofcorr.diagnosis.findings.shares import Cause, Parts, held_solution, hidden_shares, unchanged
+from tofcorr.diagnosis.findings.shares import Share, Parts, held_solution, hidden_shares, unchanged
 
 _POSES, _PIXELS = 24, 40
 _CAUSES = (
-    Cause(name="hand_eye", kind="parameter", members=(1,)),
-    Cause(name="distance", kind="parameter", members=(0, 2)),
-    Cause(name="drift", kind="effect", members=(3,)),
+    Share(cause="hand_eye", kind="parameter", members=(1,)),
+    Share(cause="distance", kind="parameter", members=(0, 2)),
+    Share(cause="drift", kind="effect", members=(3,)),
 )
 
 
@@ -28,17 +27,16 @@ def _columns(seed: int) -> tuple[Tensor, Tensor]:
 
 def _parts(columns: Tensor, residual: Tensor, least: float) -> Parts:
     """Return the parts of a residual (U, M); `least`, m^2, is what a change must close."""
-    everything = torch.cat([columns, residual[:, :, None]], dim=2)
+    beside = torch.stack([residual, torch.ones_like(residual)], dim=2)
+    everything = torch.cat([columns, beside], dim=2)
     products = everything.transpose(1, 2) @ everything
-    counts = torch.full((len(columns),), float(columns.shape[1]), dtype=torch.float64)
+    counts = products[:, -1, -1]
     return Parts(
         causes=_CAUSES,
         products=products,
-        means=everything.sum(1),
-        counts=counts,
         noise=torch.zeros_like(counts),
         start=torch.zeros(columns.shape[2], dtype=torch.float64),
-        fitted=(products[:, :-1, :-1], products[:, :-1, -1], 1e-9 * torch.eye(4).double()),
+        fitted=(products[:, :-2, :-2], products[:, :-2, -2], 1e-9 * torch.eye(4).double()),
         prior=1e-9 * torch.eye(4).double(),
         constant=0,
         least=dict.fromkeys(("hand_eye", "distance"), least * counts),
@@ -48,7 +46,7 @@ def _parts(columns: Tensor, residual: Tensor, least: float) -> Parts:
 def _shares(parts: Parts, *, sparse: bool = True) -> dict[str, float]:
     found = parts.refitted(torch.ones(_POSES).double(), sparse=sparse)
     values = found.values
-    names = [cause.name for cause in _CAUSES]
+    names = [cause.cause for cause in _CAUSES]
     return dict(zip(names, (values / values.sum()).tolist(), strict=True))
 
 
@@ -145,7 +143,3 @@ def test_each_parameter_has_a_threshold_of_its_own() -> None:
     groups = {"hand_eye": (1,), "distance": (0, 2)}
     least = {"hand_eye": 1e3, "distance": 1e-12}
     assert unchanged(normal, score, torch.zeros(4).double(), groups, least) == {"hand_eye"}
-
-
-def test_a_hull_contains_every_interval() -> None:
-    assert hull([(0.1, 0.4), (0.2, 0.7), (0.15, 0.3)]) == (0.1, 0.7)

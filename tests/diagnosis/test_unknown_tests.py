@@ -8,16 +8,18 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.gap import draw_resamples, measure_gap
-from tofcorr.diagnosis.findings.naming import name_effects
-from tofcorr.diagnosis.findings.open_set import (
-    _WEIGHTS,
-    _covariates,
-    _most_scatter,
+from tofcorr.diagnosis.findings.gap import (
+    OpenSet,
+    allowed_scatter,
+    bias_p_value,
     joined,
     judge_remainder,
+    measure_gap,
+    resampled,
 )
-from tofcorr.diagnosis.findings.where import Region
+from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.structure import coherence
+from tofcorr.diagnosis.findings.where import Estimated, Region
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.linear_system import pose_columns
@@ -35,7 +37,7 @@ def test_poses_of_a_poor_robot_are_no_unknown_cause_unless_a_better_one_was_stat
     recording = diagnosed_recordings.recorded(tmp_path / "poor", 50, [], POOR_ROBOT)
     study = prepare(recording, DiagnosisOptions(catalogue=("wiggling", "lens"))).study
     named = name_effects(study)
-    resamples = draw_resamples(study, torch.Generator().manual_seed(1))[:30]
+    resamples = resampled(study.sums.num_units, 30, torch.Generator().manual_seed(1))
     gap = measure_gap(study, named, resamples)
     left = judge_remainder(study, named, gap)
     assert named.names == ()
@@ -58,7 +60,8 @@ def test_poses_may_scatter_by_three_millimetres_and_three_milliradians(
         slope = (moved - predicted_distance(observations, pose)) / 1e-6
         squares += float((share * slope**2).sum() / share.sum())
     expected = 0.003**2 * (1 + squares)
-    assert _most_scatter(nothing_study) == pytest.approx(expected, rel=1e-3)
+    after = replace(coherence(nothing_study, nothing_study.fit.residual), between=1.0)
+    assert allowed_scatter(nothing_study, after) == pytest.approx(expected, rel=1e-3)
 
 
 def _bins(biases: list[float], p_value: float) -> dict[str, list[Region]]:
@@ -70,8 +73,7 @@ def _bins(biases: list[float], p_value: float) -> dict[str, list[Region]]:
                 covariate="distance_m",
                 low=place,
                 high=place + 1.0,
-                bias=bias,
-                interval=(bias - half, bias + half),
+                bias=Estimated(bias, interval=(bias - half, bias + half)),
                 p_value=p_value,
             )
             for place, bias in enumerate(biases)
@@ -80,17 +82,17 @@ def _bins(biases: list[float], p_value: float) -> dict[str, list[Region]]:
 
 
 def test_a_bias_along_a_covariate_counts_if_it_is_large_enough() -> None:
-    assert _covariates(_bins([1e-3, -1e-3], 0.004), 5e-4) == 0.004
-    assert _covariates(_bins([3e-4, -3e-4], 0.004), 5e-4) == 1.0
-    assert _covariates({}, 5e-4) == 1.0
+    assert bias_p_value(_bins([1e-3, -1e-3], 0.004), 5e-4) == 0.004
+    assert bias_p_value(_bins([3e-4, -3e-4], 0.004), 5e-4) == 1.0
+    assert bias_p_value({}, 5e-4) == 1.0
 
 
 def test_the_tests_share_the_level() -> None:
     """Each alone may reject at its share of the level; the shares add up to all of it."""
-    assert sum(_WEIGHTS.values()) == pytest.approx(1.0)
+    assert sum(OpenSet.weights.values()) == pytest.approx(1.0)
     level = 0.05
-    ones = dict.fromkeys(_WEIGHTS, 1.0)
-    for name, weight in _WEIGHTS.items():
+    ones = dict.fromkeys(OpenSet.weights, 1.0)
+    for name, weight in OpenSet.weights.items():
         assert joined(ones | {name: 0.999 * weight * level}) < level
         assert joined(ones | {name: 1.001 * weight * level}) > level
     assert joined(ones) == 1.0

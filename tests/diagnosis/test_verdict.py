@@ -1,12 +1,13 @@
 """Sentences of a verdict that must not contradict one another."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from tofcorr.diagnosis.findings.cause_sets import CauseSet
 from tofcorr.diagnosis.findings.shares import Share
+from tofcorr.diagnosis.findings.where import Estimated
 from tofcorr.diagnosis.report.words import effect_line, moving_waves, write_verdict
 
 NOTHING_NAMED: Any = SimpleNamespace(
@@ -15,25 +16,16 @@ NOTHING_NAMED: Any = SimpleNamespace(
     likeliest=(),
     study=SimpleNamespace(options=SimpleNamespace(target_gap_mm=1.0)),
 )
-ALL_UNEXPLAINED = [
-    Share(cause="unexplained", kind="unexplained", share=1.0, interval=(0.9, 1.0), of_constant=None)
-]
+ALL_UNEXPLAINED = [Share("unexplained", "unexplained", share=Estimated(1.0))]
 
 
 def gap_of(
     size: float, interval: tuple[float, float], floor: float, *, from_repeats: bool = True
 ) -> Any:
     """Return a gap that no effect closes, metres."""
-    return SimpleNamespace(
-        as_given=None,
-        as_given_interval=None,
-        before=size,
-        before_interval=interval,
-        after=size,
-        after_interval=interval,
-        floor=floor,
-        floor_from_repeats=from_repeats,
-    )
+    known = Estimated(size, interval=interval)
+    sizes = dict.fromkeys(("before", "after", "whole"), known)
+    return SimpleNamespace(as_given=None, floor=floor, floor_from_repeats=from_repeats, **sizes)
 
 
 LARGE_GAP = gap_of(9.5e-3, (7e-3, 12e-3), 2e-3)
@@ -43,7 +35,7 @@ LARGE_GAP = gap_of(9.5e-3, (7e-3, 12e-3), 2e-3)
 def test_a_name_on_less_evidence_is_said_to_be_one(certain: bool) -> None:
     named: Any = SimpleNamespace(
         names=("warm_up",),
-        sets=(CauseSet(("warm_up",), {}),),
+        sets={"warm_up": {"warm_up": 1.0}},
         certain=certain,
         study=SimpleNamespace(fit=SimpleNamespace(model=SimpleNamespace(groups=frozenset()))),
     )
@@ -84,20 +76,18 @@ def test_a_gap_that_scattering_poses_explain_is_not_called_small() -> None:
 
 def test_a_small_rest_does_not_read_as_nothing() -> None:
     """The page said < 1 % of what the verdict called 0 %."""
-    left = Share(
-        cause="unexplained", kind="unexplained", share=0.003, interval=(0, 0.01), of_constant=None
-    )
-    cause = Share(
-        cause="hand_eye", kind="parameter", share=0.997, interval=(0.9, 1.0), of_constant=None
-    )
+    left = Share("unexplained", "unexplained", share=Estimated(0.003))
+    cause = Share("hand_eye", "parameter", share=Estimated(0.997))
     remainder: Any = SimpleNamespace(unknown=False, scatter=0.0)
     verdict = write_verdict(NOTHING_NAMED, LARGE_GAP, remainder, [cause, left])
     assert "Shares of its square: hand_eye 100 %; < 1 % is unexplained." in verdict
 
 
-KNOWN: Any = SimpleNamespace(unknown=False)
-UNKNOWN: Any = SimpleNamespace(unknown=True)
-STUDY: Any = SimpleNamespace(fit=SimpleNamespace(model=SimpleNamespace(groups=set())))
+KNOWN: Any = SimpleNamespace(unknown=False, scatter=0.0)
+UNKNOWN: Any = SimpleNamespace(unknown=True, scatter=0.0)
+STUDY: Any = SimpleNamespace(
+    fit=SimpleNamespace(model=SimpleNamespace(groups=set())), options=NOTHING_NAMED.study.options
+)
 
 
 def test_a_large_gap_without_a_significant_cause_names_the_likeliest_ones() -> None:
@@ -129,7 +119,7 @@ def test_named_effects_that_may_be_one_are_said_to(
     named: Any = SimpleNamespace(
         names=("warm_up", "lens"),
         certain=False,
-        sets=[CauseSet(each, {}) for each in sets],
+        sets={each[0]: dict.fromkeys(each, 0.0) for each in sets},
         likeliest=(),
         study=STUDY,
     )
@@ -140,10 +130,10 @@ def test_a_cause_says_what_it_may_be_instead_and_an_error_in_the_form_of() -> No
     named: Any = SimpleNamespace(
         names=("warm_up", "room_temperature"),
         certain=False,
-        sets=[
-            CauseSet(("warm_up",), {}),
-            CauseSet(("room_temperature", "lens", "warm_up"), {"lens": 0.5}),
-        ],
+        sets={
+            "warm_up": {"warm_up": 1.0},
+            "room_temperature": {"room_temperature": 1.0, "lens": 0.5, "warm_up": math.nan},
+        },
         study=SimpleNamespace(fit=STUDY.fit, candidates=SimpleNamespace(effects={})),
     )
     line = effect_line(named, "room_temperature")

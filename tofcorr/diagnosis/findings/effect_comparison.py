@@ -30,7 +30,7 @@ from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.inputs import VELOCITY
 from tofcorr.simulation.effects.numerics import by_frame

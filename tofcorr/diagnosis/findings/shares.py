@@ -49,7 +49,7 @@ from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.base import Term
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
 
@@ -60,11 +60,11 @@ HAND_EYE = "hand_eye"
 
 
 @dataclass(frozen=True)
-class Cause:
+class Share:
     """One cause of the gap, and its share in the square of the gap.
 
     Attributes:
-        name: `hand_eye`, a group of the base model's terms, an effect, or `unexplained`.
+        cause: `hand_eye`, a group of the base model's terms, an effect, or `unexplained`.
         kind: Parameter of the simulator, effect, or the unexplained.
         members: Numbers of its columns.
         offset: What it adds beyond its columns, shape (M,), metres: what is not linear, or was
@@ -75,7 +75,7 @@ class Cause:
             it; None for causes that have none.
     """
 
-    name: str
+    cause: str
     kind: Literal["parameter", "effect", "unexplained"]
     members: tuple[int, ...] = ()
     offset: Tensor | None = None
@@ -84,7 +84,7 @@ class Cause:
     of_constant: float | None = None
 
 
-def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Cause]:
+def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Share]:
     """Return the causes; an effect and the base term that it refines are one.
 
     Args:
@@ -113,8 +113,10 @@ def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Ca
     for name in named.names:  # They come last.
         members[name] = (*members.pop(name, ()), *places.get(name, ()))
         offsets[name] = _beyond_columns(study, named, name)
-    kinds = dict.fromkeys(named.names, "effect")
-    return [Cause(n, kinds.get(n, "parameter"), own, offsets.get(n)) for n, own in members.items()]
+    return [
+        Share(name, "effect" if name in named.names else "parameter", own, offsets.get(name))
+        for name, own in members.items()
+    ]
 
 
 def _cause_of(term: Term) -> str:
@@ -230,7 +232,7 @@ class Parts:
             (U,).
     """
 
-    causes: tuple[Cause, ...]
+    causes: tuple[Share, ...]
     products: Tensor
     noise: Tensor
     start: Tensor
@@ -252,7 +254,7 @@ class Parts:
         gram, score, prior = self.fitted
         normal, right = torch.tensordot(weights, gram, dims=1) + prior, weights @ score
         held: frozenset[str] = frozenset()
-        groups = {c.name: c.members for c in self.causes if c.name in self.least and c.members}
+        groups = {c.cause: c.members for c in self.causes if c.cause in self.least and c.members}
         if sparse and groups:
             least = {name: float(weights @ self.least[name]) for name in groups}
             held = unchanged(normal, right, self.start, groups, least)
@@ -261,7 +263,7 @@ class Parts:
         coefficients = torch.zeros(len(self.causes), len(products) - 2, dtype=torch.float64)
         coefficients[:, : len(theta)] = self.owned * theta
         for row, cause in zip(coefficients, self.causes, strict=True):
-            if cause.fixed is not None and cause.name not in held:
+            if cause.fixed is not None and cause.cause not in held:
                 row[cause.fixed] = 1.0
         owner = [self.constant in cause.members for cause in self.causes]
         if any(owner):
@@ -352,7 +354,7 @@ def parts_of(
     else:
         start[: model.num_hand_eye] = twist_of(study)
         start[model.num_geometry : model.num_columns] = study.fit.coefficients
-    causes = list[Cause]()
+    causes = list[Share]()
     for cause in causes_of(study, named, parameters=residual is not None):
         fixed = None
         if cause.offset is not None:
@@ -372,7 +374,7 @@ def parts_of(
         prior=fitted[2] / sums.scale,
         constant=model.num_geometry,
         least={
-            cause.name: pose * (second if cause.name == HAND_EYE else least)
+            cause.cause: pose * (second if cause.cause == HAND_EYE else least)
             for cause in causes
             if cause.kind == "parameter"
         },
@@ -448,7 +450,7 @@ def values_beside_base(parts: Parts, weights: Tensor) -> Tensor:
     return values / products[:, -1:, -1]
 
 
-def _left(parts: Parts, products: Tensor, causes: list[Cause]) -> Tensor:
+def _left(parts: Parts, products: Tensor, causes: list[Share]) -> Tensor:
     """Return the sum of squares that base model and some effects leave, shape (B,), m^2.
 
     Args:
@@ -468,7 +470,7 @@ def _left(parts: Parts, products: Tensor, causes: list[Cause]) -> Tensor:
     return square - (theta * (2 * right - (gram @ theta[..., None])[..., 0])).sum(1)
 
 
-def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Cause, ...]:
+def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     """Share out the square of the gap as given; without a simulator, of the gap of the base model.
 
     Args:
@@ -506,7 +508,7 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Cause, ...]:
     # What resamples do not show is added in quadrature to either half of an interval.
     beside = [*map(math.hypot, hidden_shares(parts, best, unexplained), shrunk), 0.0]
     found = []
-    for place, cause in enumerate((*parts.causes, Cause("unexplained", "unexplained"))):
+    for place, cause in enumerate((*parts.causes, Share("unexplained", "unexplained"))):
         share = float(shares[place])
         ends = [end for each in draws for end in interval_of(each[:, place].tolist(), share)]
         below, above = (math.hypot(end - share, beside[place]) for end in (min(ends), max(ends)))

@@ -146,7 +146,7 @@ def _observations(
     """
     old = study.observations
     ends = [old.frame_ends[frame] for frame in source.tolist()]
-    places = [torch.arange(*end, max(1, (end[1] - end[0]) // per_frame)) for end in ends]
+    places = [torch.arange(low, end, max(1, (end - low) // per_frame)) for low, end in ends]
     place = torch.cat(places)
     made = replace(
         old.at(place),
@@ -370,6 +370,6 @@ def _advised(
     raw = signal(study, effect) / (columns * ols.scale * float(study.sums.count.sum()))
     needed = noncentrality(named.first.tests[effect], named.first.critical_score(0.05))
     now, then = ((raw * needed / max(one, TINY)) ** 0.5 for one in (before, after))
-    if now < 1:  # A metre is no error of a depth camera.
+    if before > 0 and now < 1:  # A metre is no error of a depth camera.
         advice += f" from {1e3 * then:.1f} mm on, instead of {1e3 * now:.1f} mm"
     return advice + "."

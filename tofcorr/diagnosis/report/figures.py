@@ -27,7 +27,7 @@ from tofcorr.diagnosis.report.words import (
     share_words,
     stages_shown,
 )
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.observables.figures import BLUE, FAINT, GREY, RED, line_across, panels
 from tofcorr.observables.figures import drawings as observable_drawings
 

@@ -34,7 +34,7 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
             for stage in result.stages
         ],
         "attribution": [
-            {"cause": one.name, "kind": one.kind, "share": round(one.share, 4)}
+            {"cause": one.cause, "kind": one.kind, "share": round(one.share, 4)}
             | {"ci": _rounded(one.share.interval)}
             | ({} if one.of_constant is None else {"of_constant": round(one.of_constant, 4)})
             for one in result.shares

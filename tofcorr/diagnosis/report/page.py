@@ -182,7 +182,7 @@ def write_events(result: DiagnosisResult, folder: Path | str) -> None:
     numbers = {f"stage_mm/{stage.name}": 1e3 * (stage.gap or 0.0) for stage in known_stages}
     numbers |= {f"gap_mm/{part}": 1e3 * getattr(gap, part) for part in ("before", "after", "floor")}
     numbers |= {f"score/{entry.name}": entry.score for entry in result.ranking}
-    numbers |= {f"share/{cause.name}": cause.share for cause in result.shares}
+    numbers |= {f"share/{cause.cause}": cause.share for cause in result.shares}
     curves: dict[str, list[float]] = {}
     for stage in stages_shown(result):
         curves[f"pose_mm/{stage.name}"] = stage.offsets.tolist()

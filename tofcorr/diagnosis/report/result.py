@@ -10,7 +10,7 @@ from tofcorr.diagnosis.findings.effect_comparison import EffectTest
 from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.outliers import Outliers
-from tofcorr.diagnosis.findings.shares import Cause
+from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Estimated, Stage
 from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -88,7 +88,7 @@ class DiagnosisResult:
     remarks: tuple[str, ...]
     simulator_kind: SimulatorKind
     stages: tuple[Stage, Stage, Stage]
-    shares: tuple[Cause, ...]
+    shares: tuple[Share, ...]
     warnings: tuple[str, ...]
     detected: bool
     p_value: float

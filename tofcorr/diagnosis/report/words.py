@@ -11,7 +11,7 @@ from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.findings.effect_comparison import closed_gap
 from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.shares import HAND_EYE, Cause
+from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
 from tofcorr.diagnosis.findings.where import Estimated, Interval, Region, Stage
 from tofcorr.diagnosis.rerun.simulator import solution_of
 from tofcorr.diagnosis.sums.observations import TINY
@@ -56,13 +56,13 @@ def effect_words(study: Study, name: str) -> str:
     return f"{name} (higher order)" if refined else name
 
 
-def cause_words(study: Study, cause: Cause) -> str:
+def cause_words(study: Study, cause: Share) -> str:
     """Return the name of a cause in an attribution: which kind of term it is."""
-    if cause.name == HAND_EYE:
+    if cause.cause == HAND_EYE:
         return "hand-eye transform"
-    if cause.name in CATALOGUE and cause.kind == "parameter":
-        return f"{cause.name} (base term)"
-    words = effect_words(study, cause.name)
+    if cause.cause in CATALOGUE and cause.kind == "parameter":
+        return f"{cause.cause} (base term)"
+    words = effect_words(study, cause.cause)
     return words if study.fit.known is None else words.replace("(higher", "(base, higher")
 
 
@@ -130,7 +130,7 @@ def p_words(value: float, least: float) -> str:
 
 
 def write_verdict(
-    named: NamedEffects, gap: Gap, remainder: OpenSet, causes: Sequence[Cause]
+    named: NamedEffects, gap: Gap, remainder: OpenSet, causes: Sequence[Share]
 ) -> str:
     """Return the finding in three sentences: the gap as given, what it consists of, what remains.
 
@@ -148,7 +148,7 @@ def write_verdict(
         f"{start} differs from the recording by {sized(gap.whole, gap.whole.interval)}, in excess "
         f"of a noise of {mm(gap.floor)} mm{bound}."
     )
-    shares = {one.name: one.share for one in causes if abs(one.share) >= 1 / 100}
+    shares = {one.cause: one.share for one in causes if abs(one.share) >= 1 / 100}
     left = next(one.share for one in causes if one.kind == "unexplained")
     shares.pop("unexplained", None)
     made_of = ""
@@ -231,7 +231,7 @@ def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     return f"{start}, and {nothing}{': calibrate it' if gap.as_given else ''}."
 
 
-def list_causes(study: Study, named: NamedEffects, causes: Sequence[Cause]) -> tuple[str, ...]:
+def list_causes(study: Study, named: NamedEffects, causes: Sequence[Share]) -> tuple[str, ...]:
     """Return a line for each cause, the largest share first."""
     # A parameter that was left as the simulator has it causes nothing.
     shown = (one for one in causes if one.kind == "effect" or one.share or any(one.share.interval))
@@ -239,14 +239,14 @@ def list_causes(study: Study, named: NamedEffects, causes: Sequence[Cause]) -> t
     return tuple(_cause_line(study, named, one) for one in ordered if one.kind != "unexplained")
 
 
-def _cause_line(study: Study, named: NamedEffects, one: Cause) -> str:
+def _cause_line(study: Study, named: NamedEffects, one: Share) -> str:
     share = f"{share_words(one.share)} {interval_words(one.share.interval)}"
     line = f"{cause_words(study, one)}: {share} of the squared gap"
     if one.of_constant is not None and one.of_constant > _SMALL:
         line += f" ({percent(one.of_constant)} by a constant offset, which any cause may have)"
     if one.kind == "effect":
-        return f"{line}; {effect_line(named, one.name)}."
-    if one.name != HAND_EYE or study.fit.known is None:
+        return f"{line}; {effect_line(named, one.cause)}."
+    if one.cause != HAND_EYE or study.fit.known is None:
         return f"{line}; a parameter of the simulator's error model."
     given = study.fit.known.tool_from_camera
     moved = se3.log(se3.inverse(given) @ solution_of(study, named)[0])
@@ -473,9 +473,9 @@ def _attribution(result: "DiagnosisResult") -> Finding:
         finding = f"The largest cause is {words} with {share_words(largest.share)}."
     if any(one.share < 0 and percent(one.share) != "0 %" for one in causes):
         finding += " A cause with a negative share cancels part of another."
-    effects = [one for one in causes if one.kind == "effect" and one.name in first.tests]
+    effects = [one for one in causes if one.kind == "effect" and one.cause in first.tests]
     if any(abs(one.share) < _SMALL for one in effects) and result.stages[0].gap is not None:
-        closed = {one.name: closed_gap(study, first, first.tests[one.name])[1] for one in effects}
+        closed = {one.cause: closed_gap(study, first, first.tests[one.cause])[1] for one in effects}
         each = [f"{effect_words(study, n)} {share_words(share)}" for n, share in closed.items()]
         finding += (
             " Effects are named for what recalibration leaves; of the square of that gap they "
