@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.shares import (
-    Share,
     Parts,
+    Share,
     scaled_shares,
     shapley_values,
     shrinkage_of_values,

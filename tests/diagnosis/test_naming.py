@@ -89,7 +89,7 @@ def test_two_effects_are_both_named(tmp_path: Path) -> None:
 
 def test_nothing_is_named_where_nothing_is_missing(nothing_study: Study) -> None:
     named = name_effects(nothing_study)
-    assert not (named.names or named.probes)
+    assert named.names == named.with_probes == ()
     assert not _judged(nothing_study, named).unknown
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.shares import Share, Parts, held_solution, hidden_shares, unchanged
+from tofcorr.diagnosis.findings.shares import Parts, Share, held_solution, hidden_shares, unchanged
 
 _POSES, _PIXELS = 24, 40
 _CAUSES = (
@@ -53,7 +53,7 @@ def _shares(parts: Parts, *, sparse: bool = True) -> dict[str, float]:
 def _truth(columns: Tensor, theta: Tensor) -> dict[str, float]:
     """Return the share of every cause in the square of the sum; means count as distance."""
     parts = {
-        c.name: (columns[:, :, list(c.members)] @ theta[list(c.members)]).ravel() for c in _CAUSES
+        c.cause: (columns[:, :, list(c.members)] @ theta[list(c.members)]).ravel() for c in _CAUSES
     }
     constant = sum(float(part.mean()) for part in parts.values())
     parts = {name: part - part.mean() for name, part in parts.items()}
