@@ -100,7 +100,7 @@ def _fitted_mount(data: Path, mount: str, folder: Path) -> dict[str, Any]:
 def _imported(data: Path, mount: str, walls: tuple[str, ...], folder: Path) -> "Recording":
     """Import as `tofcorr import distances` does."""
     from tofcorr import Recording
-    from tofcorr.importing.distances.command import command as distances
+    from tofcorr.importing.distances import command as distances
 
     out = folder / "_".join((mount, *walls))
     sources = [str(data / f"L3CX_{wall}_{mount}") for wall in walls]

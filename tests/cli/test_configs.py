@@ -129,7 +129,7 @@ def test_the_shell_completes_commands_and_configurations() -> None:
 
 def test_completion_says_of_a_command_what_the_list_of_commands_says() -> None:
     assert completed("tofcorr ev", "zsh") == ["plain", "evaluate", COMMANDS["evaluate"]]
-    importer = IMPORTERS["bop"].summary
+    importer = IMPORTERS["bop"]
     assert completed("tofcorr import bo", "zsh") == ["plain", "bop", importer]
 
 

@@ -12,13 +12,14 @@ from importing.walls.rendered_room import (
     Camera,
     Room,
     hand_eye_anywhere,
+    imported,
     intrinsics,
     poses_in_room,
 )
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
-from tofcorr.data.writing import write_recording
+from tofcorr.data.writing import RecordingWriter, write_recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -31,7 +32,7 @@ from tofcorr.diagnosis.sums.base_model import (
 from tofcorr.diagnosis.sums.observations import observe, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.walls.recording import import_walls
+from tofcorr.importing.robot_images import PosedOptions
 
 QUICK = DiagnosisOptions(bootstraps=20, simulate_anew=False, page=False)
 EFFECTS: dict[str, dict[str, Any]] = {
@@ -46,8 +47,31 @@ EFFECTS: dict[str, dict[str, Any]] = {
 
 def with_walls_found(recording: Recording) -> Recording:
     """Return the recording as an importer leaves it, its plane found in the depth."""
-    out = recording.path.with_name(f"{recording.path.name}_walls")
-    import_walls(recording, out)
+    out, table = recording.path.with_name(f"{recording.path.name}_walls"), recording.frames
+    options = PosedOptions(
+        depth_kind=recording.depth_kind, saturation_amplitude=recording.saturation_amplitude
+    )
+    images = (recording.camera, table.world_from_tool, recording.depth, recording.amplitude)
+    found, report = imported(out.with_suffix(".plain"), *images, options=options)
+    image = np.array([int(view["view"]) for view in report["views"]])
+    ids = image if table.pose_id is None else table.pose_id[image]
+    # An importer knows no conditions of a frame: they are those of its image.
+    with RecordingWriter.with_header_of(out, found) as writer:
+        for frame, number in enumerate(image):
+            plane = found.frames.row(frame)
+            row = replace(
+                table.row(number),
+                normal_world=plane.normal_world,
+                offset=plane.offset,
+                target=plane.target,
+                pose_id=str(ids[frame]),
+            )
+            parts = {
+                name: array[number]
+                for name in ("depth", "amplitude", "raw")
+                if (array := getattr(recording, name)) is not None
+            }
+            writer.append(row=row, mask=np.asarray(found.mask)[frame], **parts)
     return Recording.open(out)
 
 

@@ -13,7 +13,7 @@ PAGES = sorted((ROOT / "docs" / "how-to").glob("add-*.md"))
 END_OF_LIST = {
     "error_terms": ")\n\n\ndef _class",
     "simulation": ")\n\n\ndef _effect",
-    "importing": ")\n\nIMPORTERS",
+    "importing": '}\n"""The line of each',
     "correction": ")\n\nFORMATS",
 }
 

@@ -16,7 +16,7 @@ from tofcorr.importing.images import DepthCoding
 from tofcorr.importing.pose_files import read_poses
 from tofcorr.importing.robot_images import look
 from tofcorr.importing.rosbag.source import open_bag
-from tofcorr.importing.run import no_progress
+from tofcorr.importing.run import Sieve
 
 Damage = tuple[int, float, float, bytes]
 """What is done: an operation, where it begins and ends (shares of the file), and new bytes."""
@@ -76,7 +76,7 @@ def read_bag(path: Path) -> None:
     frames = {"base_frame": bags.BASE, "tool_frame": bags.TOOL}
     topics = {"amplitude_topic": bags.INFRARED}
     with open_bag(path, bags.DEPTH, DepthCoding(), **frames, **topics) as images:
-        look(images, no_progress)
+        look(images, Sieve("bag"))
 
 
 def survives(read: Callable[[Path], object], path: Path, content: bytes) -> None:

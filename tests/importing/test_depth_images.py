@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.images import DepthCoding, DepthImage, amplitude_counts, read_array
+from tofcorr.importing.images import (
+    DepthCoding,
+    DepthImage,
+    coded_image,
+    of_size,
+    read_array,
+)
 from tofcorr.importing.run import RefusedViewError
 
 CAMERA = CameraIntrinsics(
@@ -18,7 +24,7 @@ FITS, TURNED = np.ones((3, 4), np.float32), np.ones((4, 3), np.float32)
 
 def test_an_image_of_the_size_of_the_intrinsics_is_taken_as_it_is() -> None:
     for image in (DepthImage(FITS), DepthImage(FITS, FITS)):
-        assert image.of(CAMERA) is image
+        assert of_size(image, CAMERA) is image
 
 
 @pytest.mark.parametrize(
@@ -29,16 +35,18 @@ def test_an_image_of_the_size_of_the_intrinsics_is_taken_as_it_is() -> None:
 def test_an_image_of_another_size_is_refused_with_both_sizes(image: DepthImage, what: str) -> None:
     message = f"its {what} has 3x4 pixels, the intrinsics hold for 4x3"
     with pytest.raises(RefusedViewError, match=f"^{re.escape(message)}$"):
-        image.of(CAMERA)
+        of_size(image, CAMERA)
 
 
 def test_amplitudes_turn_with_the_images_and_keep_their_counts() -> None:
     counts = np.arange(12, dtype=np.uint16).reshape(3, 4)
-    found = amplitude_counts(counts, DepthCoding(rotate=90), "a.png")
+    depth = np.ones((3, 4)), "d.png"
+    found = coded_image(DepthCoding(rotate=90), depth, (counts, "a.png")).amplitude
+    assert found is not None
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, np.rot90(counts, -1))
     with pytest.raises(RefusedViewError, match=r"^a.png has 8 bits a pixel; .* as amplitude$"):
-        amplitude_counts(counts.astype(np.uint8), DepthCoding(), "a.png")
+        coded_image(DepthCoding(), depth, (counts.astype(np.uint8), "a.png"))
 
 
 def _write_exr(path: Path, names: tuple[str, ...]) -> None:

@@ -98,7 +98,7 @@ def test_an_azure_kinect_s_calibration_holds_for_all_its_modes(
 
 def test_an_azure_kinect_has_no_other_sizes(tmp_path: Path) -> None:
     path = write_text(tmp_path, json.dumps(azure_kinect()), "k4a.json")
-    with pytest.raises(CalibrationDataError, match=r"640x576.*these have 512x424"):
+    with pytest.raises(CalibrationDataError, match=r"640x576.*the images have 512x424"):
         read_intrinsics(path).camera((512, 424))
 
 

@@ -125,8 +125,7 @@ def _table(plan: "PosePlan", start: "np.ndarray") -> str:
 @click.group(
     cls=LazyGroup,
     lazy={
-        name: (f"importing.{importer.module}:command", importer.summary)
-        for name, importer in IMPORTERS.items()
+        name: (f"importing.{name}:command", summary) for name, summary in IMPORTERS.items()
     },
     context_settings={"help_option_names": ["-h", "--help"]},
 )

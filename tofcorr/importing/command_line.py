@@ -91,6 +91,12 @@ intrinsics_options = _adding(
 )
 """Adds the options that say where the camera intrinsics come from."""
 
+pose_format_option = click.option(
+    "--pose-format",
+    type=click.Choice(["tum", "csv", "matrix", "matrices", "moveit"]),
+    help="Left out: told from the file.",
+)
+
 coding_options = _adding(
     click.option(
         "--depth-unit-mm",
@@ -180,12 +186,8 @@ def take_intrinsics(given: dict[str, Any]) -> "GivenIntrinsics | None":
     return intrinsics_from_numbers(focal, centre, distortion or (), source)
 
 
-def take_coding(given: dict[str, Any], where: str) -> "DepthCoding":
+def take_coding(given: dict[str, Any]) -> "DepthCoding":
     """Remove the options of `coding_options` from `given` and return what they say.
-
-    Args:
-        given: Click's values.
-        where: The command, for messages.
 
     Raises:
         ConfigError: A value is not allowed.
@@ -193,15 +195,14 @@ def take_coding(given: dict[str, Any], where: str) -> "DepthCoding":
     from tofcorr.importing.images import DepthCoding
 
     values = {key: given.pop(key) for key in ("unit_mm", "invalid", "big_endian", "rotate")}
-    return DepthCoding.from_mapping(values | {"rotate": int(values["rotate"])}, where)
+    return DepthCoding.from_mapping(values | {"rotate": int(values["rotate"])}, _command_name())
 
 
-def take_posed_options(given: dict[str, Any], where: str, camera_frame: str = "") -> "PosedOptions":
+def take_posed_options(given: dict[str, Any], camera_frame: str = "") -> "PosedOptions":
     """Remove the options of `posed_options` from `given` and return what they say.
 
     Args:
         given: Click's values.
-        where: The command, for messages.
         camera_frame: What the images call the camera's frame; empty if they do not.
 
     Raises:
@@ -221,7 +222,13 @@ def take_posed_options(given: dict[str, Any], where: str, camera_frame: str = ""
         *("eye_to_hand", "depth_kind", "time_offset_s", "pose_tolerance_s", "images_per_stop"),
         *("saturation_amplitude", "modulation_frequency_hz"),
     )
-    return PosedOptions.from_mapping(mapping | {key: given.pop(key) for key in same}, where)
+    given_same = {key: given.pop(key) for key in same}
+    return PosedOptions.from_mapping(mapping | given_same, _command_name())
+
+
+def _command_name() -> str:
+    """Return what messages call the command that is run."""
+    return f"tofcorr import {click.get_current_context().info_name}"
 
 
 def progress_bar(items: Iterable[Item], step: str) -> Iterable[Item]:

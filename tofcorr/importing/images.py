@@ -2,8 +2,9 @@
 
 import os
 import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,25 +12,14 @@ from pydantic import PositiveFloat
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.npy import load_numbers
-from tofcorr.importing.pose_track import in_seconds
-from tofcorr.importing.run import RefusedViewError
+from tofcorr.importing.intrinsics import GivenIntrinsics
+from tofcorr.importing.numbers import load_numbers
+from tofcorr.importing.pose_track import LEAST_SECONDS, in_seconds
+from tofcorr.importing.run import Refused, RefusedViewError
 from tofcorr.options import Options, one_line
-
-_GROUPS = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
-"""What the wildcards of a pattern stand for."""
 
 _LARGEST_GB = 1
 """Largest image file read, GB: a hundred times a 4-megapixel depth image in float64."""
-
-_LEAST_SECONDS = 1e8
-"""Numbers in names count as times from here on, or with a decimal point: in Unix seconds it
-is 1973, and no folder has as many images."""
-
-_SWAPPED_SMOOTHER = 4.0
-"""How many times smoother an image is with its bytes swapped if they are in the wrong order. Depth
-read with the bytes swapped jumps by thousands between neighbours: on views of a Kinect v2 the
-ratio is 100 to 270 in the wrong order, and its inverse in the right one."""
 
 
 class DepthImage(NamedTuple):
@@ -42,21 +32,6 @@ class DepthImage(NamedTuple):
 
     depth: np.ndarray
     amplitude: np.ndarray | None = None
-
-    def of(self, camera: CameraIntrinsics) -> Self:
-        """Return the image, unless a camera of other intrinsics took it.
-
-        Raises:
-            RefusedViewError: Depth or amplitude is of another size.
-        """
-        size = (camera.height, camera.width)
-        for what, image in self._asdict().items():
-            if image is not None and image.shape != size:
-                raise RefusedViewError(
-                    f"its {what} has {image.shape[1]}x{image.shape[0]} pixels, the intrinsics hold "
-                    f"for {size[1]}x{size[0]}"
-                )
-        return self
 
 
 class DepthCoding(Options):
@@ -98,23 +73,63 @@ def matching_files(folder: Path, pattern: str, what: str) -> dict[str, Path]:
             f"the {what} pattern '{pattern}' names one file; put {{view}} or * where the images "
             "differ."
         )
-    regex = re.compile("".join(_GROUPS.get(part, re.escape(part)) for part in parts))
+    wildcards = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
+    regex = re.compile("".join(wildcards.get(part, re.escape(part)) for part in parts))
     found: dict[str, Path] = {}
     for path in folder.glob("/".join("*" * (pattern.count("/") + 1))):
         match = regex.fullmatch(path.relative_to(folder).as_posix())
         if match and path.is_file():
             found["-".join(match.groups())] = path
     if not found:
-        names = sorted((path.name for path in folder.iterdir()), key=natural_order) or [""]
+        names = sorted((path.name for path in folder.iterdir()), key=_natural_order) or [""]
         held = f"it holds {len(names)} entries such as '{names[0]}' and '{names[-1]}'"
         held = held if names[0] else "the folder is empty"
         raise CalibrationDataError(
             f"{folder}: no file matches the {what} pattern '{pattern}'; {held}."
         )
-    return {view: found[view] for view in sorted(found, key=natural_order)}
+    return {view: found[view] for view in sorted(found, key=_natural_order)}
 
 
-def natural_order(text: str) -> list[tuple[int, str]]:
+def files_of_views(
+    folder: Path, patterns: Mapping[str, str]
+) -> tuple[dict[str, dict[str, Path]], Refused]:
+    """Find the files that belong together: those whose wildcards match the same text.
+
+    Images are never paired by their order: one missing file would shift all that follow.
+
+    Args:
+        folder: Where the patterns start.
+        patterns: A pattern for each kind of image, as `matching_files` takes them.
+
+    Returns:
+        The files of each view by kind, in natural order (2 before 10), and why views lack some.
+
+    Raises:
+        CalibrationDataError: There is no such folder, a pattern has no wildcard or matches
+            nothing, or no images belong together.
+    """
+    found = {what: matching_files(folder, pattern, what) for what, pattern in patterns.items()}
+    every = sorted({view for files in found.values() for view in files}, key=_natural_order)
+    views, refused = {}, Refused()
+    for view in every:
+        files = {what: found[what][view] for what in found if view in found[what]}
+        if len(files) == len(found):
+            views[view] = files
+            continue
+        lacking = next(what for what in found if what not in files)
+        refused[view] = f"{next(iter(files.values())).name} has no {lacking} image beside it"
+    if not views:
+        (one, files), (other, beside) = list(found.items())[:2]
+        first, second = (next(iter(paths.values())).name for paths in (files, beside))
+        raise CalibrationDataError(
+            f"{folder}: no {one} image has an {other} image of the same name: '{patterns[one]}' "
+            f"matches '{first}', '{patterns[other]}' matches '{second}'. The text that {{view}} "
+            "(or *) matches must be the same in both."
+        )
+    return views, refused
+
+
+def _natural_order(text: str) -> list[tuple[int, str]]:
     """Return a key that sorts numbers in names by their value."""
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", text)]
 
@@ -123,14 +138,14 @@ def times_in_names(views: list[str]) -> np.ndarray | None:
     """Return the times that all names are, seconds, shape (N,); None if they are none.
 
     A time is a number with a decimal point, or a whole number of seconds, milliseconds,
-    microseconds or nanoseconds since 1970.
+    microseconds or nanoseconds since 1970; smaller ones are numbers of images.
     """
     if not all(re.fullmatch(r"\d+(\.\d+)?", view) for view in views):
         return None
     values = np.array([float(view) for view in views])
     if all("." in view for view in views):
         return values
-    return None if values.min() < _LEAST_SECONDS else in_seconds(values)
+    return None if values.min() < LEAST_SECONDS else in_seconds(values)
 
 
 def read_array(path: Path) -> np.ndarray:
@@ -220,10 +235,9 @@ def _exr(path: Path) -> np.ndarray:
             names = list(channels)
             of_depth = [n for n in names if re.search(r"depth\.[zv]$", n, re.IGNORECASE)]
             single = names if len(names) == 1 else []
-            wanted = ("Z", *of_depth, *single, "V", "Y", "R")
-            chosen = next((name for name in wanted if name in names), None)
-            if chosen is not None:
-                return np.array(channels[chosen].pixels)
+            for name in ("Z", *of_depth, *single, "V", "Y", "R"):
+                if name in names:
+                    return np.array(channels[name].pixels)
     except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise RefusedViewError(f"{path.name} is not a readable EXR file ({error})") from None
     raise RefusedViewError(
@@ -232,17 +246,27 @@ def _exr(path: Path) -> np.ndarray:
     )
 
 
-def depth_metres(counts: np.ndarray, coding: DepthCoding, name: str) -> np.ndarray:
-    """Return depth in metres, float32, shape (H, W); NaN where there is no return.
+Counts = tuple[np.ndarray, str]
+"""An image as a file or a message holds it, and what it is called there."""
+
+
+def coded_image(
+    coding: DepthCoding, depth: Counts, amplitude: Counts | None = None, advice: str = ""
+) -> DepthImage:
+    """Return an image in metres, turned as the coding says.
+
+    Args:
+        coding: How the numbers are to be read.
+        depth: The depth.
+        amplitude: The amplitude; None: there is none.
+        advice: What else to do with an amplitude of 8 bits, a sentence without a full stop.
 
     Raises:
-        RefusedViewError: The image has 8 bits a pixel, or its bytes stand in the wrong order.
+        RefusedViewError: An image has 8 bits a pixel, or the depth's bytes stand in the wrong
+            order.
     """
-    if counts.dtype.itemsize == 1:
-        raise RefusedViewError(
-            f"{name} has 8 bits a pixel; expected 16 bits or floats (an 8-bit image is a preview, "
-            "its depth is lost)"
-        )
+    counts, name = depth
+    _refuse_preview(depth, "(an 8-bit image is a preview, its depth is lost)")
     if counts.dtype.kind in "iu" and counts.dtype.itemsize == 2:
         if coding.big_endian:
             counts = counts.byteswap()
@@ -252,29 +276,74 @@ def depth_metres(counts: np.ndarray, coding: DepthCoding, name: str) -> np.ndarr
     usable = np.isfinite(values) & (values > 0) & ~np.isin(values, coding.invalid)
     unit_mm = coding.unit_mm or (1000.0 if counts.dtype.kind == "f" else 1.0)
     metres = np.where(usable, values * (1e-3 * unit_mm), np.nan)
-    return turned(metres.astype(np.float32), coding.rotate)
+    image = DepthImage(turned(metres.astype(np.float32), coding.rotate))
+    if amplitude is None:
+        return image
+    _refuse_preview(amplitude, f"as amplitude. {advice}" if advice else "as amplitude")
+    return image._replace(amplitude=turned(amplitude[0].astype(np.float32), coding.rotate))
 
 
-def amplitude_counts(
-    counts: np.ndarray, coding: DepthCoding, name: str, advice: str = ""
-) -> np.ndarray:
-    """Return amplitudes in the camera's units, float32, shape (H, W), turned as depth is.
+def _refuse_preview(image: Counts, why: str) -> None:
+    if image[0].dtype.itemsize == 1:
+        raise RefusedViewError(f"{image[1]} has 8 bits a pixel; expected 16 bits or floats {why}")
+
+
+def of_size(
+    image: DepthImage,
+    camera: CameraIntrinsics,
+    names: tuple[str, str] = ("its depth", "its amplitude"),
+    others: str = "the intrinsics hold for",
+) -> DepthImage:
+    """Return the image, unless a camera of other intrinsics took it.
 
     Args:
-        counts: As read.
-        coding: How far images are to be turned.
-        name: Of the image, for the message.
-        advice: What else to do with an image of 8 bits, a sentence without a full stop.
+        image: Depth and amplitude.
+        camera: The camera.
+        names: What depth and amplitude are called.
+        others: What has the camera's size, to begin "... 640x480".
 
     Raises:
-        RefusedViewError: The image has 8 bits a pixel.
+        RefusedViewError: Depth or amplitude is of another size.
     """
-    if counts.dtype.itemsize == 1:
-        raise RefusedViewError(
-            f"{name} has 8 bits a pixel; expected 16 bits or floats as amplitude"
-            + (advice and f". {advice}")
-        )
-    return turned(counts.astype(np.float32), coding.rotate)
+    for name, part in zip(names, image, strict=True):
+        if part is not None and part.shape != (camera.height, camera.width):
+            raise RefusedViewError(
+                f"{name} has {part.shape[1]}x{part.shape[0]} pixels, {others} "
+                f"{camera.width}x{camera.height}"
+            )
+    return image
+
+
+def camera_of(
+    intrinsics: GivenIntrinsics, read: Callable[[int], np.ndarray], count: int, origin: str
+) -> CameraIntrinsics:
+    """Return the intrinsics for images of the first readable size.
+
+    Args:
+        intrinsics: Of images as they are used.
+        read: Reads one of the images by its number.
+        count: How many there are.
+        origin: Where they come from, for messages.
+
+    Raises:
+        CalibrationDataError: No image can be read, or the intrinsics hold for another size.
+    """
+    reasons = []
+    for number in range(count):
+        try:
+            height, width = read(number).shape
+        except RefusedViewError as refusal:
+            reasons.append(str(refusal))
+            continue
+        if intrinsics.size == (height, width) and height != width:
+            raise CalibrationDataError(
+                f"{intrinsics.source}: the intrinsics hold for {height}x{width} pixels, the images "
+                f"have {width}x{height}: they seem to be turned. Add --rotate 90 or --rotate 270."
+            )
+        return intrinsics.camera((width, height))
+    raise CalibrationDataError(
+        f"{origin}: none of {count} depth images can be used; the first: {reasons[0]}."
+    )
 
 
 def turned(image: np.ndarray, degrees: int) -> np.ndarray:
@@ -282,11 +351,15 @@ def turned(image: np.ndarray, degrees: int) -> np.ndarray:
     return np.ascontiguousarray(np.rot90(image, -(degrees // 90)))
 
 
-def _refuse_swapped(counts: np.ndarray, name: str) -> None:
-    """Refuse an image that is much smoother with the bytes of each number swapped."""
+def _refuse_swapped(counts: np.ndarray, name: str, smoother: int = 4) -> None:
+    """Refuse an image that is `smoother` times as smooth with the bytes of each number swapped.
+
+    Depth read with the bytes swapped jumps by thousands between neighbours: on views of a Kinect v2
+    the ratio is 100 to 270 in the wrong order, and its inverse in the right one.
+    """
     few = counts[::4]  # Thousands of pixels, quickly.
     here, swapped = _roughness(few), _roughness(few.byteswap())
-    if here > _SWAPPED_SMOOTHER * swapped and swapped > 0:
+    if here > smoother * swapped > 0:
         raise RefusedViewError(
             f"{name}: neighbours differ by {here:.0f} counts as read and by {swapped:.0f} with the "
             "bytes swapped; the image seems to be big-endian. Add --big-endian"

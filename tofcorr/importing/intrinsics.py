@@ -17,14 +17,8 @@ import numpy as np
 from tofcorr.data.recording import HEADER_FILE, build_header
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics, Matrix3
-from tofcorr.options import (
-    LARGEST_NUMBER,
-    is_shipped_name,
-    one_line,
-    parse_yaml,
-    read_text,
-    shipped_file,
-)
+from tofcorr.importing.numbers import any_numbers
+from tofcorr.options import is_shipped_name, one_line, parse_yaml, read_text, shipped_file
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
 _MATRIX_KEYS = ("K", "matrix", "camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx")
@@ -34,15 +28,6 @@ _DISTORTION_KEYS = (
 )
 _SIZE_KEYS = (("width", "height"), ("image_width", "image_height"), ("image_Width", "image_Height"))
 _MODELS = ("plumb_bob", "rational_polynomial", "opencv", "none", "pinhole")
-
-_AZURE_MODES = {
-    (640, 576): ((1024, 1024), (192, 180)),
-    (320, 288): ((512, 512), (96, 90)),
-    (1024, 1024): ((1024, 1024), (0, 0)),
-    (512, 512): ((512, 512), (0, 0)),
-}
-"""Size of the depth images, the size the sensor is binned to, and where the image is cut out of it,
-pixels. From the Azure-Kinect-Sensor-SDK, mode_specific_calibration.c."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,15 +55,11 @@ class GivenIntrinsics:
         Raises:
             CalibrationDataError: They are valid for another size, or no camera has them.
         """
-        if self.size is not None and self.size != size:
+        sizes = [*self.matrix_by_size] if self.size is None else [self.size]
+        if sizes and size not in sizes:
+            listed = ", ".join(f"{width}x{height}" for width, height in sizes)
             raise CalibrationDataError(
-                f"{self.source}: the intrinsics hold for {self.size[0]}x{self.size[1]} pixels, "
-                f"the images have {size[0]}x{size[1]}."
-            )
-        if self.matrix_by_size and size not in self.matrix_by_size:
-            sizes = ", ".join(f"{width}x{height}" for width, height in self.matrix_by_size)
-            raise CalibrationDataError(
-                f"{self.source}: the camera has images of {sizes} pixels, these have "
+                f"{self.source}: the intrinsics hold for {listed} pixels, the images have "
                 f"{size[0]}x{size[1]}."
             )
         camera = CameraIntrinsics(
@@ -166,16 +147,16 @@ def intrinsics_from_mapping(
             "(plumb_bob, rational_polynomial) is needed. Undistort the images, or calibrate again."
         )
     distortion = _numbers(_first(values, _DISTORTION_KEYS, []), source, "the distortion")
-    matrix = _matrix(values, source)
-    size = None
-    for keys in _SIZE_KEYS:
-        if size is None and all(key in values for key in keys):
-            width, height = _numbers([values[key] for key in keys], source, "the image size")
-            size = int(width), int(height)
+    sides = [
+        _numbers(values[key], source, "the image size")
+        for keys in _SIZE_KEYS
+        for key in keys
+        if set(keys) <= values.keys()
+    ]
     return GivenIntrinsics(
-        matrix=matrix,
+        matrix=_matrix(values, source),
         distortion=tuple(distortion),
-        size=size,
+        size=(int(sides[0][0]), int(sides[1][0])) if sides else None,
         source=source,
         matrix_by_size=values.get("matrix_by_size", {}),
     )
@@ -199,11 +180,6 @@ def _matrix(values: Mapping[str, Any], source: str) -> Matrix3:
             f"{source}: the camera matrix must have 9 numbers, got {len(numbers)}."
         )
     a, b, c, d, e, f, g, h, i = numbers
-    if any((d, g, h)) or i != 1:
-        raise CalibrationDataError(
-            f"{source}: the camera matrix must be upper triangular with a last row of 0 0 1, "
-            f"got {[[a, b, c], [d, e, f], [g, h, i]]}."
-        )
     return (a, b, c), (d, e, f), (g, h, i)
 
 
@@ -226,22 +202,19 @@ def _numbers(value: Any, source: str, what: str) -> list[float]:  # noqa: ANN401
         raise CalibrationDataError(f"{source}: {what} must be numbers, got {shown}.") from None
     if not np.isfinite(array).all() or np.asarray(value).dtype == bool:
         raise CalibrationDataError(f"{source}: {what} must be finite numbers, got {shown}.")
-    if array.size and np.abs(array).max() > LARGEST_NUMBER:
-        raise CalibrationDataError(
-            f"{source}: {what} must be at most {LARGEST_NUMBER:g}, got {shown}."
-        )
     return array.tolist()
 
 
 def _read(path: Path) -> Mapping[str, Any]:
     try:
         text = read_text(path)
-        if "opencv-matrix" in text or text.startswith("%YAML:") or text.lstrip().startswith("<"):
-            return _file_storage(text, str(path))
         words = text.replace(",", " ").split()
-        if len(words) == 9 and (plain := _floats(words)) is not None:
-            return {"K": plain}
-        values = parse_yaml(text, str(path))
+        if "opencv-matrix" in text or text.startswith("%YAML:") or text.lstrip().startswith("<"):
+            values = _file_storage(text, str(path))
+        elif len(words) == any_numbers(words).size == 9:
+            values = {"K": words}
+        else:
+            values = parse_yaml(text, str(path))
     except ConfigError as error:
         raise CalibrationDataError(str(error)) from None
     if not isinstance(values, Mapping):
@@ -251,15 +224,7 @@ def _read(path: Path) -> Mapping[str, Any]:
     return values
 
 
-def _floats(words: Sequence[str]) -> list[float] | None:
-    """Return words as numbers; None if one is not."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        return None
-
-
-def _file_storage(text: str, source: str) -> dict[str, Any]:
+def _file_storage(text: str, source: str) -> Any:  # noqa: ANN401 - as YAML has it
     """Read a text of cv::FileStorage without OpenCV, whose parser ends the program on some texts.
 
     Returns:
@@ -270,50 +235,39 @@ def _file_storage(text: str, source: str) -> dict[str, Any]:
             rows and columns.
     """
     try:
-        values = _xml(text) if text.lstrip().startswith("<") else _opencv_yaml(text, source)
+        if text.lstrip().startswith("<"):
+            values = _xml(text)
+        else:  # JSON is YAML too; OpenCV's first line and its tags are not.
+            plain = re.sub(r"\A%YAML[: ][^\n]*|!!opencv-[a-z-]+", "", text)
+            values = parse_yaml(plain, source)
     except (ConfigError, ElementTree.ParseError, ValueError) as error:
         reason = one_line(str(error).removeprefix(f"{source}: "))
         raise CalibrationDataError(f"{source}: not a readable OpenCV file ({reason}).") from None
-    for key, value in values.items():
-        if isinstance(value, Mapping) and "data" in value:
-            _check_matrix(value, f"{source}: '{key}'")
-    return dict(values)
-
-
-def _opencv_yaml(text: str, source: str) -> Mapping[str, Any]:
-    """Read YAML and JSON, which is YAML too; OpenCV's first line and tags are not."""
-    plain = re.sub(r"\A%YAML[: ][^\n]*", "", text, count=1)
-    values = parse_yaml(re.sub(r"!!opencv-[a-z-]+", "", plain), source)
-    if not isinstance(values, Mapping):
-        raise ConfigError(f"expected keys and values, got {type(values).__name__}")
+    for key, value in values.items() if isinstance(values, Mapping) else ():
+        if not isinstance(value, Mapping) or "data" not in value:
+            continue
+        count = len(value["data"]) if isinstance(value["data"], list) else "no list"
+        rows, columns = (one_line(str(value.get(name))) for name in ("rows", "cols"))
+        sides = any_numbers([rows, columns])
+        if not sides.size or count != sides.prod():
+            raise CalibrationDataError(
+                f"{source}: '{key}' must have rows x cols numbers, got {count} for "
+                f"{rows} x {columns}."
+            )
     return values
 
 
 def _xml(text: str) -> dict[str, Any]:
+    """Return the elements of an XML text by their names: text, or what a matrix consists of."""
     if "<!" in text.replace("<!--", ""):
         raise ValueError("it declares entities or a document type, which OpenCV's files never do")
-    return {one.tag: _element(one) for one in ElementTree.fromstring(text)}
-
-
-def _element(element: ElementTree.Element) -> Any:  # noqa: ANN401 - text, number or matrix
-    parts = {one.tag: (one.text or "").strip() for one in element}
-    if "data" in parts:
-        return parts | {"data": parts["data"].split()}
-    return (element.text or "").strip().strip('"')
-
-
-def _check_matrix(value: Mapping[str, Any], where: str) -> None:
-    data, size = value["data"], [value.get("rows"), value.get("cols")]
-    try:
-        rows, columns = (int(str(one)) for one in size)
-    except ValueError:
-        rows, columns = -1, -1
-    if not isinstance(data, list) or len(data) != rows * columns:
-        count = len(data) if isinstance(data, list) else "no list"
-        raise CalibrationDataError(
-            f"{where} must have rows x cols numbers, got {count} for "
-            f"{one_line(str(size[0]))} x {one_line(str(size[1]))}."
-        )
+    found: dict[str, Any] = {}
+    for element in ElementTree.fromstring(text):
+        parts = {one.tag: (one.text or "").strip() for one in element}
+        found[element.tag] = (element.text or "").strip().strip('"')
+        if "data" in parts:
+            found[element.tag] = parts | {"data": parts["data"].split()}
+    return found
 
 
 def _understood(values: Mapping[str, Any], source: str, camera: str | None) -> Mapping[str, Any]:
@@ -363,11 +317,10 @@ def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[
         raise CalibrationDataError(
             f"{source}: Kalibr's 'intrinsics' must be fx, fy, cx, cy, got {len(numbers)} numbers."
         )
-    found: dict[str, Any] = {"K": _pinhole(*numbers)}
     size = entry.get("resolution")
-    if isinstance(size, list) and len(size) == 2:
-        found |= {"width": size[0], "height": size[1]}
-    return found | {"distortion": entry.get("distortion_coeffs", [])}
+    whole = isinstance(size, list) and len(size) == 2
+    named = dict(zip(("width", "height"), size, strict=True)) if whole else {}
+    return named | {"K": _pinhole(*numbers), "distortion": entry.get("distortion_coeffs", [])}
 
 
 def _azure_kinect(
@@ -395,9 +348,17 @@ def _azure_kinect(
     if model not in ("LensDistortionModelBrownConrady", "LensDistortionModelRational6KT"):
         raise CalibrationDataError(f"{source}: lens model '{one_line(model)}' is not supported.")
     cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = parameters[:14]
+    # Of each size of images the pixels that the sensor is binned to, and what is cut off left and
+    # above. From the Azure-Kinect-Sensor-SDK, mode_specific_calibration.c.
     modes = {
-        size: _pinhole(fx * width, fy * height, cx * width - left - 0.5, cy * height - top - 0.5)
-        for size, ((width, height), (left, top)) in _AZURE_MODES.items()
+        (640, 576): (1024, 192, 180),
+        (320, 288): (512, 96, 90),
+        (1024, 1024): (1024, 0, 0),
+        (512, 512): (512, 0, 0),
+    }
+    by_size = {
+        size: _pinhole(fx * side, fy * side, cx * side - left - 0.5, cy * side - top - 0.5)
+        for size, (side, left, top) in modes.items()
     }
     distortion = [k1, k2, p1, p2, k3, k4, k5, k6]
-    return {"K": modes[640, 576], "distortion": distortion, "matrix_by_size": modes}
+    return {"K": by_size[640, 576], "distortion": distortion, "matrix_by_size": by_size}

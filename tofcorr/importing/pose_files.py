@@ -7,40 +7,35 @@ import csv
 import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.importing.npy import load_numbers
+from tofcorr.importing.numbers import any_numbers, lines_of, load_numbers, numbers_in, read_text
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.options import one_line, read_yaml
 
-_LARGEST_MB = 256
-"""Largest pose file read, MB: a day of poses at 10 Hz takes 100 MB."""
-
-_ROUNDING = 1e-3
-"""How far the length of a quaternion may be from one: what three decimals do to it."""
-
-# Each quantity under the names that tables give it, and the factor to SI units. Names as pandas,
-# ROS and the `frames.csv` of a recording write them.
-_TIME = {"stamp": 1.0, "timestamp_s": 1.0, "timestamp": 1.0, "time": 1.0, "time_s": 1.0, "t": 1.0,
-         "timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_us": 1e-6, "timestamp_ns": 1e-9,
-         "time_ns": 1e-9}  # fmt: skip
-# Seconds and nanoseconds of a ROS stamp, in the words of ROS 2 and of ROS 1.
-_STAMP = (("stamp_sec", "stamp_nanosec"), ("stamp_secs", "stamp_nsecs"))
-_NAME = ("name", "image", "file", "filename", "frame")
+# Each quantity under the names that tables give it, and the factors to SI units. Names as pandas,
+# ROS (1 and 2) and the `frames.csv` of a recording write them.
+_TIME = {
+    **{(f"stamp_{second}", f"stamp_{part}"): (1.0, 1e-9)
+       for second, part in (("sec", "nanosec"), ("secs", "nsecs"))},
+    **{(name,): (1.0,) for name in ("stamp", "timestamp_s", "timestamp", "time", "time_s", "t")},
+    **{(f"{name}_{unit}",): (factor,) for name in ("timestamp", "time")
+       for unit, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))},
+}  # fmt: skip
+_NAME = tuple((name,) for name in ("name", "image", "file", "filename", "frame"))
 _TRANSLATION = {
     tuple(f"{letter}{unit}" for letter in letters): factor
     for letters in (("tx", "ty", "tz"), ("x", "y", "z"), ("px", "py", "pz"))
     for unit, factor in (("", 1.0), ("_m", 1.0), ("_mm", 1e-3))
 }
-_QUATERNION = (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w"), ("ox", "oy", "oz", "ow"))
-_ROTATION_VECTOR = (("rx", "ry", "rz"),)
-
-Line = tuple[int, list[str]]
-"""The number of a line, counted from one, and its fields."""
+_ROTATION = (
+    *(("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w"), ("ox", "oy", "oz", "ow")),
+    ("rx", "ry", "rz"),
+)
+"""Quaternions, scalar last, and vectors: an axis times an angle in radians, as UR robots report."""
 
 
 def read_poses(path: Path, pose_format: str | None = None) -> PoseTrack:
@@ -90,104 +85,45 @@ def _guessed_format(path: Path) -> str:
     return "tum" if len(fields) == 8 else "matrices"
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file of bounded size.
-
-    Raises:
-        CalibrationDataError: There is no such file, it is too large, or it is not text.
-    """
-    try:
-        with path.open("rb") as file:
-            content = file.read(_LARGEST_MB * 10**6 + 1)
-    except OSError as error:
-        raise CalibrationDataError(f"{path}: cannot be read ({error.strerror}).") from None
-    if len(content) > _LARGEST_MB * 10**6:
-        raise CalibrationDataError(
-            f"{path}: larger than {_LARGEST_MB} MB, the limit of a pose file here."
-        )
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise CalibrationDataError(
-            f"{path}: expected a text file of poses, found binary content."
-        ) from None
-
-
-def lines_of(text: str) -> list[Line]:
-    """Return the lines that hold something, with their fields; `#` and `%` begin comments.
-
-    Fields are separated by white space, commas or semicolons.
-    """
-    contents = (re.sub(r"[#%].*", "", line) for line in text.splitlines())
-    split = (re.sub("[,;]", " ", content).split() for content in contents)
-    return [(number, fields) for number, fields in enumerate(split, start=1) if fields]
-
-
-def _numbers(line: Line, path: Path, counts: tuple[int, ...]) -> np.ndarray:
-    """Return the numbers of a line, which must be finite and as many as expected."""
-    number, fields = line
-    if len(fields) not in counts:
-        wanted = " or ".join(map(str, counts))
-        raise CalibrationDataError(
-            f"{path}, line {number}: expected {wanted} numbers, got {len(fields)}."
-        )
-    try:
-        values = np.array([float(field) for field in fields])
-    except ValueError:
-        shown = " ".join(fields)[:60]
-        raise CalibrationDataError(
-            f"{path}, line {number}: expected numbers, got '{shown}'."
-        ) from None
-    if not np.isfinite(values).all():
-        raise CalibrationDataError(f"{path}, line {number}: expected finite numbers.")
-    return values
-
-
-def pose_from_quaternion(translation: np.ndarray, quaternion_xyzw: np.ndarray) -> np.ndarray:
-    """Return a rigid transform, shape (4, 4).
+def rigid_transforms(
+    translation: np.ndarray, rotation: np.ndarray, where: Callable[[int], str]
+) -> np.ndarray:
+    """Return rigid transforms, shape (P, 4, 4).
 
     Args:
-        translation: Shape (3,), metres.
-        quaternion_xyzw: Shape (4,), scalar last, of unit length to 0.001.
+        translation: Shape (P, 3), metres.
+        rotation: Quaternions, scalar last, shape (P, 4); or axes times angles, radians, (P, 3).
+        where: What to call a pose in a message, by its number.
 
     Raises:
-        ValueError: The quaternion is not of unit length.
+        CalibrationDataError: A quaternion is not of unit length to 0.001, which is what three
+            decimals do to it, or an angle is larger than a whole turn.
     """
-    length = float(np.linalg.norm(quaternion_xyzw))
-    if not abs(length - 1) <= _ROUNDING:
-        raise ValueError(f"the quaternion (x, y, z, w) has length {length:.4g}; expected 1")
-    return _transform(translation, Rotation.from_quat(quaternion_xyzw))
-
-
-def _pose_from_rotation_vector(translation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return a rigid transform of an axis times an angle in radians (as UR robots report)."""
-    angle = float(np.linalg.norm(vector))
+    length, of_quaternions = np.linalg.norm(rotation, axis=1), rotation.shape[1] == 4
     # Robots report half a turn at most, some up to a whole one.
-    if not angle <= 2 * np.pi + _ROUNDING:
-        raise ValueError(
-            f"rx, ry, rz are read as an axis times an angle in radians, and the angle is "
-            f"{angle:.4g}; degrees, or Euler angles, must be turned into quaternions qx, qy, qz, qw"
+    off = np.abs(length - 1) if of_quaternions else length - 2 * np.pi
+    for place in np.flatnonzero(~(off <= 1 / 1000)).tolist():
+        said = (
+            f"the quaternion (x, y, z, w) has length {length[place]:.4g}; expected 1"
+            if of_quaternions
+            else "rx, ry, rz are read as an axis times an angle in radians, and the angle is "
+            f"{length[place]:.4g}; degrees, or Euler angles, must be turned into quaternions qx, "
+            "qy, qz, qw"
         )
-    return _transform(translation, Rotation.from_rotvec(vector))
-
-
-def _transform(translation: np.ndarray, rotation: Rotation) -> np.ndarray:
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation.as_matrix(), translation
-    return transform
+        raise CalibrationDataError(f"{where(place)}: {said}.")
+    transforms = np.tile(np.eye(4), (len(rotation), 1, 1))
+    if len(rotation):
+        turn = Rotation.from_quat if of_quaternions else Rotation.from_rotvec
+        transforms[:, :3, :3], transforms[:, :3, 3] = turn(rotation).as_matrix(), translation
+    return transforms
 
 
 def _read_tum(path: Path) -> PoseTrack:
     """Read TUM's lines: `timestamp tx ty tz qx qy qz qw`, metres and seconds."""
-    times, poses = [], []
-    for line in lines_of(read_text(path)):
-        values = _numbers(line, path, (8,))
-        try:
-            poses.append(pose_from_quaternion(values[1:4], values[4:]))
-        except ValueError as error:
-            raise CalibrationDataError(f"{path}, line {line[0]}: {error}.") from None
-        times.append(values[0])
-    return PoseTrack.checked(np.array(poses), str(path), np.array(times))
+    lines = lines_of(read_text(path))
+    rows = np.reshape([numbers_in(line, path, (8,)) for line in lines], (-1, 8))
+    poses = rigid_transforms(rows[:, 1:4], rows[:, 4:], lambda k: f"{path}, line {lines[k][0]}")
+    return PoseTrack.checked(poses, str(path), rows[:, 0])
 
 
 def _read_moveit(path: Path) -> PoseTrack:
@@ -207,22 +143,13 @@ def _read_moveit(path: Path) -> PoseTrack:
     poses = []
     for place, sample in enumerate(values):
         given = sample.get("effector_wrt_world") if isinstance(sample, dict) else None
-        numbers = any_numbers(given)
-        if numbers.size != 16:
+        poses.append(any_numbers(given).ravel())
+        if poses[-1].size != 16:
             raise CalibrationDataError(
                 f"{path}: sample {place}: expected 'effector_wrt_world' with the 16 numbers of a "
-                f"4x4 matrix, got {numbers.size}."
+                f"4x4 matrix, got {poses[-1].size}."
             )
-        poses.append(numbers.reshape(4, 4))
-    return PoseTrack.checked(np.array(poses), str(path))
-
-
-def any_numbers(value: Any) -> np.ndarray:  # noqa: ANN401 - from a file
-    """Return a value from a file as an array of float64; an empty one if it holds no numbers."""
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return np.zeros(0)
+    return PoseTrack.checked(np.reshape(poses, (-1, 4, 4)), str(path))
 
 
 def _read_matrices(path: Path) -> PoseTrack:
@@ -245,24 +172,19 @@ def _read_matrices(path: Path) -> PoseTrack:
         return PoseTrack.checked(_square(values.reshape(len(values), -1)), str(path))
     lines = lines_of(read_text(path))
     in_blocks = bool(lines) and len(lines[0][1]) == 4
-    counts = (4,) if in_blocks else (12, 13, 16, 17)
-    rows = [_numbers(line, path, counts) for line in lines]
-    if in_blocks:
-        if len(rows) % 4:
-            raise CalibrationDataError(
-                f"{path}: expected four lines of four numbers a pose, got {len(rows)} lines."
-            )
-        return PoseTrack.checked(np.reshape(rows, (-1, 4, 4)), str(path))
-    widths = {len(row) for row in rows}
+    rows = [numbers_in(one, path, (4,) if in_blocks else (12, 13, 16, 17)) for one in lines]
+    widths = {len(row) for row in rows} or {12}
     if len(widths) > 1:
         raise CalibrationDataError(
             f"{path}: expected as many numbers in every line, got {min(widths)} and {max(widths)}."
         )
-    if not rows:
-        raise CalibrationDataError(f"{path}: expected poses, found none.")
-    values, stamped = np.array(rows), widths.pop() in (13, 17)
+    if in_blocks and len(rows) % 4:
+        raise CalibrationDataError(
+            f"{path}: expected four lines of four numbers a pose, got {len(rows)} lines."
+        )
+    values, stamped = np.reshape(rows, (-1, 16 if in_blocks else min(widths))), min(widths) % 4
     times = values[:, 0] if stamped else None
-    return PoseTrack.checked(_square(values[:, int(stamped) :]), str(path), times)
+    return PoseTrack.checked(_square(values[:, stamped:]), str(path), times)
 
 
 def _folder_of_matrices(path: Path) -> PoseTrack:
@@ -274,7 +196,7 @@ def _folder_of_matrices(path: Path) -> PoseTrack:
         if file.suffix.lower() == ".npy":
             values = _loaded(file).ravel()
         else:
-            rows = [_numbers(one, file, (3, 4, 12, 16)) for one in lines_of(read_text(file))]
+            rows = [numbers_in(one, file, (3, 4, 12, 16)) for one in lines_of(read_text(file))]
             values = np.concatenate(rows or [[]])
         if values.size not in (12, 16):
             raise CalibrationDataError(
@@ -307,94 +229,70 @@ def _read_table(path: Path) -> PoseTrack:
     message are understood as well, such as `pose.position.x` and `header.stamp.sec`. Cells are
     separated by commas, or by semicolons or tabs, and then decimals may have commas.
     """
-    table = _Table(path)
-    translation = table.translation()
-    rotation, build = table.first_of(_QUATERNION), pose_from_quaternion
-    if rotation is None:
-        rotation, build = table.first_of(_ROTATION_VECTOR), _pose_from_rotation_vector
-    if rotation is None:
-        euler = any(name.startswith(("roll", "pitch", "yaw")) for name in table.columns)
-        advice = " Turn roll, pitch and yaw into quaternions: their order has no standard."
-        raise CalibrationDataError(
-            f"{path}: expected the columns qx, qy, qz, qw or rx, ry, rz, got {table.listed}."
-            + (advice if euler else "")
-        )
-    poses = []
-    for place, (move, turn) in enumerate(zip(translation, table.numbers(rotation), strict=True)):
-        try:
-            poses.append(build(move, turn))
-        except ValueError as error:
-            raise CalibrationDataError(f"{path}, row {place + 1}: {error}.") from None
-    name = table.first_of((name,) for name in _NAME)
-    names = None if name is None else table.cells(name[0])
-    return PoseTrack.checked(np.reshape(poses, (-1, 4, 4)), str(path), table.times(), names)
+    delimiter, columns, rows = _table(path)
 
-
-class _Table:
-    """The cells of a table by their columns' plain names."""
-
-    def __init__(self, path: Path) -> None:
-        text = read_text(path)
-        head = _header(text)
-        if head is None:
-            raise CalibrationDataError(f"{path}: expected a header row and poses, found none.")
-        self._path, (self._delimiter, self.columns, line) = path, head
-        self.listed = one_line(", ".join(self.columns))
-        lines = text[text.index(line) + len(line) :].splitlines()
-        rows = csv.reader(lines, delimiter=self._delimiter, skipinitialspace=True)
-        self._rows = [row for row in rows if row and not row[0].startswith("#")]
-
-    def first_of(self, choices: Iterable[tuple[str, ...]]) -> tuple[str, ...] | None:
+    def first_of(choices: Iterable[tuple[str, ...]]) -> tuple[str, ...] | None:
         """Return the first choice whose columns all exist."""
-        return next((one for one in choices if set(one) <= set(self.columns)), None)
+        return next((one for one in choices if set(one) <= set(columns)), None)
 
-    def translation(self) -> np.ndarray:
-        """Return translations, shape (P, 3), metres."""
-        names = self.first_of(_TRANSLATION)
-        if names is None:
-            raise CalibrationDataError(
-                f"{self._path}: expected the columns tx, ty, tz, got {self.listed}."
-            )
-        return _TRANSLATION[names] * self.numbers(names)
-
-    def times(self) -> np.ndarray | None:
-        """Return time stamps in seconds, shape (P,); None without such a column."""
-        parts = self.first_of(_STAMP)
-        if parts is not None:
-            return self.numbers(parts) @ (1.0, 1e-9)
-        names = self.first_of((name,) for name in _TIME)
-        return None if names is None else _TIME[names[0]] * self.numbers(names)[:, 0]
-
-    def cells(self, name: str) -> list[str]:
-        """Return the text of a column."""
-        column = len(self.columns) - 1 - self.columns[::-1].index(name)
-        for place, row in enumerate(self._rows, start=1):
+    def cells(name: str) -> list[str]:
+        """Return the text of a column, the last of that name."""
+        column = len(columns) - 1 - columns[::-1].index(name)
+        for place, row in enumerate(rows, start=1):
             if column >= len(row):
                 raise CalibrationDataError(
-                    f"{self._path}, row {place}: expected {len(self.columns)} cells, got "
-                    f"{len(row)}."
+                    f"{path}, row {place}: expected {len(columns)} cells, got {len(row)}."
                 )
-        return [row[column].strip() for row in self._rows]
+        return [row[column].strip() for row in rows]
 
-    def numbers(self, names: tuple[str, ...]) -> np.ndarray:
-        """Return some columns, shape (P, C)."""
-        values = np.empty((len(self._rows), len(names)))
-        for column, name in enumerate(names):
-            if self.columns.count(name) > 1:
+    def numbers(name: str) -> list[float]:
+        """Return the numbers of a column, shape (P,)."""
+        if columns.count(name) > 1:
+            raise CalibrationDataError(
+                f"{path}: two columns are '{one_line(name)}'; expected the poses of one frame."
+            )
+        found = []
+        for place, cell in enumerate(cells(name)):
+            try:
+                found.append(float(cell if delimiter == "," else cell.replace(",", ".")))
+            except ValueError:
                 raise CalibrationDataError(
-                    f"{self._path}: two columns are '{one_line(name)}'; expected the poses of one "
-                    "frame."
-                )
-            for place, cell in enumerate(self.cells(name)):
-                number = cell if self._delimiter == "," else cell.replace(",", ".")
-                try:
-                    values[place, column] = float(number)
-                except ValueError:
-                    raise CalibrationDataError(
-                        f"{self._path}, row {place + 1}, column '{name}': expected a number, got "
-                        f"'{cell[:40]}'."
-                    ) from None
-        return values
+                    f"{path}, row {place + 1}, column '{name}': expected a number, got "
+                    f"'{cell[:40]}'."
+                ) from None
+        return found
+
+    move, turn = first_of(_TRANSLATION), first_of(_ROTATION)
+    if move is None or turn is None:
+        wanted = "tx, ty, tz" if move is None else "qx, qy, qz, qw or rx, ry, rz"
+        euler = any(name.startswith(("roll", "pitch", "yaw")) for name in columns)
+        advice = " Turn roll, pitch and yaw into quaternions: their order has no standard."
+        raise CalibrationDataError(
+            f"{path}: expected the columns {wanted}, got {one_line(', '.join(columns))}."
+            + advice * (euler and move is not None)
+        )
+    time, name = first_of(_TIME), first_of(_NAME)
+    translation, rotation = (np.array([numbers(one) for one in names]).T for names in (move, turn))
+    return PoseTrack.checked(
+        rigid_transforms(
+            _TRANSLATION[move] * translation, rotation, lambda k: f"{path}, row {k + 1}"
+        ),
+        str(path),
+        None if time is None else np.array(_TIME[time]) @ [numbers(one) for one in time],
+        None if name is None else cells(name[0]),
+    )
+
+
+def _table(path: Path) -> tuple[str, list[str], list[list[str]]]:
+    """Return what separates the cells of a table, its columns' plain names, and its rows."""
+    text = read_text(path)
+    head = _header(text)
+    if head is None:
+        raise CalibrationDataError(f"{path}: expected a header row and poses, found none.")
+    delimiter, columns, line = head
+    lines = text[text.index(line) + len(line) :].splitlines()
+    rows = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+    return delimiter, columns, [row for row in rows if row and not row[0].startswith("#")]
 
 
 def _plain_name(text: str) -> str:
@@ -416,10 +314,9 @@ def _plain_name(text: str) -> str:
         name, ending = name[: unit.start()], f"_{unit[1].strip()}" if unit[1].strip() else ""
     *path, last = re.split(r"[./]", name)
     parts = {"position": "", "translation": "", "orientation": "q", "rotation": "q"}
+    parts["stamp"] = "stamp_"
     if path and path[-1] in parts:
         name = parts[path[-1]] + last
-    elif path and path[-1] == "stamp":
-        name = f"stamp_{last}"
     elif last == "stamp":
         name = last
     # As the EuRoC data set and others write: p_RS_R_x, q_RS_w.
@@ -439,23 +336,14 @@ def _header(text: str) -> tuple[str, list[str], str] | None:
     lines = [line for line in text.splitlines() if line.strip()]
     for line, below in zip(lines, [*lines[1:], ""], strict=False):
         delimiter = max((",", ";", "\t"), key=line.count)
-        cells = line.split(delimiter)
-        columns = [_plain_name(cell) for cell in cells]
+        columns = [_plain_name(cell) for cell in line.split(delimiter)]
         if line.lstrip()[0] not in "#%":
-            numbers = all(map(_is_number, line.replace(delimiter, " ").split()))
-            return None if numbers else (delimiter, columns, line)
-        same = 1 < len(cells) == below.count(delimiter) + 1
+            words = line.replace(delimiter, " ").split()
+            return None if any_numbers(words).size == len(words) else (delimiter, columns, line)
+        same = 1 < len(columns) == below.count(delimiter) + 1
         if same and any(re.fullmatch(r"[tp]?x(_m|_mm)?", name) for name in columns):
             return delimiter, columns, line
     return None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 POSE_FORMATS: Mapping[str, Callable[[Path], PoseTrack]] = {

@@ -2,19 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from tofcorr.data.recording import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 
-_UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-"""From this number on a stamp counts nanoseconds, microseconds or milliseconds, and the factor to
-seconds. In seconds the least of them is the year 5138; in its own unit each is 1973."""
+LEAST_SECONDS = 1e8
+"""Seconds since 1970 from which on a number is a time: in 1973. A thousand times as much counts
+milliseconds, and so on; in seconds that would be the year 5138."""
 
 
 def in_seconds(stamps: np.ndarray) -> np.ndarray:
@@ -29,7 +30,8 @@ def in_seconds(stamps: np.ndarray) -> np.ndarray:
         [1700000000.5]
     """
     least = float(stamps.min()) if len(stamps) else 0.0
-    return stamps * next((factor for bound, factor in _UNITS if least >= bound), 1.0)
+    finer = sum(least >= LEAST_SECONDS * 1000**steps for steps in (1, 2, 3))
+    return stamps * 1000.0**-finer
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,21 +103,19 @@ class PoseTrack:
             times: Shape (N,), seconds on the clock of the track.
         """
         assert self.timestamp is not None
-        times = np.asarray(times, dtype=np.float64)
-        if len(self) == 1:
-            same = (times == self.timestamp[0])[:, None, None]
-            return np.where(same, self.world_from_tool, np.nan)
-        after = np.clip(np.searchsorted(self.timestamp, times, side="right"), 1, len(self) - 1)
-        before = after - 1
-        share = (times - self.timestamp[before]) / (self.timestamp[after] - self.timestamp[before])
-        first, second = self.world_from_tool[before], self.world_from_tool[after]
-        start = Rotation.from_matrix(first[:, :3, :3])
-        turn = (start.inv() * Rotation.from_matrix(second[:, :3, :3])).as_rotvec()
-        poses = first + share[:, None, None] * (second - first)
-        turned = start * Rotation.from_rotvec(share[:, None] * turn)
-        poses[:, :3, :3] = turned.as_matrix()
-        poses[(share < 0) | (share > 1)] = np.nan
+        clipped = np.clip(times, self.timestamp[0], self.timestamp[-1])
+        poses = np.tile(self.world_from_tool[0], (len(clipped), 1, 1))
+        if len(self) > 1:
+            poses[:, :3, :3] = self._rotation(clipped).as_matrix()
+            for axis, along in enumerate(self.world_from_tool[:, :3, 3].T):
+                poses[:, axis, 3] = np.interp(clipped, self.timestamp, along)
+        poses[clipped != times] = np.nan
         return poses
+
+    @cached_property
+    def _rotation(self) -> Slerp:
+        assert self.timestamp is not None
+        return Slerp(self.timestamp, Rotation.from_matrix(self.world_from_tool[:, :3, :3]))
 
     def lists_stops(self, tolerance: float) -> bool:
         """Whether poses are typically so far apart in time (over twice `tolerance`, seconds).

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +37,8 @@ from tofcorr.importing.run import (
 )
 from tofcorr.importing.timing import Lag, estimate_lag, far_lags, refine_lag
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
-from tofcorr.importing.walls.gathering import distances, seen_planes
-from tofcorr.importing.walls.image_planes import wall_masks
+from tofcorr.importing.walls.hand_eye import distances, seen_planes
+from tofcorr.importing.walls.image_planes import plane_masks
 
 _LAG_OF_STOPS = 0.02
 """A refined lag that differs by more than this from the first (seconds) changes which images are
@@ -78,13 +77,18 @@ class PosedImport:
         self._times = None if source.times is None else source.times + options.time_offset_s
         self._track = source.track.inverse() if options.eye_to_hand else source.track
         self._images = ImagesOfPlanes(source, options)
-        self._lists_stops = self._track.lists_stops(options.pose_tolerance_s)
 
     def prepare(self, sieve: Sieve) -> PreparedImport:
         """Read all images once or twice, and find out everything but the frames themselves."""
         source, options = self._source, self._options
-        self._readable, median, self._change, refused = look(source, sieve.progress)
+        sieve.refused |= source.refused
+        self._readable, median, change = look(source, sieve)
         refuse_impossible_depth(median, source.origin)
+        # How much each readable image differs from the one before, where both have times.
+        self._changes = None
+        listed = self._track.lists_stops(options.pose_tolerance_s)
+        if self._times is not None and self._track.timestamp is not None and not listed:
+            self._changes = self._times[self._readable], change[self._readable][1:]
         lag = self._first_lag()
         chosen = self._choose(lag)
         refuse_impossible_poses(chosen.world_from_tool, self._track.source)
@@ -95,13 +99,8 @@ class PosedImport:
                 chosen = self._choose(refined)
                 found, warnings = self._walls(chosen, sieve)
             lag = refined
-        sieve.refused += [*source.refused, *refused, *chosen.refused]
-        for one in found.left_out:
-            # 'image 3, plane 2': the number among the images chosen becomes the image's name.
-            head, comma, tail = one.view.partition(",")
-            name = source.names[chosen.images[int(head.split()[1])]]
-            sieve.refused.append(one._replace(view=f"{name}{comma}{tail}"))
-        mapping = found.to_mapping()
+            warnings = [*_lag_warnings(lag), *warnings]
+        sieve.refused |= chosen.refused | found.left_out
         return PreparedImport(
             views=self._reported(chosen, found),
             frames=self._frames(chosen, found),
@@ -110,32 +109,23 @@ class PosedImport:
             findings={
                 "paired_by": chosen.paired_by,
                 "stops": len(np.unique(chosen.stop[chosen.stop >= 0])),
-                "lag": None if lag is None else _lag_mapping(lag),
-                # Refusals and warnings stand there already.
-                **{key: mapping[key] for key in mapping if key not in ("left_out", "warnings")},
+                "lag": None if lag is None else lag.to_mapping(),
+                **found.to_mapping(),
             },
             warnings=[
                 *source.warnings,
-                *([] if lag is None or options.lag_s != "auto" else _lag_warnings(lag)),
                 *warnings,
                 *_contradiction(source.tool_from_camera, found.tool_from_camera),
-                *found.warnings,
+                *found.warnings(),
             ],
         )
 
     def _first_lag(self) -> Lag | None:
         """Return the lag as given, or estimated from how images and poses change."""
-        if self._times is None or self._track.timestamp is None:
-            return None
-        if self._options.lag_s != "auto":
-            return Lag(seconds=self._options.lag_s)
-        if self._lists_stops:
-            return None
-        return estimate_lag(self._track, self._times[self._readable], self._changes())
-
-    def _changes(self) -> np.ndarray:
-        """Return how much each readable image differs from the one before, metres."""
-        return self._change[self._readable][1:]
+        if self._options.lag_s == "auto":
+            return None if self._changes is None else estimate_lag(self._track, *self._changes)
+        timed = self._times is not None and self._track.timestamp is not None
+        return Lag(seconds=self._options.lag_s) if timed else None
 
     def _choose(self, lag: Lag | None) -> Chosen:
         names = self._source.names
@@ -146,34 +136,30 @@ class PosedImport:
         source, options = self._source, self._options.walls
         numbers = sieve.progress(chosen.images.tolist(), "finding walls")
         planes = [self._images.planes(k) for k in numbers]
+        names = [source.names[k] for k in chosen.images]
         targets = None if source.targets is None else source.targets[chosen.images]
 
-        def far() -> list[float]:
-            """Return lags of seconds that may explain why walls do not fit."""
-            if self._times is None or self._track.timestamp is None or self._lists_stops:
+        def explain(given: FoundWalls | None) -> list[str]:
+            """Refuse what a mistake explains; where planes are named, there is none to undo."""
+            if targets is not None:
                 return []
-            return far_lags(self._track, self._times[self._readable], self._changes())
+            return explain_misfit(
+                self._images,
+                chosen,
+                given,
+                options,
+                lists=self._changes is None,
+                far_lags=lambda: far_lags(self._track, *self._changes) if self._changes else [],
+                at_lag=lambda late: self._choose(Lag(seconds=late)),
+            )
 
-        explain = partial(
-            explain_misfit,
-            self._images,
-            chosen,
-            options=options,
-            lists=chosen.paired_by != "time" or self._lists_stops,
-            far_lags=far,
-            at_lag=lambda late: self._choose(Lag(seconds=late)),
-        )
         try:
             pixels, poses = source.camera.width * source.camera.height, chosen.world_from_tool
-            found = walls_of_planes(
-                planes, pixels, poses, np.eye(4), options, source.origin, targets
-            )
+            found = walls_of_planes(planes, names, pixels, poses, options, source.origin, targets)
         except CalibrationDataError:
-            if targets is None:
-                explain(given=None)
+            explain(None)
             raise
-        sentence = explain(given=found) if targets is None else None
-        return found, [] if sentence is None else [sentence]
+        return found, explain(found)
 
     def _refined(
         self, lag: Lag, moving: np.ndarray, found: FoundWalls, sieve: Sieve, most: int = 200
@@ -183,7 +169,7 @@ class PosedImport:
         At 0.1 m/s and 10 mm a plane, the mean of 200 tells 1 to 2 ms, a fifth of what matters.
         """
         assert self._times is not None
-        hand_eye, walls = torch.from_numpy(found.tool_from_camera), found.planes()
+        hand_eye, walls = torch.from_numpy(found.tool_from_camera), torch.from_numpy(found.walls)
         times, points, on = [], [], []
         step = max(1, -(-len(moving) // most))
         for k in sieve.progress(moving[::step].tolist(), "refining the lag"):
@@ -191,16 +177,17 @@ class PosedImport:
             if not bool(pose.isfinite().all()) or not self._images.planes(k):
                 continue
             seen = seen_planes([self._images.planes(k)], pose, 1)
-            off, nearest = distances(seen, hand_eye, walls).min(dim=1)
+            off, nearest = distances(*seen.in_world(hand_eye), walls).min(dim=1)
             # A tool at 1 m/s is off by 0.1 m after 0.1 s of lag.
-            for plane in (off < 1 / 10).nonzero()[:, 0].tolist():
-                wall = found.walls[int(nearest[plane])]
-                times.append(self._times[k])
-                points.append((seen.points[plane] @ hand_eye[:3, :3].T + hand_eye[:3, 3]).numpy())
-                on.append([*wall.normal_world, wall.offset])
+            near = off < 1 / 10
+            times += [self._times[k]] * int(near.sum())
+            points.append(se3.transformed(hand_eye, seen.points[near]).numpy())
+            on.append(found.walls[nearest[near].numpy()])
         if not times:
             return lag
-        return refine_lag(self._track, np.array(times), np.stack(points), np.array(on), lag)
+        return refine_lag(
+            self._track, np.array(times), np.concatenate(points), np.concatenate(on), lag
+        )
 
     def _writer(self, found: FoundWalls) -> partial[RecordingWriter]:
         """Begin the recording, with the names of frames as its format has them.
@@ -225,50 +212,42 @@ class PosedImport:
 
     def _reported(self, chosen: Chosen, found: FoundWalls) -> list[dict[str, Any]]:
         """Return what `import.json` says of each frame: one image of one wall."""
-        reported = []
-        for view in found.views:
-            number = int(chosen.images[view.image])
-            time = None if self._times is None else float(self._times[number])
-            reported.append({
-                "view": self._source.names[number],
-                "wall": found.walls[view.wall].name,
-                "stop": int(chosen.stop[view.image]),
-                "timestamp_s": time,
-            })  # fmt: skip
-        return reported
+        return [
+            {
+                "view": self._source.names[chosen.images[image]],
+                "wall": found.names[wall],
+                "stop": int(chosen.stop[image]),
+                "timestamp_s": None
+                if self._times is None
+                else float(self._times[chosen.images[image]]),
+            }
+            for image, wall in zip(found.image, found.wall, strict=True)
+        ]
 
     def _frames(self, chosen: Chosen, found: FoundWalls) -> Iterator[Frame]:
         """Yield one frame for each image and wall."""
-        for place, group in groupby(found.views, key=lambda view: view.image):
-            number, views = int(chosen.images[place]), list(group)
+        for place in np.unique(found.image).tolist():
+            own, number = found.image == place, int(chosen.images[place])
             image, stop = self._images.read(number), int(chosen.stop[place])
             distance, valid = self._images.along_rays(image)
-            tolerance = 1e-3 * self._options.walls.tolerance_mm
-            gradients = [view.gradient for view in views]
-            masks = wall_masks(distance, valid, self._images.rays, gradients, tolerance)
+            masks = valid.expand(int(own.sum()), *valid.shape)
+            if found.gradient is not None:
+                gradients = torch.from_numpy(found.gradient[own])
+                tolerance = 1e-3 * self._options.walls.tolerance_mm
+                masks = plane_masks(distance, valid, self._images.rays, gradients, tolerance)
             timestamp = float(place)
             if self._times is not None:
                 timestamp = float(self._times[number] - self._times[chosen.images[0]])
-            for view, mask in zip(views, masks, strict=True):
-                wall = found.walls[view.wall]
+            for wall, mask in zip(found.wall[own], masks.numpy(), strict=True):
                 row = FrameRow(
                     timestamp=timestamp,
                     world_from_tool=chosen.world_from_tool[place],
-                    normal_world=wall.normal_world,
-                    offset=wall.offset,
-                    target=wall.name,
+                    normal_world=found.walls[wall, :3],
+                    offset=float(found.walls[wall, 3]),
+                    target=found.names[wall],
                     pose_id=f"stop {stop}" if stop >= 0 else f"image {number}",
                 )
                 yield row, image.depth, image.amplitude, mask
-
-
-def _lag_mapping(lag: Lag) -> dict[str, float | None]:
-    """Return what `import.json` says of the lag."""
-    return {
-        "seconds": round(lag.seconds, 5),
-        "standard_error": round(lag.standard_error, 5),
-        "correlation": None if math.isnan(lag.correlation) else round(lag.correlation, 3),
-    }
 
 
 def _lag_warnings(lag: Lag) -> list[str]:

@@ -1,7 +1,7 @@
 """Depth images that a camera took while a robot moved: read, paired with poses, and chosen."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.images import DepthImage
 from tofcorr.importing.pose_track import PoseTrack
-from tofcorr.importing.run import Progress, Refusal, RefusedViewError
+from tofcorr.importing.run import Refused, RefusedViewError, Sieve
 from tofcorr.importing.timing import Lag, find_stops, pair
 from tofcorr.importing.walls.image_planes import ImagePlane, WallOptions, planes_of_image
 from tofcorr.options import Options
@@ -80,7 +80,7 @@ class RobotImages:
     read: Callable[[int], DepthImage]
     track: PoseTrack
     times: np.ndarray | None = None
-    refused: Sequence[Refusal] = ()
+    refused: Refused = field(default_factory=dict)
     warnings: Sequence[str] = ()
     targets: np.ndarray | None = None
     tool_from_camera: np.ndarray | None = None
@@ -88,48 +88,41 @@ class RobotImages:
 
 
 def look(
-    images: RobotImages, progress: Progress[int], looked_at: int = 4096
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Refusal]]:
+    images: RobotImages, sieve: Sieve, looked_at: int = 4096
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read every image once, and keep a few numbers of each.
 
     Args:
         images: The images.
-        progress: Shows how far this has come.
+        sieve: Sets aside the images that cannot be read.
         looked_at: Pixels of an image that are compared with the image before: their median change
             is known to a sixtieth of the noise, a fraction of a millimetre.
 
     Returns:
         Which images can be read, shape (I,), bool; the median depth of each, metres, NaN without
-        returns; the median absolute difference to the readable image before, metres, NaN for the
-        first one, or where no pixel has a return in both; and the images that cannot be read.
+        returns; and the median absolute difference to the readable image before, metres, NaN for
+        the first one, or where no pixel has a return in both.
 
     Raises:
         CalibrationDataError: No image can be used.
     """
-    count = len(images.names)
-    readable = np.zeros(count, dtype=bool)
-    median, change = np.full(count, np.nan), np.full(count, np.nan)
-    refused: list[Refusal] = []
+    median, change = (np.full(len(images.names), np.nan) for _ in range(2))
     before = np.zeros(0)
-    for k in progress(range(count), "looking at images"):
-        try:
-            depth = images.read(k).depth
-        except RefusedViewError as refusal:
-            refused.append(Refusal(images.names[k], str(refusal)))
-            continue
+
+    def read(k: int) -> int:
+        nonlocal before
+        depth = images.read(k).depth
         few = depth.ravel()[:: max(1, depth.size // looked_at)]
-        readable[k] = True
         if np.isfinite(few).any():
             median[k] = np.nanmedian(few)
         if len(before) and np.isfinite(moved := np.abs(few - before)).any():
             change[k] = np.nanmedian(moved)
         before = few
-    if not readable.any():
-        reason = f"; the first: {refused[0].reason}" if refused else ""
-        raise CalibrationDataError(
-            f"{images.origin}: none of {count} depth images can be used{reason}."
-        )
-    return readable, median, change, refused
+        return k
+
+    every = sieve.progress(range(len(images.names)), "looking at images")
+    readable = np.isin(np.arange(len(median)), sieve.apply(read, every, images.names.__getitem__))
+    return readable, median, change
 
 
 class ImagesOfPlanes:
@@ -201,7 +194,7 @@ class Chosen:
     world_from_tool: np.ndarray
     stop: np.ndarray
     moving: np.ndarray
-    refused: list[Refusal]
+    refused: Refused
     paired_by: str
 
 
@@ -243,7 +236,7 @@ def choose(
         stop = find_stops(track, times[images] - lag.seconds, margin + 2 * lag.standard_error)
     take, moving = stop < 0, images[stop < 0]
     if options.moving == "leave_out":
-        refused = [*refused, *(Refusal(names[int(k)], "the tool was moving") for k in moving)]
+        refused |= {names[k]: "the tool was moving" for k in moving}
         take = np.zeros(len(stop), dtype=bool)
     # At most so many images of a stop, evenly spread, the middle first.
     for number in np.unique(stop[stop >= 0]):
@@ -251,7 +244,7 @@ def choose(
         count = min(options.images_per_stop, len(own))
         take[own[((np.arange(count) + 0.5) * len(own) / count).astype(int)]] = True
     reason = f"its stop has {options.images_per_stop} images already"
-    refused += [Refusal(names[int(k)], reason) for k in images[(stop >= 0) & ~take]]
+    refused |= {names[k]: reason for k in images[(stop >= 0) & ~take]}
     if not take.any():
         raise CalibrationDataError(
             f"{track.source}: the tool moves in all of {len(images)} images that have a pose. Stop "

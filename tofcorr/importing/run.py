@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -29,17 +29,12 @@ Progress = Callable[[Iterable[Item], str], Iterable[Item]]
 """Wraps an iterable to show how far a step (named by the text) has come."""
 Frame = tuple[FrameRow, np.ndarray, np.ndarray | None, np.ndarray | None]
 """Row, depth, amplitude and mask of one frame, as `RecordingWriter.append` takes them."""
+Refused = dict[str, str]
+"""Why views are not in the recording, by their names."""
 
 
 class RefusedViewError(CalibrationDataError):
     """One view cannot be used; the message says why, and the import goes on without it."""
-
-
-class Refusal(NamedTuple):
-    """A view that is not in the recording, and why."""
-
-    view: str
-    reason: str
 
 
 def no_progress(items: Iterable[Item], _: str) -> Iterable[Item]:
@@ -60,7 +55,7 @@ class Sieve:
 
     def __init__(self, source: str, progress: Progress = no_progress) -> None:
         self._source, self.progress = source, progress
-        self.refused: list[Refusal] = []
+        self.refused: Refused = {}
 
     def apply(
         self, step: Callable[[Item], Result], views: Iterable[Item], name: Callable[[Item], str]
@@ -80,11 +75,11 @@ class Sieve:
             try:
                 results.append(step(view))
             except RefusedViewError as refusal:
-                self.refused.append(Refusal(name(view), str(refusal)))
+                self.refused[name(view)] = str(refusal)
         if not results:
             raise CalibrationDataError(
                 f"{self._source}: none of {len(self.refused)} views can be imported; the first: "
-                f"{self.refused[0].reason}."
+                f"{next(iter(self.refused.values()))}."
             )
         return results
 
@@ -141,7 +136,7 @@ def run_import(
             "options": options.to_mapping(),
             "camera": prepared.camera,
             "views": [{"frame": number, **view} for number, view in enumerate(prepared.views)],
-            "refused": [refusal._asdict() for refusal in sieve.refused],
+            "refused": [{"view": view, "reason": why} for view, why in sieve.refused.items()],
             **prepared.findings,
             "warnings": prepared.warnings,
         }

@@ -26,7 +26,7 @@ from scipy.optimize import minimize_scalar
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.importing.pose_track import PoseTrack
-from tofcorr.importing.run import Refusal
+from tofcorr.importing.run import Refused
 
 _STILL = 5e-4, 1e-3
 """Within a stop the tool moves less than this, metres, and turns less than this, radians: a few
@@ -58,6 +58,14 @@ class Lag:
     standard_error: float = 0.0
     correlation: float = float("nan")
 
+    def to_mapping(self) -> dict[str, float]:
+        """Return what `import.json` says of the lag."""
+        return {
+            "seconds": round(self.seconds, 5),
+            "standard_error": round(self.standard_error, 5),
+            "correlation": round(self.correlation, 3),
+        }
+
 
 def pair(
     names: Sequence[str],
@@ -66,7 +74,7 @@ def pair(
     *,
     tolerance: float,
     lag: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray, list[Refusal], str]:
+) -> tuple[np.ndarray, np.ndarray, Refused, str]:
     """Find the pose of every image.
 
     Where images and poses both carry times, poses are interpolated at the images' times; of poses
@@ -98,12 +106,12 @@ def pair(
             "names that tell which belong together. Expected as many of both; a dropped image "
             "shifts every later pair. Add time stamps, or names."
         )
-    return np.arange(len(names)), track.world_from_tool, [], "order"
+    return np.arange(len(names)), track.world_from_tool, {}, "order"
 
 
 def _by_time(
     names: Sequence[str], times: np.ndarray, track: PoseTrack, tolerance: float
-) -> tuple[np.ndarray, np.ndarray, list[Refusal]]:
+) -> tuple[np.ndarray, np.ndarray, Refused]:
     assert track.timestamp is not None
     first, last = float(times.min()), float(times.max())
     start, end = float(track.timestamp[0]), float(track.timestamp[-1])
@@ -114,49 +122,42 @@ def _by_time(
             f"--time-offset-s (the starts differ by {first - start:.3f} s)."
         )
     near = track.nearest(times)
-    listed = track.lists_stops(tolerance)
-    poses = track.world_from_tool[near] if listed else track.at(times)
+    poses = track.world_from_tool[near] if track.lists_stops(tolerance) else track.at(times)
     inside = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     gap = np.abs(times - track.timestamp[near])
     used = inside & (gap <= tolerance)
-    refused = [
-        Refusal(
-            names[k],
-            f"the nearest pose is {gap[k]:.3f} s away, the tolerance is {tolerance:g} s"
-            if inside[k]
-            else f"taken {gap[k]:.3f} s before the first pose or after the last",
-        )
+    refused = {
+        names[k]: f"the nearest pose is {gap[k]:.3f} s away, the tolerance is {tolerance:g} s"
+        if inside[k]
+        else f"taken {gap[k]:.3f} s before the first pose or after the last"
         for k in np.flatnonzero(~used).tolist()
-    ]
+    }
     if not used.any():
         raise CalibrationDataError(
             f"{track.source}: none of {len(names)} images has a pose; the first: "
-            f"{refused[0].reason}."
+            f"{next(iter(refused.values()))}."
         )
     return np.flatnonzero(used), poses[used], refused
 
 
 def _by_name(
     names: Sequence[str], track: PoseTrack, called: Sequence[str]
-) -> tuple[np.ndarray, np.ndarray, list[Refusal]]:
+) -> tuple[np.ndarray, np.ndarray, Refused]:
     stems = [PurePath(name).stem for name in called]
     place = {stem: k for k, stem in enumerate(stems)}
     if len(place) < len(stems):
         twice = next(stem for stem in place if stems.count(stem) > 1)
         raise CalibrationDataError(f"{track.source}: two poses are called '{twice}'.")
-    found = [place.get(PurePath(name).stem, -1) for name in names]
-    poses = np.array(found)
-    if (poses < 0).all():
+    poses = np.array([place.get(PurePath(name).stem, -1) for name in names])
+    images = np.flatnonzero(poses >= 0)
+    if not len(images):
         raise CalibrationDataError(
             f"{track.source}: no pose is called as an image is: poses '{called[0]}', ..., "
             f"images '{names[0]}', ...."
         )
-    refused = [
-        Refusal(name, f"no pose of that name in {track.source}")
-        for name, pose in zip(names, found, strict=True)
-        if pose < 0
-    ]
-    return np.flatnonzero(poses >= 0), track.world_from_tool[poses[poses >= 0]], refused
+    reason = f"no pose of that name in {track.source}"
+    refused = {names[k]: reason for k in np.flatnonzero(poses < 0).tolist()}
+    return images, track.world_from_tool[poses[images]], refused
 
 
 def find_stops(track: PoseTrack, times: np.ndarray, margin: float) -> np.ndarray:
@@ -174,11 +175,9 @@ def find_stops(track: PoseTrack, times: np.ndarray, margin: float) -> np.ndarray
         The stop that each image belongs to, shape (N,); -1 while moving.
     """
     assert track.timestamp is not None
-    here = track.at(times)
-    still = np.ones(len(times), dtype=bool)
-    for shift in (-margin, margin):
-        aside = np.clip(times + shift, track.timestamp[0], track.timestamp[-1])
-        still &= _near(here, track.at(aside))
+    here, ends = track.at(times), track.timestamp[[0, -1]]
+    before, after = (track.at(np.clip(times + shift, *ends)) for shift in (-margin, margin))
+    still = _near(here, before) & _near(here, after)
     number = np.full(len(times), -1)
     current, last = -1, -1
     for k in np.flatnonzero(still):
@@ -191,9 +190,8 @@ def find_stops(track: PoseTrack, times: np.ndarray, margin: float) -> np.ndarray
 def _near(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Whether pairs of poses (N, 4, 4) differ by less than a stop allows, shape (N,)."""
     distance = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1)
-    turn = np.einsum("nij,nik->njk", first[:, :3, :3], second[:, :3, :3])
-    angle = se3.rotation_angle(torch.from_numpy(turn)).numpy()
-    return (distance < _STILL[0]) & (angle < _STILL[1])
+    turn = torch.from_numpy(np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3])
+    return (distance < _STILL[0]) & (se3.rotation_angle(turn).numpy() < _STILL[1])
 
 
 def estimate_lag(
@@ -215,18 +213,19 @@ def estimate_lag(
     """
     reach = round(largest / _STEP)
     lags = np.arange(-reach, reach + 1) * _STEP
-    moved = np.stack([_movement(track, times - lag) for lag in lags])
+    moved = _movements(track, times, lags)
     usable = np.isfinite(change) & np.isfinite(moved).all(axis=0)
     if usable.sum() < fewest:
         return None
-    seen, moved = change[usable], moved[:, usable]
-    best, correlation = _best(lags, _correlations(moved, seen))
+
+    def best(kept: np.ndarray | slice = slice(None)) -> tuple[float, float]:
+        return _best(lags, _correlations(moved[:, usable][:, kept], change[usable][kept]))
+
+    seconds, correlation = best()
     if correlation < _LEAST_CORRELATION:
         return None
-    error = _jackknife_error(
-        lambda kept: _best(lags, _correlations(moved[:, kept], seen[kept]))[0], len(seen)
-    )
-    return Lag(seconds=best, standard_error=error, correlation=correlation)
+    error = _jackknife_error(lambda kept: best(kept)[0], int(usable.sum()))
+    return Lag(seconds=seconds, standard_error=error, correlation=correlation)
 
 
 def far_lags(
@@ -246,8 +245,7 @@ def far_lags(
         apart: Seconds between two of them: less than a stop and a move take.
     """
     lags = np.arange(-_FARTHEST, _FARTHEST + _FAR_STEP, _FAR_STEP)
-    moved = np.stack([_movement(track, times - lag) for lag in lags])
-    follows = _correlations(np.sqrt(moved), np.sqrt(change))
+    follows = _correlations(np.sqrt(_movements(track, times, lags)), np.sqrt(change))
     found: list[float] = []
     for k in np.argsort(-follows)[: int((follows > 0).sum())]:
         if all(abs(lags[k] - other) >= apart for other in (0.0, *found)):
@@ -255,15 +253,17 @@ def far_lags(
     return found[:most]
 
 
-def _movement(track: PoseTrack, times: np.ndarray) -> np.ndarray:
-    """Return how far the tool moves from each time (I,) to the next, metres, shape (I - 1,).
+def _movements(track: PoseTrack, times: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Return how far the tool moves from each time (I,) to the next at lags (L,), (L, I - 1).
 
-    A turn by one radian counts as 1 m: the distance to the wall, about.
+    In metres; a turn by one radian counts as 1 m: the distance to the wall, about.
     """
-    poses = track.at(times)
-    step = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turn = np.linalg.norm(np.diff(poses[:, :3, :3], axis=0), axis=(1, 2)) / np.sqrt(2)
-    return step + turn
+    steps = (np.diff(track.at(times - lag), axis=0) for lag in lags)
+    return np.stack([
+        np.linalg.norm(step[:, :3, 3], axis=1)
+        + np.linalg.norm(step[:, :3, :3], axis=(1, 2)) / np.sqrt(2)
+        for step in steps
+    ])  # fmt: skip
 
 
 def _correlations(moved: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -271,15 +271,11 @@ def _correlations(moved: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
     It is 0 where less than three quarters are known, so that a few at an end do not decide.
     """
-    both = np.isfinite(moved) & np.isfinite(seen)
-    count = np.maximum(both.sum(axis=1, keepdims=True), 1)
-    first, second = (
-        np.where(both, values - np.where(both, values, 0).sum(axis=1, keepdims=True) / count, 0)
-        for values in (moved, np.broadcast_to(seen, moved.shape))
-    )
-    scale = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
-    enough = 4 * both.sum(axis=1) >= 3 * len(seen)
-    return np.where(enough, (first * second).sum(axis=1) / np.maximum(scale, 1e-300), 0.0)
+    unknown = ~(np.isfinite(moved) & np.isfinite(seen))
+    both = np.ma.array([moved, np.broadcast_to(seen, moved.shape)], mask=[unknown, unknown])
+    first, second = both - both.mean(axis=2, keepdims=True)
+    found = (first * second).sum(1) / np.sqrt((first**2).sum(1) * (second**2).sum(1))
+    return np.where(4 * unknown.sum(axis=1) <= len(seen), found.filled(0.0), 0.0)
 
 
 def _best(lags: np.ndarray, correlation: np.ndarray, as_good: float = 0.1) -> tuple[float, float]:

@@ -1,11 +1,16 @@
 """Images are paired by name, never by order."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.checkerboard.importer import find_pairs
+from tofcorr.importing.images import files_of_views
+
+
+def find_pairs(folder: Path, depth: str, infrared: str) -> Any:
+    return files_of_views(folder, {"depth": depth, "infrared": infrared})
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -19,31 +24,31 @@ def touch(folder: Path, *names: str) -> Path:
 def test_views_come_in_natural_order(tmp_path: Path) -> None:
     touch(tmp_path, *(f"{n}_{kind}.png" for n in (10, 2, 1) for kind in ("depth", "ir")))
     pairs, refused = find_pairs(tmp_path, "{view}_depth.png", "{view}_ir.png")
-    assert [pair.view for pair in pairs] == ["1", "2", "10"]
-    assert refused == []
+    assert list(pairs) == ["1", "2", "10"]
+    assert refused == {}
 
 
 @pytest.mark.parametrize("pattern", ["{}/{{view}}.png", "{}/*.png"])
 def test_images_may_lie_in_folders_of_their_own(tmp_path: Path, pattern: str) -> None:
     touch(tmp_path, "depth/a.png", "ir/a.png", "ir/notes.txt")
     pairs, _ = find_pairs(tmp_path, pattern.format("depth"), pattern.format("ir"))
-    assert [(p.depth.parent.name, p.infrared.parent.name) for p in pairs] == [("depth", "ir")]
+    assert pairs == {"a": {"depth": tmp_path / "depth/a.png", "infrared": tmp_path / "ir/a.png"}}
 
 
 def test_a_lost_image_costs_its_own_view_only(tmp_path: Path) -> None:
     touch(tmp_path, "1_depth.png", "1_ir.png", "2_depth.png", "3_ir.png", "4_depth.png", "4_ir.png")
     pairs, refused = find_pairs(tmp_path, "*_depth.png", "*_ir.png")
-    assert [pair.view for pair in pairs] == ["1", "4"]
-    assert [(r.view, r.reason) for r in refused] == [
-        ("2", "2_depth.png has no infrared image beside it"),
-        ("3", "3_ir.png has no depth image beside it"),
-    ]
+    assert list(pairs) == ["1", "4"]
+    assert refused == {
+        "2": "2_depth.png has no infrared image beside it",
+        "3": "3_ir.png has no depth image beside it",
+    }
 
 
 def test_several_wildcards_name_a_view_together(tmp_path: Path) -> None:
     touch(tmp_path, "run1_003_d.png", "run1_003_i.png", "run2_003_d.png", "run2_003_i.png")
     pairs, _ = find_pairs(tmp_path, "run?_*_d.png", "run?_*_i.png")
-    assert [pair.view for pair in pairs] == ["1-003", "2-003"]
+    assert list(pairs) == ["1-003", "2-003"]
 
 
 @pytest.mark.parametrize(

@@ -3,16 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.table import FrameRow
-from tofcorr.data.writing import write_recording
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.importing.images import DepthImage
+from tofcorr.importing.pose_track import PoseTrack
+from tofcorr.importing.posed import import_posed
+from tofcorr.importing.robot_images import PosedOptions, RobotImages
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
 from tofcorr.importing.walls.image_planes import WallOptions, planes_of_image
 
@@ -181,47 +184,54 @@ def hand_eye_anywhere(generator: np.random.Generator) -> np.ndarray:
     return transform
 
 
-def recorded(path: Path, room: Room, views: Views, guess: np.ndarray | None = None) -> Recording:
-    """Write views as a recording whose planes say nothing, as an importer has them at first."""
-    rows = [
-        FrameRow(
-            timestamp=float(k),
-            world_from_tool=pose,
-            normal_world=np.array([0.0, 0.0, -1.0]),
-            offset=1.0,
-            target="unknown",
+RADIAL = PosedOptions(depth_kind="radial")
+
+
+def imported(
+    out: Path,
+    camera: CameraIntrinsics,
+    poses: np.ndarray,
+    depth: np.ndarray,
+    amplitude: np.ndarray | None = None,
+    targets: np.ndarray | None = None,
+    options: PosedOptions = RADIAL,
+) -> tuple[Recording, dict[str, Any]]:
+    """Import depth, by default along the ray, and poses of the tool, paired in their order."""
+    names = [str(k) for k in range(len(depth))]
+
+    def read(k: int) -> DepthImage:
+        return DepthImage(
+            depth[k].astype(np.float32),
+            None if amplitude is None else amplitude[k].astype(np.float32),
         )
-        for k, pose in enumerate(views.world_from_tool)
-    ]
-    write_recording(
-        path,
-        camera=intrinsics(room.camera),
-        depth_kind="radial",
-        rows=rows,
-        depth=views.depth,
-        amplitude=views.amplitude,
-        tool_from_camera=guess,
+
+    images = RobotImages(
+        origin="room",
+        names=names,
+        camera=camera,
+        read=read,
+        track=PoseTrack.checked(poses, "room"),
+        targets=targets,
     )
-    return Recording.open(path)
+    report = import_posed(images, out, options)
+    return Recording.open(out), report
 
 
 def found_in(
     room: Room,
     views: Views,
-    guess: np.ndarray | None = None,
     options: WallOptions | None = None,
     targets: np.ndarray | None = None,
 ) -> FoundWalls:
     """Find the walls of views."""
     camera = intrinsics(room.camera)
-    return found_in_images(views.depth, camera, views.world_from_tool, guess, options, targets)
+    return found_in_images(views.depth, camera, views.world_from_tool, options, targets)
 
 
 def found_in_images(
     depth: Sequence[np.ndarray] | np.ndarray,
     camera: CameraIntrinsics,
     world_from_tool: np.ndarray,
-    guess: np.ndarray | None = None,
     options: WallOptions | None = None,
     targets: np.ndarray | None = None,
 ) -> FoundWalls:
@@ -229,8 +239,8 @@ def found_in_images(
     images = [torch.from_numpy(np.array(one, dtype=float)) for one in depth]
     given, rays, named = options or WallOptions(), ray_directions(camera), targets is not None
     planes = [planes_of_image(one, one.isfinite(), rays, given, named=named) for one in images]
-    pixels, start = camera.width * camera.height, np.eye(4) if guess is None else guess
-    return walls_of_planes(planes, pixels, world_from_tool, start, given, "room", targets)
+    names, pixels = [f"image {k}" for k in range(len(images))], camera.width * camera.height
+    return walls_of_planes(planes, names, pixels, world_from_tool, given, "room", targets)
 
 
 def looking_straight(number: int, roll: float, generator: np.random.Generator) -> np.ndarray:

@@ -18,7 +18,6 @@ from importing.walls.rendered_room import (
     looking_straight,
     poses_in_room,
 )
-from scipy.spatial.transform import Rotation
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.walls.finding import FoundWalls
@@ -41,8 +40,8 @@ def planes_shown(room: Room, found: FoundWalls) -> list[int]:
     shown = []
     for wall in found.walls:
         off = [
-            np.degrees(np.arccos(min(1.0, wall.normal_world @ np.array(normal)))) / NEAR_DEG
-            + abs(wall.offset - offset) * 1e3 / NEAR_MM
+            np.degrees(np.arccos(min(1.0, wall[:3] @ np.array(normal)))) / NEAR_DEG
+            + abs(wall[3] - offset) * 1e3 / NEAR_MM
             for normal, offset in room.planes
         ]
         assert min(off) < 2, wall
@@ -68,23 +67,22 @@ def test_three_walls_and_a_floor_are_found_and_every_view_is_of_its_wall(
     mm, degrees = apart(found.tool_from_camera, room.tool_from_camera)
     assert mm < NEAR_MM
     assert degrees < NEAR_DEG
-    for view in found.views:
-        true = views.plane[view.image]
-        assert (true == shown[view.wall]).mean() > 0.03
+    for image, wall in zip(found.image, found.wall, strict=True):
+        assert (views.plane[image] == shown[wall]).mean() > 0.03
     assert found.undetermined == []
-    assert found.warnings == []
+    assert found.warnings() == []
 
 
 def test_walls_are_named_by_their_pixels_and_the_lowest_horizontal_one_is_the_floor() -> None:
     room, views = room_and_views(3)
     found = found_in(room, views)
-    names = [wall.name for wall in found.walls]
+    names = found.names
     assert sorted(names) == ["floor", "wall 1", "wall 2", "wall 3"]
     assert planes_shown(room, found)[names.index("floor")] == 0
-    pixels = [wall.images * wall.share for wall in found.walls if wall.name != "floor"]
-    assert pixels == sorted(pixels, reverse=True)
+    pixels = (found.images * found.share)[np.array(names) != "floor"]
+    assert pixels.tolist() == sorted(pixels, reverse=True)
     plain = found_in(room, views, options=WallOptions(up="unknown"))
-    assert [wall.name for wall in plain.walls] == ["wall 1", "wall 2", "wall 3", "wall 4"]
+    assert plain.names == ["wall 1", "wall 2", "wall 3", "wall 4"]
 
 
 def test_parallel_walls_are_kept_apart_by_their_places() -> None:
@@ -104,22 +102,6 @@ def test_one_wall_is_enough_if_it_is_seen_tilted_about_two_axes(
     assert found.undetermined == []
 
 
-@pytest.mark.parametrize("degrees", [40.0, pytest.param(170.0, marks=pytest.mark.slow)])
-def test_a_wrong_guess_makes_no_difference(degrees: float) -> None:
-    room, views = room_and_views(6, clutter=0.2)
-    axis = np.array([0.6, 0.0, 0.8])
-    wrong = room.tool_from_camera.copy()
-    wrong[:3, :3] = wrong[:3, :3] @ Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix()
-    wrong[:3, 3] += 0.1
-    without, with_it = found_in(room, views), found_in(room, views, wrong)
-    assert [wall.name for wall in without.walls] == [wall.name for wall in with_it.walls]
-    assert [(v.image, v.wall) for v in without.views] == [(v.image, v.wall) for v in with_it.views]
-    mm, turned = apart(without.tool_from_camera, with_it.tool_from_camera)
-    # A tenth of what the camera's error leaves.
-    assert mm < NEAR_MM / 10
-    assert turned < NEAR_DEG / 10
-
-
 @pytest.mark.slow
 def test_the_answer_does_not_depend_on_the_order_of_the_images() -> None:
     room, views = room_and_views(7, clutter=0.2)
@@ -132,11 +114,11 @@ def test_the_answer_does_not_depend_on_the_order_of_the_images() -> None:
     )
     first, second = found_in(room, views), found_in(room, shuffled)
     np.testing.assert_array_equal(first.tool_from_camera, second.tool_from_camera)
-    for one, other in zip(first.walls, second.walls, strict=True):
-        assert (one.name, one.images, one.offset) == (other.name, other.images, other.offset)
-        np.testing.assert_array_equal(one.normal_world, other.normal_world)
-    places = {(int(order[view.image]), view.wall) for view in second.views}
-    assert places == {(view.image, view.wall) for view in first.views}
+    assert first.names == second.names
+    np.testing.assert_array_equal(first.walls, second.walls)
+    np.testing.assert_array_equal(first.images, second.images)
+    places = set(zip(order[second.image].tolist(), second.wall.tolist(), strict=True))
+    assert places == set(zip(first.image.tolist(), first.wall.tolist(), strict=True))
 
 
 def test_images_that_show_nothing_flat_are_left_out_with_the_reason() -> None:
@@ -145,11 +127,10 @@ def test_images_that_show_nothing_flat_are_left_out_with_the_reason() -> None:
     depth[3] = np.random.default_rng(0).uniform(0.5, 3.0, depth[3].shape)
     depth[11] = np.nan
     found = found_in(room, replace(views, depth=depth))
-    assert {3, 11}.isdisjoint({view.image for view in found.views})
-    reasons = {one.view: one.reason for one in found.left_out}
-    assert "nothing flat covers 5 %" in reasons["image 3"]
-    assert "nothing flat covers 5 %" in reasons["image 11"]
-    assert len(found.views) > 25
+    assert {3, 11}.isdisjoint(found.image)
+    assert "nothing flat covers 5 %" in found.left_out["image 3"]
+    assert "nothing flat covers 5 %" in found.left_out["image 11"]
+    assert len(found.image) > 25
 
 
 def test_a_plane_that_belongs_to_no_wall_is_left_out_with_its_distance() -> None:
@@ -159,8 +140,8 @@ def test_a_plane_that_belongs_to_no_wall_is_left_out_with_its_distance() -> None
     poses[4, :3, 3] += [0.3, 0.25, 0.3]
     found = found_in(room, replace(views, world_from_tool=poses))
     assert sorted(planes_shown(room, found)) == [0, 1, 2, 3]
-    assert 4 not in {view.image for view in found.views}
-    reasons = [one.reason for one in found.left_out if one.view.startswith("image 4,")]
+    assert 4 not in found.image
+    reasons = [why for view, why in found.left_out.items() if view.startswith("image 4,")]
     assert reasons
     assert all("mm from the nearest wall" in reason for reason in reasons)
 
@@ -173,12 +154,12 @@ def test_one_wall_seen_head_on_names_what_is_not_determined(roll: float) -> None
     found = found_in(room, views)
     (wall,) = found.walls
     # What is determined is right: the robot moves along the wall's normal.
-    assert np.degrees(np.arccos(-wall.normal_world[0])) < NEAR_DEG
+    assert np.degrees(np.arccos(-wall[0])) < NEAR_DEG
     text = "; ".join(found.undetermined)
     assert "of the hand-eye against the distance of wall 1" in text
     for symbol in ("t_x", "t_y", "w_z"):
         assert f"{symbol} of the hand-eye" in text
-    (warning,) = found.warnings
+    (warning,) = found.warnings()
     assert warning.startswith("The images do not determine: ")
     # Nothing is invented: along the wall the translation is that of the guess.
     assert np.linalg.norm(found.tool_from_camera[:3, 3]) < 0.02
@@ -204,10 +185,10 @@ def test_few_zones_before_named_walls_need_no_search_in_the_image() -> None:
     )
     whole = Room(camera=camera, planes=(FRONT, SLANTED), tool_from_camera=hand_eye)
     found = found_in(whole, views, targets=np.array(names))
-    assert [wall.name for wall in found.walls] == ["left", "right"]
+    assert found.names == ["left", "right"]
     assert planes_shown(whole, found) == [0, 1]
     assert apart(found.tool_from_camera, hand_eye)[1] < NEAR_DEG
-    assert all(view.gradient is None for view in found.views)
+    assert found.gradient is None
 
 
 def test_poses_that_do_not_belong_to_the_images_are_refused_in_words() -> None:

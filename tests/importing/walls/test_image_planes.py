@@ -18,7 +18,6 @@ from tofcorr.importing.walls.image_planes import (
     WallOptions,
     plane_masks,
     planes_of_image,
-    representative_points,
 )
 
 OPTIONS = WallOptions()
@@ -128,13 +127,9 @@ def test_without_noise_the_plane_is_exact() -> None:
         normal = pose[:3, :3].T @ np.array(ROOM[1][0])
         true = -normal / (np.array(ROOM[1][0]) @ pose[:3, 3] + ROOM[1][1])
         np.testing.assert_allclose(plane.gradient.numpy(), true, atol=1e-9)
-
-
-def test_four_points_stand_for_all_of_a_plane() -> None:
-    generator = torch.Generator().manual_seed(9)
-    flat = torch.randn(500, 3, generator=generator, dtype=torch.float64)
-    flat = flat * torch.tensor([0.4, 0.2, 0.0]) + torch.tensor([0.1, -0.3, 1.5])
-    four = representative_points(flat)
-    torch.testing.assert_close(four.mean(dim=0), flat.mean(dim=0))
-    centred, few = flat - flat.mean(dim=0), four - four.mean(dim=0)
-    torch.testing.assert_close(few.T @ few / 4, centred.T @ centred / 500)
+        points = depth[..., None] * exact.camera.rays
+        flat = points[np.isfinite(depth)]
+        # Four points stand for all: they have the same mean and second moments.
+        four = plane.points.numpy()
+        np.testing.assert_allclose(four.mean(axis=0), flat.mean(axis=0), atol=1e-9)
+        np.testing.assert_allclose(np.cov(four.T, ddof=0), np.cov(flat.T, ddof=0), atol=1e-9)

@@ -12,16 +12,16 @@ from importing.walls.rendered_room import (
     SLANTED,
     found_in_images,
     hand_eye_anywhere,
+    imported,
     poses_in_room,
 )
-from importing.walls.wall_trials import MOUNTS, ONE_PIXEL, WALLS, record_trials
+from importing.walls.wall_trials import MOUNTS, ONE_PIXEL, WALLS, read_trial
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import name_walls, walls_alone
-from tofcorr.importing.walls.recording import import_walls
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.options import TrainingOptions
 
@@ -33,10 +33,10 @@ REPEATABLE = 2.0
 
 
 @pytest.mark.parametrize(
-    "degrees", [*(pytest.param(one, marks=pytest.mark.slow) for one in (0.0, 40.0)), 150.0]
+    "seed", [*(pytest.param(one, marks=pytest.mark.slow) for one in (0, 40)), 150]
 )
-def test_ray_and_origin_are_found_from_distances_wherever_the_sensor_points(degrees: float) -> None:
-    generator = np.random.default_rng(int(degrees))
+def test_ray_and_origin_are_found_from_distances_wherever_the_sensor_points(seed: int) -> None:
+    generator = np.random.default_rng(seed)
     hand_eye = hand_eye_anywhere(generator)
     poses, distances, targets = [], [], []
     for name, (normal, offset), towards in (
@@ -50,16 +50,11 @@ def test_ray_and_origin_are_found_from_distances_wherever_the_sensor_points(degr
         distances.append(distance + 0.001 * generator.normal(size=len(distance)))
         targets += [name] * len(distance)
     images = np.concatenate(distances)[:, None, None]
-    guess = np.eye(4)
-    angle = np.radians(degrees)
-    guess[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    found = found_in_images(
-        images, ONE_PIXEL, np.concatenate(poses), guess, targets=np.array(targets)
-    )
-    assert [wall.name for wall in found.walls] == ["front", "slanted"]
+    found = found_in_images(images, ONE_PIXEL, np.concatenate(poses), targets=np.array(targets))
+    assert found.names == ["front", "slanted"]
     for wall, (normal, offset) in zip(found.walls, (FRONT, SLANTED), strict=True):
-        np.testing.assert_allclose(wall.normal_world, normal, atol=0.005)
-        assert wall.offset == pytest.approx(offset, abs=0.02)
+        np.testing.assert_allclose(wall[:3], normal, atol=0.005)
+        assert wall[3] == pytest.approx(offset, abs=0.02)
     ray, true = found.tool_from_camera[:3, 2], hand_eye[:3, 2]
     assert np.degrees(np.arccos(min(1.0, ray @ true))) < 0.3
     apart = found.tool_from_camera[:3, 3] - hand_eye[:3, 3]
@@ -70,12 +65,12 @@ def test_ray_and_origin_are_found_from_distances_wherever_the_sensor_points(degr
 
 
 def test_an_image_without_a_reading_is_left_out(tmp_path: Path, real_data: Path) -> None:
-    recording = record_trials(real_data, tmp_path / "source", "P1", ("R1",))
-    distance, table = np.array(recording.depth), recording.frames
+    poses, distance = read_trial(real_data, "R1", "P1")
     distance[5] = np.nan
-    found = found_in_images(distance, ONE_PIXEL, table.world_from_tool, targets=table.target)
-    assert 5 not in {view.image for view in found.views}
-    assert [one.view for one in found.left_out] == ["image 5"]
+    targets = np.full(len(poses), "R1")
+    found = found_in_images(distance[:, None, None], ONE_PIXEL, poses, targets=targets)
+    assert 5 not in found.image
+    assert list(found.left_out) == ["image 5"]
 
 
 def fitted(recording: Recording, degree: int, frames: np.ndarray | None = None) -> Fit:
@@ -87,18 +82,20 @@ def fitted(recording: Recording, degree: int, frames: np.ndarray | None = None) 
 
 
 @pytest.fixture(scope="module")
-def imported(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> TrialsOf:
+def trials_of(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> TrialsOf:
     """The trials of a mount before some walls, imported once for all laws."""
     out = tmp_path_factory.mktemp("trials")
 
     @cache
     def trials(mount: str, walls: tuple[str, ...]) -> Recording:
-        name = f"{mount}_{'_'.join(walls)}"
-        source = record_trials(real_data, out / f"{name}_source", mount, walls)
-        found = import_walls(source, out / name)
-        assert [wall.name for wall in found.walls] == list(walls)
-        assert "w_z of the hand-eye" in found.undetermined
-        return Recording.open(out / name)
+        parts = [read_trial(real_data, wall, mount) for wall in walls]
+        poses, depth = (np.concatenate(part) for part in zip(*parts, strict=True))
+        targets = np.repeat(walls, [len(own) for own, _ in parts])
+        where = out / f"{mount}_{'_'.join(walls)}"
+        recording, report = imported(where, ONE_PIXEL, poses, depth[:, None, None], None, targets)
+        assert [wall["name"] for wall in report["walls"]] == list(walls)
+        assert "w_z of the hand-eye" in report["undetermined"]
+        return recording
 
     return trials
 
@@ -117,17 +114,17 @@ EVERY_TRIAL = pytest.param(MOUNTS, WALLS, marks=pytest.mark.slow)
 # What a sensor of one ray can tell is held by the two quick tests around this one.
 @pytest.mark.parametrize(("mounts", "walls"), [EVERY_TRIAL])
 def test_the_origin_of_a_real_mount_repeats_across_its_ray_from_wall_to_wall(
-    imported: TrialsOf, mounts: tuple[str, ...], walls: tuple[str, ...]
+    trials_of: TrialsOf, mounts: tuple[str, ...], walls: tuple[str, ...]
 ) -> None:
     scores = []
     for mount in mounts:
-        together = fitted(imported(mount, WALLS), degree=1)
+        together = fitted(trials_of(mount, WALLS), degree=1)
         assert {"w_z"} <= {
             name for one in together.observability.undetermined for name in one.shares
         }
         place, covariance, ray = origin(together)
         for wall in walls:
-            alone = fitted(imported(mount, (wall,)), degree=1)
+            alone = fitted(trials_of(mount, (wall,)), degree=1)
             own_place, own_covariance, own_ray = origin(alone)
             # Along the ray a shift is a constant error of the distance: compared across it.
             apart = own_place - place
@@ -147,11 +144,11 @@ def test_the_origin_of_a_real_mount_repeats_across_its_ray_from_wall_to_wall(
 
 @pytest.mark.parametrize(("mounts", "walls"), [(("P2",), ("W1",)), EVERY_TRIAL])
 def test_three_real_walls_predict_the_distances_to_the_fourth(
-    imported: TrialsOf, mounts: tuple[str, ...], walls: tuple[str, ...]
+    trials_of: TrialsOf, mounts: tuple[str, ...], walls: tuple[str, ...]
 ) -> None:
     held_out, nearer = {}, {}
     for mount in mounts:
-        recording = imported(mount, WALLS)
+        recording = trials_of(mount, WALLS)
         dataset, depth = Dataset((recording,)), np.array(recording.depth)[:, 0, 0]
         for wall in walls:
             train = np.flatnonzero(dataset.targets != wall)

@@ -11,15 +11,14 @@ from importing.walls.rendered_room import (
     Views,
     apart,
     hand_eye_anywhere,
+    intrinsics,
     poses_in_room,
-    recorded,
 )
+from importing.walls.rendered_room import imported as imported_room
 
 import tofcorr
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.walls.finding import FoundWalls
-from tofcorr.importing.walls.recording import import_walls
 from tofcorr.pixels.dataset import Dataset
 
 EA = {
@@ -44,9 +43,9 @@ class Imported:
             camera=Camera(48, 40, 46.0), tool_from_camera=hand_eye_anywhere(generator), clutter=0.2
         )
         self.views: Views = self.room.views(poses_in_room(40, generator), generator)
-        self.source = recorded(folder / "source", self.room, self.views)
-        self.found: FoundWalls = import_walls(self.source, folder / "walls")
-        self.recording = Recording.open(folder / "walls")
+        camera, views = intrinsics(self.room.camera), self.views
+        given = (camera, views.world_from_tool, views.depth, views.amplitude)
+        self.recording, self.report = imported_room(folder / "walls", *given)
 
 
 @pytest.fixture(scope="module")
@@ -55,41 +54,37 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Imported:
 
 
 def test_each_image_and_wall_is_a_frame_with_a_mask_of_its_own(imported: Imported) -> None:
-    recording, source = imported.recording, imported.source
-    table = recording.frames
-    assert recording.num_frames == len(imported.found.views) > source.num_frames
+    recording, views, table = imported.recording, imported.views, imported.recording.frames
+    of_image = np.array([int(view["view"]) for view in imported.report["views"]])
+    assert recording.num_frames == len(of_image) > len(views.depth)
     assert recording.mask is not None
     assert table.pose_id is not None
-    for frame, view in enumerate(imported.found.views):
-        wall = imported.found.walls[view.wall]
-        assert table.target[frame] == wall.name
-        np.testing.assert_allclose(table.normal_world[frame], wall.normal_world, atol=1e-12)
-        assert table.timestamp[frame] == source.frames.timestamp[view.image]
-        np.testing.assert_allclose(
-            table.world_from_tool[frame], source.frames.world_from_tool[view.image], atol=1e-12
-        )
-        np.testing.assert_array_equal(recording.depth[frame], source.depth[view.image])
-        true = imported.views.plane[view.image][recording.mask[frame] == 1]
-        assert np.bincount(true + 1).max() > 0.9 * len(true)
-    of_image = [view.image for view in imported.found.views]
+    walls = {wall["name"]: wall for wall in imported.report["walls"]}
     masks = np.asarray(recording.mask, dtype=int)
+    for frame, image in enumerate(of_image):
+        wall = walls[str(table.target[frame])]
+        np.testing.assert_allclose(table.normal_world[frame], wall["normal_world"], atol=1e-12)
+        assert table.timestamp[frame] == image
+        np.testing.assert_allclose(
+            table.world_from_tool[frame], views.world_from_tool[image], atol=1e-12
+        )
+        np.testing.assert_allclose(recording.depth[frame], views.depth[image], rtol=1e-6)
+        true = views.plane[image][masks[frame] == 1]
+        assert np.bincount(true + 1).max() > 0.9 * len(true)
     for image in set(of_image):
-        own = np.array(of_image) == image
+        own = of_image == image
         assert len(set(table.pose_id[own])) == 1
         assert masks[own].sum(axis=0).max() == 1
     assert len(np.unique(Dataset((recording,)).pose_groups())) == len(set(of_image))
 
 
-def test_the_header_says_that_the_planes_are_estimated(imported: Imported) -> None:
+def test_header_and_report_say_what_was_found_and_what_was_not(imported: Imported) -> None:
     header = yaml.safe_load((imported.recording.path / "recording.yaml").read_text())
+    report = imported.report
     assert header["planes"] == "estimated"
-    np.testing.assert_allclose(header["tool_from_camera"], imported.found.tool_from_camera)
-
-
-def test_the_report_names_what_was_left_out(imported: Imported) -> None:
-    report = imported.found.to_mapping()
+    np.testing.assert_allclose(header["tool_from_camera"], report["tool_from_camera"])
     assert {wall["name"] for wall in report["walls"]} >= {"wall 1", "floor"}
-    assert all(one["view"] and one["reason"] for one in report["left_out"])
+    assert all(one["view"] and one["reason"] for one in report["refused"])
     assert report["undetermined"] == []
 
 
@@ -103,7 +98,7 @@ def test_training_finds_the_hand_eye_without_being_told_anything(imported: Impor
     assert degrees < 0.1
     # Noise of 3 mm along the ray is less towards the plane.
     assert report["error_mm"]["after"]["test"]["rms"] < 3.0
-    assert {wall["wall"] for wall in report["walls"]} == {w.name for w in imported.found.walls}
+    assert {wall["wall"] for wall in report["walls"]} == set(imported.recording.frames.target)
 
 
 def test_evaluating_judges_every_column_against_walls_of_its_own(
@@ -147,15 +142,6 @@ def test_checking_uses_no_estimated_plane(imported: Imported, tmp_path: Path) ->
         tofcorr.check(tmp_path / "run", one).to_mapping() for one in (imported.recording, bent)
     )
     assert first == second
-
-
-def test_a_strip_of_another_wall_is_in_no_mask(imported: Imported) -> None:
-    """Too narrow to be found in the image, it passed for the wall beside it near the crease."""
-    assert imported.recording.mask is not None
-    for frame, view in enumerate(imported.found.views):
-        true = imported.views.plane[view.image][imported.recording.mask[frame] == 1]
-        of_walls = np.bincount(true[true >= 0])
-        assert of_walls.max() == of_walls.sum()
 
 
 def test_an_outlier_window_around_estimated_planes_is_refused(imported: Imported) -> None:

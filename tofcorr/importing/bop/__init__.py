@@ -1,1 +1,45 @@
 """Scenes in BOP's layout, and BlenderProc's HDF5 files: depth with the camera's own poses."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tofcorr.files import NewPath
+from tofcorr.importing.command_line import (
+    posed_options,
+    print_report,
+    progress_bar,
+    take_posed_options,
+)
+
+
+@click.command(name="bop")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
+@click.option(
+    "--amplitude",
+    "amplitude_pattern",
+    help="Names of 16-bit amplitude images, such as 'gray/*.png'; left out: none.",
+)
+@click.option("--intrinsics", help="For HDF5 without cam_K: a file, or a shipped name.")
+@posed_options
+def command(scene: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
+    """Import SCENE: a folder of BOP's layout, or of BlenderProc's HDF5 files.
+
+    A BOP scene holds scene_camera.json with the camera's poses (cam_R_w2c, cam_t_w2c) and
+    depth/*.png. The poses are the camera's own: the tool is the camera, and tool_from_camera the
+    identity.
+    """
+    from tofcorr.importing.bop.scene import import_scene
+
+    amplitude, intrinsics = given.pop("amplitude_pattern"), given.pop("intrinsics")
+    report = import_scene(
+        scene,
+        out,
+        take_posed_options(given),
+        amplitude_pattern=amplitude,
+        intrinsics=intrinsics,
+        progress=progress_bar,
+    )
+    print_report(report, out)

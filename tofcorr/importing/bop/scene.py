@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.importing.frames.source import found_images, open_folder
-from tofcorr.importing.images import DepthCoding, DepthImage
+from tofcorr.importing.frames.source import open_folder
+from tofcorr.importing.images import DepthCoding, DepthImage, matching_files, of_size
 from tofcorr.importing.intrinsics import (
     GivenIntrinsics,
     intrinsics_from_mapping,
     read_named_intrinsics,
 )
-from tofcorr.importing.pose_files import any_numbers
+from tofcorr.importing.numbers import any_numbers
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.posed import import_posed
 from tofcorr.importing.robot_images import PosedOptions, RobotImages
@@ -28,9 +28,6 @@ _TOOL_IS_CAMERA = np.eye(4)
 _POSE_KEYS = ("cam2world_matrix", "cam2world", "cam_pose")
 _STATE = "campose"
 """Text of the camera's state (BlenderProc's CameraStateWriter)."""
-
-_BACKGROUND = 1e4
-"""Metres from which on nothing was hit: Blender writes 1e10."""
 
 
 def import_scene(
@@ -110,21 +107,18 @@ def read_scene_camera(path: Path) -> tuple[GivenIntrinsics, float, PoseTrack]:
             "objects do not tell where the camera is; without poses a hand-eye transform cannot be "
             "estimated."
         )
-    poses = []
-    for name, image in posed.items():
+    poses = np.tile(np.eye(4), (len(posed), 1, 1))
+    for pose, (name, image) in zip(poses, posed.items(), strict=True):
         # The pose is inverted; its translation is in millimetres.
         rotation = _numbers(image, "cam_R_w2c", 9, f"{path}: image {name}").reshape(3, 3).T
-        translation = 1e-3 * _numbers(image, "cam_t_w2c", 3, f"{path}: image {name}")
-        poses.append(np.eye(4))
-        poses[-1][:3, :3], poses[-1][:3, 3] = rotation, -rotation @ translation
+        translation = _numbers(image, "cam_t_w2c", 3, f"{path}: image {name}") / 1000
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ translation
     where = f"{path}: image {first}"
     (unit,) = _numbers(images[first], "depth_scale", 1, where)
     if unit <= 0:
         raise CalibrationDataError(f"{path}: 'depth_scale' must be positive, got {unit:g}.")
     matrix = _numbers(images[first], "cam_K", 9, where).tolist()
-    track = PoseTrack.checked(
-        np.stack(poses), str(path), names=[f"{int(name):06d}" for name in posed]
-    )
+    track = PoseTrack.checked(poses, str(path), names=[f"{int(name):06d}" for name in posed])
     return intrinsics_from_mapping({"K": matrix}, str(path)), float(unit), track
 
 
@@ -170,7 +164,7 @@ def _open_hdf5(folder: Path, intrinsics: GivenIntrinsics | None) -> tuple[RobotI
         CalibrationDataError: A file is damaged, or has no depth, pose or intrinsics; or the package
             h5py is missing.
     """
-    found = found_images(folder, "*.hdf5", "HDF5")[0]
+    found = matching_files(folder, "*.hdf5", "HDF5")
     paths = list(found.values())
     with _opened(paths[0]) as file:
         key = next((key for key in ("depth", "distance") if key in file), None)
@@ -179,12 +173,17 @@ def _open_hdf5(folder: Path, intrinsics: GivenIntrinsics | None) -> tuple[RobotI
             raise CalibrationDataError(
                 f"{paths[0]}: expected 'depth' or 'distance', found {listed}."
             )
+        if intrinsics is None:
+            matrix = _value(file, ("cam_K", "K"))
+            if matrix is None:
+                raise CalibrationDataError(
+                    f"{paths[0]}: no intrinsics ('cam_K'); name a file: --intrinsics."
+                )
+            values = {"K": np.asarray(matrix).tolist()}
+            intrinsics = intrinsics_from_mapping(values, str(paths[0]))
         height, width = _image(file, key, paths[0]).shape
-        camera = (intrinsics or _intrinsics(file, paths[0])).camera((width, height))
-    poses = []
-    for path in paths:
-        with _opened(path) as file:
-            poses.append(_world_from_camera(file, path))
+        camera = intrinsics.camera((width, height))
+    poses = np.stack([_world_from_camera(path) for path in paths])
 
     def read(number: int) -> DepthImage:
         try:
@@ -192,19 +191,17 @@ def _open_hdf5(folder: Path, intrinsics: GivenIntrinsics | None) -> tuple[RobotI
                 depth = _image(file, key, paths[number])
         except CalibrationDataError as error:
             raise RefusedViewError(str(error).rstrip(".")) from None
-        if depth.shape != (height, width):
-            raise RefusedViewError(
-                f"it has {depth.shape[1]}x{depth.shape[0]} pixels, the others {width}x{height}"
-            )
-        usable = np.isfinite(depth) & (depth > 0) & (depth < _BACKGROUND)
-        return DepthImage(np.where(usable, depth, np.nan).astype(np.float32))
+        # Blender writes 1e10 m where nothing was hit.
+        usable = np.isfinite(depth) & (depth > 0) & (depth < 10_000)
+        image = DepthImage(np.where(usable, depth, np.nan).astype(np.float32))
+        return of_size(image, camera)
 
     images = RobotImages(
         origin=str(folder),
         names=list(found),
         camera=camera,
         read=read,
-        track=PoseTrack.checked(np.stack(poses), str(folder)),
+        track=PoseTrack.checked(poses, str(folder)),
         tool_from_camera=_TOOL_IS_CAMERA,
     )
     return images, key
@@ -237,23 +234,22 @@ def _image(file: Any, key: str, path: Path) -> np.ndarray:  # noqa: ANN401 - of 
     return depth.astype(np.float64)
 
 
-def _state(file: Any) -> dict[str, Any]:  # noqa: ANN401 - of h5py
-    """Return the camera's state; empty where there is none."""
-    if _STATE not in file:
-        return {}
+def _value(file: Any, keys: tuple[str, ...]) -> Any:  # noqa: ANN401 - of h5py
+    """Return what a file, or else the camera's state in it, has under the first of some keys."""
+    for key in keys:
+        if key in file:
+            return np.asarray(file[key])
     try:
         state = json.loads(bytes(np.asarray(file[_STATE][()])).decode("utf-8"))
-    except ValueError:
-        return {}
+    except (KeyError, ValueError):
+        return None
     state = state[0] if isinstance(state, list) and state else state
-    return state if isinstance(state, dict) else {}
+    return state.get(keys[0]) if isinstance(state, dict) else None
 
 
-def _world_from_camera(file: Any, path: Path) -> np.ndarray:  # noqa: ANN401 - of h5py
-    given = next((np.asarray(file[key]) for key in _POSE_KEYS if key in file), None)
-    if given is None:
-        given = _state(file).get("cam2world_matrix")
-    pose = any_numbers(given)
+def _world_from_camera(path: Path) -> np.ndarray:
+    with _opened(path) as file:
+        pose = any_numbers(_value(file, _POSE_KEYS))
     if pose.shape != (4, 4):
         raise CalibrationDataError(
             f"{path}: no pose of the camera; expected one of {', '.join(_POSE_KEYS)} (4x4, "
@@ -262,11 +258,3 @@ def _world_from_camera(file: Any, path: Path) -> np.ndarray:  # noqa: ANN401 - o
         )
     # Blender's camera looks along -z with y up; OpenCV's along z with y down.
     return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def _intrinsics(file: Any, path: Path) -> GivenIntrinsics:  # noqa: ANN401 - of h5py
-    key = next((key for key in ("cam_K", "K") if key in file), None)
-    matrix = np.asarray(file[key]).tolist() if key else _state(file).get("cam_K")
-    if matrix is None:
-        raise CalibrationDataError(f"{path}: no intrinsics ('cam_K'); name a file: --intrinsics.")
-    return intrinsics_from_mapping({"K": matrix}, str(path))

@@ -19,8 +19,8 @@ from tofcorr.importing.checkerboard.boards import FlatBoard
 from tofcorr.importing.checkerboard.pose import BoardPose, poses_of
 from tofcorr.importing.run import RefusedViewError
 
-_FEWEST_PIXELS, _SMALLEST_SHARE = 50, 0.2
-"""Fewest board pixels with depth, and their smallest share of all board pixels (no unit)."""
+_FEWEST_PIXELS = 50
+"""Fewest board pixels with depth; a fifth of all board pixels must have it, too."""
 
 _LARGEST_TILT_DEG = 25.0
 """Largest angle between the plane of the depth image and the board's pose, degrees: boards taken
@@ -37,11 +37,14 @@ intrinsics and of a printed board."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DepthAgreement:
-    """Measured depth against the pose of one board.
+class BoardView:
+    """A view whose board has a pose: measured depth against it.
 
     Attributes:
-        usable_pixels: Board pixels with depth and below saturation.
+        name: What the view is called.
+        pose: The board in the camera frame.
+        board_pixels: Pixels that see the board.
+        usable_pixels: Those with depth and below saturation.
         distance: Median true radial distance, metres.
         error: Median of measured minus true depth, of the kind recorded, metres.
         ratio: Median of measured over true distance.
@@ -49,6 +52,9 @@ class DepthAgreement:
             measured minus true radial distance) and a the angle to the optical axis.
     """
 
+    name: str
+    pose: BoardPose
+    board_pixels: int
     usable_pixels: int
     distance: float
     error: float
@@ -57,20 +63,22 @@ class DepthAgreement:
 
 
 def compare_depth(
+    name: str,
+    pose: BoardPose,
     depth: np.ndarray,
     usable: np.ndarray,
     area: np.ndarray,
-    pose: BoardPose,
     rays: np.ndarray,
     depth_kind: DepthKind,
-) -> DepthAgreement:
+) -> BoardView:
     """Compare one depth image with the board's pose.
 
     Args:
+        name: What the view is called.
+        pose: Pose of the board.
         depth: Shape (H, W), metres, of `depth_kind`.
         usable: Which depth values may be used, shape (H, W), bool.
         area: Which pixels see the board, shape (H, W), bool.
-        pose: Pose of the board.
         rays: Shape (H, W, 3).
         depth_kind: `radial` or `z`.
 
@@ -78,10 +86,10 @@ def compare_depth(
         RefusedViewError: Too few pixels have depth, or the depth has another tilt.
     """
     seen = area & usable
-    if seen.sum() < max(_FEWEST_PIXELS, _SMALLEST_SHARE * area.sum()):
+    if seen.sum() < max(_FEWEST_PIXELS, area.sum() / 5):
         raise RefusedViewError(
             f"only {seen.sum()} of {area.sum()} board pixels have depth below saturation; "
-            f"{_FEWEST_PIXELS} and {_SMALLEST_SHARE:.0%} are needed"
+            f"{_FEWEST_PIXELS} and {1 / 5:.0%} are needed"
         )
     rays = rays[seen]
     cosine = rays[:, 2]
@@ -94,15 +102,17 @@ def compare_depth(
     # Noisy depth has no tilt; `refuse_mixed_up` still checks the ratio.
     if len(near) >= _FEWEST_PIXELS:
         normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2]
-        agree = min(abs(float(normal @ pose.plane()[0])), 1.0)
-        tilt = float(np.degrees(np.arccos(agree)))
+        tilt = float(np.degrees(np.arccos(min(abs(float(normal @ pose.plane()[0])), 1.0))))
         if tilt > _LARGEST_TILT_DEG:
             raise RefusedViewError(
                 f"the depth image shows a plane tilted by {tilt:.0f} degrees against the board's "
                 "pose; are the two images of the same view?"
             )
     columns = np.stack([np.ones_like(true), true, true * (1.0 - cosine), errors])
-    return DepthAgreement(
+    return BoardView(
+        name=name,
+        pose=pose,
+        board_pixels=int(area.sum()),
         usable_pixels=int(seen.sum()),
         distance=float(np.median(true)),
         error=float(np.median(errors * along)),
@@ -111,14 +121,14 @@ def compare_depth(
     )
 
 
-def typical_ratio(agreements: Sequence[DepthAgreement]) -> float:
+def typical_ratio(views: Sequence[BoardView]) -> float:
     """Return the median ratio of measured to true distance.
 
     Raises:
         CalibrationDataError: It is so far from 1 that a unit must be wrong: units differ by factors
             of 10 and more, cameras by a tenth.
     """
-    ratio = float(np.median([agreement.ratio for agreement in agreements]))
+    ratio = float(np.median([view.ratio for view in views]))
     if not 0.5 < ratio < 2:
         raise CalibrationDataError(
             f"the depth images read {ratio:.3g} times the distance at which the corners place the "
@@ -127,34 +137,34 @@ def typical_ratio(agreements: Sequence[DepthAgreement]) -> float:
     return ratio
 
 
-def refuse_mixed_up(agreement: DepthAgreement, ratio: float) -> None:
+def refuse_mixed_up(view: BoardView, ratio: float) -> None:
     """Refuse a view whose ratio of measured to true distance differs much from `ratio` of all.
 
     Raises:
         RefusedViewError: Depth and infrared image are not of the same view, or the pose is wrong.
     """
-    if abs(agreement.ratio / ratio - 1.0) > _TENTH:
+    if abs(view.ratio / ratio - 1.0) > _TENTH:
         raise RefusedViewError(
-            f"the depth image reads {agreement.ratio * agreement.distance:.3f} m where the board "
-            f"stands at {agreement.distance:.3f} m, other views {ratio:.3f} times the distance; "
+            f"the depth image reads {view.ratio * view.distance:.3f} m where the board "
+            f"stands at {view.distance:.3f} m, other views {ratio:.3f} times the distance; "
             "are the two images of the same view?"
         )
 
 
-def agreement_warnings(agreements: Sequence[DepthAgreement], depth_kind: DepthKind) -> list[str]:
+def agreement_warnings(views: Sequence[BoardView], depth_kind: DepthKind) -> list[str]:
     """Return warnings about the unit and the kind of depth.
 
     The radial error is regressed on D (1 - cosine), with a constant and D as further regressors:
     radial depth declared as z gives a slope of +1, z depth declared as radial gives -1.
     """
     warnings = []
-    ratio = typical_ratio(agreements)
+    ratio = typical_ratio(views)
     if abs(ratio - 1.0) > _TENTH / 2:
         warnings.append(
             f"Depth reads {100 * (ratio - 1):+.1f} % against the board: check the square length, "
             "the focal length and the unit of depth before calling it a distance error."
         )
-    moments = np.sum([agreement.kind_moments for agreement in agreements], axis=0)
+    moments = np.sum([view.kind_moments for view in views], axis=0)
     # After removing constant and D, D (1 - cosine) must vary by more than the camera's own error,
     # some millimetres, to estimate its slope.
     explained = moments[2, :2] @ np.linalg.pinv(moments[:2, :2]) @ moments[:2, 2]
@@ -225,25 +235,22 @@ def degeneracy_warning(found: dict[str, Any]) -> str:
     """Return the result of `study_degeneracy` as a sentence with numbers."""
     given, (shorter, longer, larger) = found["as_given"], found["alternatives"]
     pixels, slope, mean = "reprojection_rms_px", "slope_mm_per_m", "mean_error_mm"
-    text = (
-        "A board cannot tell focal length, square length and slope of the distance error "
-        f"apart: with the focal length {_CHANGES['focal']:.0%} shorter or longer the reprojection "
-        f"error is {shorter[pixels]:.3f} or {longer[pixels]:.3f} px "
-        f"instead of {given[pixels]:.3f} px"
-    )
+    slopes = larger_slope = ""
     if given[slope] is not None:
-        text += (
+        slopes = (
             f", yet the slope of the depth error is {shorter[slope]:+.1f} or "
             f"{longer[slope]:+.1f} instead of {given[slope]:+.1f} mm/m"
         )
-    text += (
+    if larger[slope] is not None:
+        larger_slope = f"the slope {larger[slope]:+.1f} mm/m, "
+    return (
+        "A board cannot tell focal length, square length and slope of the distance error "
+        f"apart: with the focal length {_CHANGES['focal']:.0%} shorter or longer the reprojection "
+        f"error is {shorter[pixels]:.3f} or {longer[pixels]:.3f} px "
+        f"instead of {given[pixels]:.3f} px{slopes}"
         f", and its mean {shorter[mean]:+.1f} or {longer[mean]:+.1f} instead "
         f"of {given[mean]:+.1f} mm; squares {_CHANGES['square']:.0%} larger leave the "
-        "reprojection error as it is and make "
-    )
-    if larger[slope] is not None:
-        text += f"the slope {larger[slope]:+.1f} mm/m, "
-    return text + (
-        f"the mean {larger[mean]:+.1f} mm. Measure the printed board, and take the "
-        "focal length from a source of its own, before trusting offset and slope."
+        f"reprojection error as it is and make {larger_slope}the mean {larger[mean]:+.1f} mm. "
+        "Measure the printed board, and take the focal length from a source of its own, before "
+        "trusting offset and slope."
     )

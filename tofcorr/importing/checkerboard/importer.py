@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -13,12 +12,11 @@ from pydantic import Field
 from tofcorr.data.recording import DepthKind
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
-from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.checkerboard.boards import BOARDS, FlatBoard
 from tofcorr.importing.checkerboard.checks import (
-    DepthAgreement,
+    BoardView,
     agreement_warnings,
     compare_depth,
     degeneracy_warning,
@@ -26,19 +24,14 @@ from tofcorr.importing.checkerboard.checks import (
     study_degeneracy,
     typical_ratio,
 )
-from tofcorr.importing.checkerboard.pose import (
-    BoardPose,
-    calibrate,
-    calibration_warning,
-    estimate_pose,
-)
-from tofcorr.importing.images import matching_files, natural_order, read_image
+from tofcorr.importing.checkerboard.pose import calibrate, calibration_warning, estimate_pose
+from tofcorr.importing.images import DepthImage, files_of_views, of_size, read_image
 from tofcorr.importing.intrinsics import GivenIntrinsics
 from tofcorr.importing.run import (
     Frame,
     PreparedImport,
     Progress,
-    Refusal,
+    Refused,
     RefusedViewError,
     Sieve,
     camera_mapping,
@@ -49,6 +42,8 @@ from tofcorr.options import Options
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 CornerCount = Annotated[int, Field(ge=3)]
+Files = dict[str, Path]
+"""The images of one view by their kind."""
 
 
 class CheckerboardOptions(Options):
@@ -99,68 +94,21 @@ class CheckerboardOptions(Options):
         )
 
 
-class ImagePair(NamedTuple):
-    """The two images of one view."""
-
-    view: str
-    depth: Path
-    infrared: Path
-
-
 class BoardImages(NamedTuple):
-    """Pairs of a depth image and an image that shows the board's corners.
+    """Depth images, each with an image that shows the board's corners.
 
     Attributes:
-        pairs: The pairs.
-        alone: The images without their partner.
-        with_corners: Reads the image that shows the corners, shape (H, W); raises
-            `RefusedViewError` if it cannot be used.
-        measured: Reads depth in metres (NaN: no return) and amplitude, each of shape (H, W);
-            raises `RefusedViewError` if one cannot be used, or has another size than the camera.
+        views: The files of each view, by their kind; `depth` and `infrared` are among them.
+        alone: Why other views lack some.
+        with_corners: Reads the image that shows the corners, shape (H, W), from the files of a
+            view; raises `RefusedViewError` if it cannot be used.
+        measured: Reads depth and amplitude from them in the same way.
     """
 
-    pairs: Sequence[ImagePair]
-    alone: Sequence[Refusal]
-    with_corners: Callable[[ImagePair], np.ndarray]
-    measured: Callable[[ImagePair, CameraIntrinsics], tuple[np.ndarray, np.ndarray | None]]
-
-
-def find_pairs(
-    folder: Path, depth_pattern: str, infrared_pattern: str
-) -> tuple[list[ImagePair], list[Refusal]]:
-    """Pair the images whose wildcards match the same text.
-
-    Images are never paired by their order: one missing file would shift all that follow.
-
-    Args:
-        folder: The folder that the patterns are relative to.
-        depth_pattern: File name with `{view}`, or a glob with `*` and `?`; may name sub-folders.
-        infrared_pattern: The same for the infrared images.
-
-    Returns:
-        The pairs in natural order (2 before 10), and a refusal for each image without its partner.
-
-    Raises:
-        CalibrationDataError: There is no such folder, a pattern has no wildcard or matches
-            nothing, or no two images belong together.
-    """
-    depth = matching_files(folder, depth_pattern, "depth")
-    infrared = matching_files(folder, infrared_pattern, "infrared")
-    pairs = [ImagePair(v, path, infrared[v]) for v, path in depth.items() if v in infrared]
-    if not pairs:
-        first, other = (next(iter(found.values())).name for found in (depth, infrared))
-        raise CalibrationDataError(
-            f"{folder}: no depth image has an infrared image of the same name: '{depth_pattern}' "
-            f"matches '{first}', '{infrared_pattern}' matches '{other}'. The "
-            "text that {view} (or *) matches must be the same in both."
-        )
-    alone = [
-        Refusal(v, f"{path.name} has no {other} image beside it")
-        for mine, other, theirs in ((depth, "infrared", infrared), (infrared, "depth", depth))
-        for v, path in mine.items()
-        if v not in theirs
-    ]
-    return pairs, sorted(alone, key=lambda refusal: natural_order(refusal.view))
+    views: dict[str, Files]
+    alone: Refused
+    with_corners: Callable[[Files], np.ndarray]
+    measured: Callable[[Files], DepthImage]
 
 
 def sixteen_bit_images(folder: Path, options: CheckerboardOptions) -> BoardImages:
@@ -179,27 +127,13 @@ def sixteen_bit_images(folder: Path, options: CheckerboardOptions) -> BoardImage
             )
         return image
 
-    def measured(pair: ImagePair, camera: CameraIntrinsics) -> tuple[np.ndarray, np.ndarray]:
-        depth, infrared = counts(pair.depth), counts(pair.infrared)
-        refuse_other_size(pair.infrared, infrared, camera)
-        refuse_other_size(pair.depth, depth, camera)
-        return np.where(depth > 0, depth * options.depth_unit, np.nan), infrared
+    def measured(files: Files) -> DepthImage:
+        depth, infrared = counts(files["depth"]), counts(files["infrared"])
+        return DepthImage(np.where(depth > 0, depth * options.depth_unit, np.nan), infrared)
 
-    found = find_pairs(folder, options.depth_pattern, options.infrared_pattern)
-    return BoardImages(*found, lambda pair: counts(pair.infrared), measured)
-
-
-def refuse_other_size(path: Path, image: np.ndarray, camera: CameraIntrinsics) -> None:
-    """Refuse an image of another size than the camera's.
-
-    Raises:
-        RefusedViewError: It has another size; the message names its file.
-    """
-    if image.shape != (camera.height, camera.width):
-        raise RefusedViewError(
-            f"{path.name} has {image.shape[1]}x{image.shape[0]} pixels, the other images have "
-            f"{camera.width}x{camera.height}"
-        )
+    patterns = {"depth": options.depth_pattern, "infrared": options.infrared_pattern}
+    found = files_of_views(folder, patterns)
+    return BoardImages(*found, lambda files: counts(files["infrared"]), measured)
 
 
 def import_checkerboard(
@@ -234,25 +168,6 @@ def import_checkerboard(
     return run_import(str(folder), options, prepare, out, progress)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BoardView:
-    """A view whose board has a pose.
-
-    Attributes:
-        pair: Its two images.
-        corners: Pixel coordinates of the points, shape (N, 2).
-        pose: The board in the camera frame.
-        pixels: Number of pixels that see the board.
-        agreement: The measured depth against the pose.
-    """
-
-    pair: ImagePair
-    corners: np.ndarray
-    pose: BoardPose
-    pixels: int
-    agreement: DepthAgreement
-
-
 def _prepared(
     folder: Path,
     options: CheckerboardOptions,
@@ -262,33 +177,58 @@ def _prepared(
 ) -> PreparedImport:
     """Find the boards, calibrate the camera if asked to, and place the boards."""
     board = options.board()
-    sieve.refused += images.alone
-    detected = sieve.apply(
-        # One hint is enough, and looking for a second board takes time.
-        lambda pair: _detected(pair, images, board, look_for_smaller=not sieve.refused),
-        sieve.progress(images.pairs, "finding boards"),
-        lambda pair: pair.view,
-    )
-    camera, about_camera, warnings = _camera(detected, board, intrinsics)
-    rays = ray_directions(camera).numpy()
-    views = sieve.apply(
-        lambda one: _placed(one[0], one[1], images, options, camera, rays),
-        sieve.progress(detected, "placing boards"),
-        lambda one: one[0].view,
-    )
-    ratio = typical_ratio([view.agreement for view in views])
+    sieve.refused |= images.alone
+    detected: dict[str, tuple[np.ndarray, tuple[int, int]]] = {}
 
-    def checked(view: BoardView) -> BoardView:
-        refuse_mixed_up(view.agreement, ratio)
+    def detect(view: str) -> None:
+        image, files = images.with_corners(images.views[view]), images.views[view]
+        # One hint is enough, and looking for a second board takes time.
+        corners = _corners(image, board, files["infrared"].name, hint=not sieve.refused)
+        detected[view] = corners, (image.shape[1], image.shape[0])
+
+    def read(view: str) -> DepthImage:
+        files = images.views[view]
+        names = files["depth"].name, files.get("amplitude", files["infrared"]).name
+        return of_size(images.measured(files), camera, names, "the other images have")
+
+    def place(view: str) -> BoardView:
+        pose = estimate_pose(detected[view][0], board, camera, options.max_reprojection_px)
+        depth, amplitude = read(view)
+        area = pose.area(board, rays, options.margin_squares)
+        usable = np.isfinite(depth)
+        if options.saturation_counts is not None and amplitude is not None:
+            usable &= amplitude < options.saturation_counts
+        return compare_depth(view, pose, depth, usable, area, rays, options.depth_kind)
+
+    def check(view: BoardView) -> BoardView:
+        refuse_mixed_up(view, ratio)
         return view
 
-    views = sieve.apply(checked, views, lambda view: view.pair.view)
-    posed = [(view.corners, view.pose, view.agreement.error) for view in views]
+    sieve.apply(detect, sieve.progress(list(images.views), "finding boards"), str)
+    camera, about_camera, warnings = _camera(list(detected.values()), board, intrinsics)
+    rays = ray_directions(camera).numpy()
+    views = sieve.apply(place, sieve.progress(list(detected), "placing boards"), str)
+    ratio = typical_ratio(views)
+    views = sieve.apply(check, views, lambda view: view.name)
+    posed = [(detected[view.name][0], view.pose, view.error) for view in views]
     degeneracy = study_degeneracy(posed, board, camera, options.depth_kind)
-    warnings += agreement_warnings([view.agreement for view in views], options.depth_kind)
+    warnings += agreement_warnings(views, options.depth_kind)
+
+    def frames() -> Iterator[Frame]:
+        for index, view in enumerate(views):
+            normal, offset = view.pose.plane()
+            row = FrameRow(
+                timestamp=float(index),  # The files do not say when an image was taken.
+                world_from_tool=np.eye(4),
+                normal_world=normal,
+                offset=offset,
+                target=board.kind,
+            )
+            yield row, *read(view.name), view.pose.area(board, rays, options.margin_squares)
+
     return PreparedImport(
-        views=[_reported(view, board, folder) for view in views],
-        frames=_frames(views, board, images, camera, rays, options.margin_squares),
+        views=[_reported(view, board, images.views[view.name], folder) for view in views],
+        frames=frames(),
         writer=partial(
             RecordingWriter,
             camera=camera,
@@ -302,102 +242,57 @@ def _prepared(
     )
 
 
-def _detected(
-    pair: ImagePair, images: BoardImages, board: FlatBoard, *, look_for_smaller: bool
-) -> tuple[ImagePair, np.ndarray, tuple[int, int]]:
-    """Find the board's corners in an image, shape (N, 2); return the image's size too.
+def _corners(image: np.ndarray, board: FlatBoard, name: str, *, hint: bool) -> np.ndarray:
+    """Find the board's corners in an image, shape (N, 2).
 
-    If no board is found, one with a row and a column fewer may be tried: a common mistake is to
+    If no board is found, a hint may try one with a row and a column fewer: a common mistake is to
     count squares instead of inner corners.
     """
-    image = images.with_corners(pair)
     corners = board.find(image)
     if corners is not None:
-        return pair, corners, (image.shape[1], image.shape[0])
+        return corners
     fewer = board.fewer()
-    hint = ""
-    if look_for_smaller and fewer is not None and fewer.find(image) is not None:
-        hint = f", but one of {fewer}: count inner corners, not squares"
+    said = ""
+    if hint and fewer is not None and fewer.find(image) is not None:
+        said = f", but one of {fewer}: count inner corners, not squares"
     what = f"board of {board} inner corners" if fewer else f"board {board}"
-    raise RefusedViewError(f"no {what} found in {pair.infrared.name}{hint}")
+    raise RefusedViewError(f"no {what} found in {name}{said}")
 
 
 def _camera(
-    detected: Sequence[tuple[ImagePair, np.ndarray, tuple[int, int]]],
+    detected: Sequence[tuple[np.ndarray, tuple[int, int]]],
     board: FlatBoard,
     intrinsics: GivenIntrinsics | None,
 ) -> tuple[CameraIntrinsics, dict[str, Any], list[str]]:
     """Return the camera of the images' commonest size, what to report of it, and warnings."""
-    size = Counter(size for _, _, size in detected).most_common(1)[0][0]
+    size = Counter(size for _, size in detected).most_common(1)[0][0]
     if intrinsics is not None:
         camera = intrinsics.camera(size)
         return camera, camera_mapping(camera, intrinsics.source), []
-    corners = [corners for _, corners, own in detected if own == size]
-    camera, found = calibrate(corners, board, size)
+    camera, found = calibrate([corners for corners, own in detected if own == size], board, size)
     about = camera_mapping(camera, "calibrated from the boards") | found
     return camera, about, [calibration_warning(camera, found)]
 
 
-def _placed(
-    pair: ImagePair,
-    corners: np.ndarray,
-    images: BoardImages,
-    options: CheckerboardOptions,
-    camera: CameraIntrinsics,
-    rays: np.ndarray,
-) -> BoardView:
-    """Estimate the pose of the board and compare the depth image with it."""
-    board = options.board()
-    pose = estimate_pose(corners, board, camera, options.max_reprojection_px)
-    depth, amplitude = images.measured(pair, camera)
-    area = pose.area(board, rays, options.margin_squares)
-    usable = np.isfinite(depth)
-    if options.saturation_counts is not None and amplitude is not None:
-        usable &= amplitude < options.saturation_counts
-    agreement = compare_depth(depth, usable, area, pose, rays, options.depth_kind)
-    pixels = int(area.sum())
-    return BoardView(pair=pair, corners=corners, pose=pose, pixels=pixels, agreement=agreement)
-
-
-def _reported(view: BoardView, board: FlatBoard, folder: Path) -> dict[str, Any]:
+def _reported(view: BoardView, board: FlatBoard, files: Files, folder: Path) -> dict[str, Any]:
     """Return what `import.json` says of a view.
 
     `plane_sd_mm` is the standard deviation of the plane's position at the board's centre, along its
     normal, propagated from the corners; errors that all views share (focal length, square length)
     are not included. `depth_error_mm` is the median of measured minus true depth.
     """
-    pose, agreement, centre = view.pose, view.agreement, view.pose.centre(board)
+    pose, centre = view.pose, view.pose.centre(board)
     cosine = abs(float(pose.plane()[0] @ centre)) / float(np.linalg.norm(centre))
     return {
-        "view": view.pair.view,
-        "depth_file": view.pair.depth.relative_to(folder).as_posix(),
-        "infrared_file": view.pair.infrared.relative_to(folder).as_posix(),
+        "view": view.name,
+        "depth_file": files["depth"].relative_to(folder).as_posix(),
+        "infrared_file": files["infrared"].relative_to(folder).as_posix(),
         "reprojection_rms_px": pose.reprojection_rms,
         "corners_used": int(pose.used.sum()),
-        "board_pixels": view.pixels,
-        "usable_pixels": agreement.usable_pixels,
-        "distance_m": agreement.distance,
+        "board_pixels": view.board_pixels,
+        "usable_pixels": view.usable_pixels,
+        "distance_m": view.distance,
         "incidence_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))),
         "plane_sd_mm": 1e3 * pose.plane_deviation,
-        "depth_error_mm": 1e3 * agreement.error,
+        "depth_error_mm": 1e3 * view.error,
     }
-
-
-def _frames(
-    views: Sequence[BoardView],
-    board: FlatBoard,
-    images: BoardImages,
-    camera: CameraIntrinsics,
-    rays: np.ndarray,
-    margin: float,
-) -> Iterator[Frame]:
-    for index, view in enumerate(views):
-        normal, offset = view.pose.plane()
-        row = FrameRow(
-            timestamp=float(index),  # The files do not say when an image was taken.
-            world_from_tool=np.eye(4),
-            normal_world=normal,
-            offset=offset,
-            target=board.kind,
-        )
-        yield row, *images.measured(view.pair, camera), view.pose.area(board, rays, margin)

@@ -10,13 +10,18 @@ import numpy as np
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.images import DepthImage
-from tofcorr.importing.pose_files import Line, lines_of, read_poses, read_text
+from tofcorr.importing.intrinsics import intrinsics_from_numbers
+from tofcorr.importing.numbers import Line, any_numbers, lines_of, read_text
+from tofcorr.importing.pose_files import read_poses
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.robot_images import RobotImages
 from tofcorr.importing.run import RefusedViewError
 
-_DISTANCES = ("measurements.csv", "distances.csv", "measurements.txt", "distances.txt")
-_POSES = ("transforms.csv", "poses.csv", "poses.txt", "poses.npy", "transforms.txt")
+_NAMES = {
+    "distances": ("measurements.csv", "distances.csv", "measurements.txt", "distances.txt"),
+    "poses": ("transforms.csv", "poses.csv", "poses.txt", "poses.npy", "transforms.txt"),
+}
+"""Files that a folder may hold, the first of them is read."""
 
 
 def zones_of(text: str) -> tuple[int, int]:
@@ -47,21 +52,21 @@ def sensor_camera(
         ConfigError: A field of view is missing, or not between 0 and 180 degrees.
     """
     columns, rows = zones
-    if zones == (1, 1):
-        identity = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-        return CameraIntrinsics(width=1, height=1, matrix=identity)
-    if field_of_view_deg is None:
-        raise ConfigError(
-            f"A sensor of {columns}x{rows} zones needs its field of view: --fov-deg H,V (a "
-            "VL53L5CX has 45,45)."
-        )
-    horizontal, vertical = field_of_view_deg[0], field_of_view_deg[-1]
-    if not (0 < horizontal < 180 and 0 < vertical < 180):
-        raise ConfigError(f"--fov-deg must be between 0 and 180, got {field_of_view_deg}.")
-    fx = columns / 2 / math.tan(math.radians(horizontal) / 2)
-    fy = rows / 2 / math.tan(math.radians(vertical) / 2)
-    matrix = ((fx, 0.0, (columns - 1) / 2), (0.0, fy, (rows - 1) / 2), (0.0, 0.0, 1.0))
-    return CameraIntrinsics(width=columns, height=rows, matrix=matrix)
+    focal = [1.0, 1.0]
+    if zones != (1, 1):
+        if field_of_view_deg is None:
+            raise ConfigError(
+                f"A sensor of {columns}x{rows} zones needs its field of view: --fov-deg H,V (a "
+                "VL53L5CX has 45,45)."
+            )
+        if not all(0 < angle < 180 for angle in field_of_view_deg):
+            raise ConfigError(f"--fov-deg must be between 0 and 180, got {field_of_view_deg}.")
+        angles = field_of_view_deg[0], field_of_view_deg[-1]
+        pairs = zip(zones, angles, strict=True)
+        focal = [side / 2 / math.tan(math.radians(angle) / 2) for side, angle in pairs]
+    centre = (columns - 1) / 2, (rows - 1) / 2
+    given = intrinsics_from_numbers(focal, centre, (), "--fov-deg")
+    return given.camera(zones)
 
 
 def open_distances(
@@ -90,8 +95,8 @@ def open_distances(
     names, zones = _wall_names(sources, poses, walls), (camera.width, camera.height)
     tables, tracks, units, typical = [], [], set[float](), []
     for place, source in enumerate(sources):
-        metres, unit, usual = read_distances(_file_in(source, _DISTANCES), zones, unit_mm)
-        path = poses[place] if poses else _file_in(source, _POSES)
+        metres, unit, usual = read_distances(_file_in(source, "distances"), zones, unit_mm)
+        path = poses[place] if poses else _file_in(source, "poses")
         track = read_poses(path, pose_format)
         if len(track) != len(metres):
             raise CalibrationDataError(
@@ -128,14 +133,15 @@ def open_distances(
             raise RefusedViewError("no zone has a return")
         return DepthImage(every[number])
 
-    counted = zip(names, tables, strict=True)
+    targets = np.repeat(names, [len(table) for table in tables])
+    rows = np.concatenate([np.arange(len(table)) for table in tables])
     return RobotImages(
         origin=origin,
-        names=[f"{name} {k}" for name, table in counted for k in range(len(table))],
+        names=[f"{name} {row}" for name, row in zip(targets, rows, strict=True)],
         camera=camera,
         read=read,
         track=PoseTrack.checked(np.concatenate(tracks), origin),
-        targets=np.repeat(names, [len(table) for table in tables]),
+        targets=targets,
         warnings=warnings,
     )
 
@@ -154,17 +160,16 @@ def _wall_names(
     return names
 
 
-def _file_in(source: Path, names: Sequence[str]) -> Path:
-    """Return the file itself, or the one of these names in a folder."""
+def _file_in(source: Path, what: str) -> Path:
+    """Return the file itself, or the one of distances or poses in a folder."""
     if not source.is_dir():
-        if names is _POSES:
+        if what == "poses":
             raise ConfigError(f"{source} is a file: name its poses with --poses.")
         return source
-    found = next((source / name for name in names if (source / name).exists()), None)
+    found = next((source / name for name in _NAMES[what] if (source / name).exists()), None)
     if found is None:
-        what = "poses" if names is _POSES else "distances"
         raise CalibrationDataError(
-            f"{source}: no file of {what}; expected one of {', '.join(names)}."
+            f"{source}: no file of {what}; expected one of {', '.join(_NAMES[what])}."
         )
     return found
 
@@ -192,46 +197,37 @@ def read_distances(
     """
     columns, rows = zones
     lines = lines_of(read_text(path))
-    if lines and all(_number(text) is None for text in lines[0][1]):
+    if lines and not any(any_numbers(text).shape == () for text in lines[0][1]):
         lines = lines[1:]
     if not lines:
         raise CalibrationDataError(f"{path}: expected distances, found none.")
     readings = [_readings(line, columns * rows, path) for line in lines]
-    counts = np.concatenate([one.ravel() for one in readings])
-    returned = counts[counts > 0]
+    returned = np.concatenate([one[one > 0] for one in readings])
     if not returned.size:
         raise CalibrationDataError(f"{path}: no distance is above zero.")
     typical = float(np.median(returned))
     if unit_mm is None:
         unit_mm = 1.0 if typical >= 20 else 1000.0
-    medians = np.array([
-        [np.median(zone[usable]) if (usable := np.isfinite(zone) & (zone > 0)).any() else np.nan
-         for zone in one.T]
+    medians = [
+        np.ma.median(np.ma.masked_where(~(np.isfinite(one) & (one > 0)), one), axis=0)
         for one in readings
-    ])  # fmt: skip
-    return (1e-3 * unit_mm * medians).reshape(-1, rows, columns), unit_mm, typical
+    ]
+    metres = unit_mm * np.stack([np.ma.filled(median, np.nan) for median in medians]) / 1000
+    return metres.reshape(-1, rows, columns), unit_mm, typical
 
 
 def _readings(line: Line, zones: int, path: Path) -> np.ndarray:
     """Return the readings of one row, shape (R, zones)."""
     number, fields = line
-    values = [_number(text) for text in fields]
     # A time, or a number of the row.
-    if values[0] is None or (len(values) % zones == 1 and zones > 1):
-        fields, values = fields[1:], values[1:]
-    if None in values:
-        shown = fields[len(values) - 1 - values[::-1].index(None)]
-        raise CalibrationDataError(f"{path}, line {number}: expected numbers, got '{shown[:40]}'.")
-    if not values or len(values) % zones:
+    if any_numbers(fields[0]).shape or (len(fields) % zones == 1 and zones > 1):
+        fields = fields[1:]
+    wrong = next((text for text in fields if any_numbers(text).shape), None)
+    if wrong is not None:
+        raise CalibrationDataError(f"{path}, line {number}: expected numbers, got '{wrong[:40]}'.")
+    if not fields or len(fields) % zones:
         raise CalibrationDataError(
-            f"{path}, line {number}: {len(values)} numbers are not whole readings of {zones} "
+            f"{path}, line {number}: {len(fields)} numbers are not whole readings of {zones} "
             "zones. State the sensor's zones with --zones COLUMNSxROWS."
         )
-    return np.array(values, dtype=np.float64).reshape(-1, zones)
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
+    return any_numbers(fields).reshape(-1, zones)

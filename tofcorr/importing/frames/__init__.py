@@ -1,1 +1,130 @@
 """Folders of depth images beside a file of robot poses."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tofcorr.errors import ConfigError
+from tofcorr.files import NewPath
+from tofcorr.importing.checkerboard import BoardType
+from tofcorr.importing.command_line import (
+    coding_options,
+    intrinsics_options,
+    pose_format_option,
+    posed_options,
+    print_report,
+    progress_bar,
+    take_coding,
+    take_intrinsics,
+    take_posed_options,
+)
+
+
+@click.command(name="frames")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
+@click.option(
+    "--depth",
+    "depth_pattern",
+    required=True,
+    help="Names of the depth images (PNG, TIFF, NPY, EXR), such as 'depth/*.png'.",
+)
+@click.option(
+    "--amplitude",
+    "amplitude_pattern",
+    help="Names of the amplitude or infrared images; * stands for the same as in --depth.",
+)
+@click.option(
+    "--grey",
+    "grey_pattern",
+    help="With --board: images in which its corners are found, 8 bits and colour allowed; left "
+    "out: the amplitude images.",
+)
+@click.option(
+    "--poses",
+    type=click.Path(path_type=Path),
+    help="Poses of the tool in the base: a file, or a folder with a matrix a file.",
+)
+@click.option(
+    "--board",
+    type=BoardType(),
+    help="Instead of --poses: a board that gives the plane of each image; as in import "
+    "checkerboard.",
+)
+@click.option("--square-mm", type=float, help="With --board: side of a square or tag, mm.")
+@pose_format_option
+@click.option(
+    "--times",
+    type=click.Path(path_type=Path),
+    help="List of 'time name' lines, where the images' names are no times.",
+)
+@coding_options
+@intrinsics_options
+@posed_options
+def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
+    """Import depth images in FOLDER and the robot poses they were taken from.
+
+    With --poses no board is needed: walls, floor and tables are found in the depth, and their
+    planes are estimated together with the calibration. Images are paired with poses by time stamp,
+    by name or by order. With --board each image shows a board, and there is no robot. Images that
+    cannot be used are left out, and import.json in the recording says why.
+    """
+    if (given["poses"] is None) == (given["board"] is None):
+        raise ConfigError(
+            "say where the planes come from, in one way: --poses FILE (of the robot's tool; walls "
+            "are then found), or --board and --square-mm."
+        )
+    run = _from_poses if given["board"] is None else _from_boards
+    print_report(run(folder, out, given), out)
+
+
+def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """Import images of a moving robot."""
+    from tofcorr.importing.frames.source import open_folder
+    from tofcorr.importing.pose_files import read_poses
+    from tofcorr.importing.posed import import_posed
+
+    if given["grey_pattern"] is not None or given["square_mm"] is not None:
+        raise ConfigError("--grey and --square-mm are for a board: name it with --board.")
+    intrinsics = take_intrinsics(given)
+    if intrinsics is None:
+        raise ConfigError("--calibrate needs a board: name it with --board, without --poses.")
+    options = take_posed_options(given)
+    coding = take_coding(given)
+    track = read_poses(given["poses"], given["pose_format"])
+    source = open_folder(
+        folder,
+        given["depth_pattern"],
+        intrinsics,
+        coding,
+        track,
+        amplitude_pattern=given["amplitude_pattern"],
+        times=given["times"],
+    )
+    return import_posed(source, out, options, progress_bar)
+
+
+def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """Import images of a board, without a robot."""
+    from tofcorr.importing.checkerboard.importer import CheckerboardOptions, import_checkerboard
+    from tofcorr.importing.frames.source import board_images
+
+    amplitude = given["amplitude_pattern"]
+    corners = given["grey_pattern"] or amplitude
+    if corners is None or given["square_mm"] is None:
+        raise ConfigError("a board needs --square-mm, and --grey (or --amplitude) to find it in.")
+    coding = take_coding(given)
+    mapping = given["board"] | {
+        "depth_pattern": given["depth_pattern"],
+        "infrared_pattern": corners,
+        "square_length": 1e-3 * given["square_mm"],
+        "depth_unit": 1e-3 * (coding.unit_mm or 1.0),
+        "depth_kind": given["depth_kind"],
+        "saturation_counts": given["saturation_amplitude"],
+        "modulation_frequency": given["modulation_frequency_hz"],
+    }
+    options = CheckerboardOptions.from_mapping(mapping, "tofcorr import frames")
+    find = partial(board_images, coding=coding, amplitude_pattern=amplitude)
+    return import_checkerboard(folder, out, options, take_intrinsics(given), progress_bar, find)

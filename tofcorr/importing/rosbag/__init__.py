@@ -1,5 +1,54 @@
 """ROS bags: depth images and the robot's transforms, read one message at a time.
 
-`bag` gives access to the messages of a topic by number and decodes images, `tf_tree` follows the
-transforms from base to tool, and `source` puts them together.
+`bag` gives access to the messages of a topic by number and decodes images, `source` follows the
+transforms from base to tool and puts both together.
 """
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tofcorr.files import NewPath
+from tofcorr.importing.command_line import (
+    coding_options,
+    posed_options,
+    print_report,
+    progress_bar,
+    take_coding,
+    take_posed_options,
+)
+
+
+@click.command(name="rosbag")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
+@click.option("--depth", "depth_topic", required=True, help="Topic of the depth images.")
+@click.option(
+    "--amplitude", "amplitude_topic", help="Topic of the amplitude (infrared) images, 16 bits."
+)
+@click.option(
+    "--camera-info", "camera_info", help="Topic of the intrinsics; left out: beside the images."
+)
+@click.option(
+    "--intrinsics", help="A file of intrinsics or a shipped name, instead of --camera-info."
+)
+@coding_options
+@posed_options
+def command(bag: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
+    """Import BAG: a ROS 1 .bag, a ROS 2 folder, or an .mcap or .db3 file.
+
+    The poses are those of --tool-frame in --base-frame in the bag's tf and tf_static. No board is
+    needed: walls, floor and tables are found in the depth, and their planes are estimated together
+    with the calibration. import.json in the recording says which images were left out, and why.
+    """
+    from tofcorr.importing.posed import import_posed
+    from tofcorr.importing.rosbag.source import open_bag
+
+    coding, depth = take_coding(given), given.pop("depth_topic")
+    frames = {key: given[key] for key in ("base_frame", "tool_frame")}
+    topics = {key: given.pop(key) for key in ("amplitude_topic", "camera_info", "intrinsics")}
+    with open_bag(bag, depth, coding, **frames, **topics) as images:
+        options = take_posed_options(given, images.camera_frame)
+        report = import_posed(images, out, options, progress_bar)
+    print_report(report, out)

@@ -1,23 +1,33 @@
-"""A bag's images, poses and camera, ready to be imported."""
+"""A bag's images, camera, and the robot's transforms from base to tool, ready to be imported."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.importing.images import DepthCoding, DepthImage, amplitude_counts, depth_metres, turned
+from tofcorr.geometry import se3
+from tofcorr.importing.images import (
+    DepthCoding,
+    DepthImage,
+    camera_of,
+    coded_image,
+    of_size,
+    turned,
+)
 from tofcorr.importing.intrinsics import (
     GivenIntrinsics,
     intrinsics_from_mapping,
     read_named_intrinsics,
 )
+from tofcorr.importing.pose_files import rigid_transforms
 from tofcorr.importing.pose_track import PoseTrack, nearest
 from tofcorr.importing.robot_images import RobotImages
 from tofcorr.importing.rosbag.bag import Bag, TopicMessages, damage_reported
-from tofcorr.importing.rosbag.tf_tree import base_from_tool, read_tf
-from tofcorr.importing.run import Refusal, RefusedViewError
+from tofcorr.importing.run import Refused
 
 _SAME_IMAGE = 0.01
 """Seconds between the stamps of depth and amplitude of one exposure: a third of a frame at 30 Hz;
@@ -70,8 +80,9 @@ def open_bag(
             topic = _camera_info_topic(bag, depth_topic, camera_info)
             given, warnings = _read_camera_info(bag, topic, depth_topic)
         with damage_reported(path):
-            edges = read_tf(bag)
-        track = base_from_tool(edges, base_frame.lstrip("/"), tool_frame.lstrip("/"), str(path))
+            parents, poses = _read_tf(bag)
+        frames = base_frame.lstrip("/"), tool_frame.lstrip("/")
+        track = _base_from_tool(parents, poses, *frames, str(path))
     with ExitStack() as opened:
         with damage_reported(path):
             topics = [topic for topic in (depth_topic, amplitude_topic) if topic is not None]
@@ -92,7 +103,7 @@ def _images(
     depth, amplitude = messages[0], messages[-1] if len(messages) > 1 else None
     order = np.argsort(depth.stamps, kind="stable")
     names = [f"{stamp:.6f}" for stamp in depth.stamps]
-    refused, partner = [], order
+    refused, partner = Refused(), order
     if amplitude is not None:
         by_time = np.argsort(amplitude.stamps, kind="stable")
         partner = by_time[nearest(amplitude.stamps[by_time], depth.stamps)]
@@ -104,18 +115,20 @@ def _images(
                 f"{gap.min():.3f} s away."
             )
         reason = f"{amplitude.topic} has no image of its time"
-        refused = [Refusal(names[k], reason) for k in order if gap[k] > _SAME_IMAGE]
+        refused = {names[k]: reason for k in order if gap[k] > _SAME_IMAGE}
         order = order[gap[order] <= _SAME_IMAGE]
-    camera = intrinsics.camera(_first_size(depth, order, coding, origin))
+
+    def counts(number: int) -> np.ndarray:
+        return turned(depth.image(int(order[number])), coding.rotate)
+
+    camera = camera_of(intrinsics, counts, len(order), origin)
 
     def read(number: int) -> DepthImage:
-        place = int(order[number])
-        metres = depth_metres(depth.image(place), coding, depth.topic)
-        counts = None
+        place, beside = int(order[number]), None
         if amplitude is not None:
-            counts = amplitude.image(int(partner[place]))
-            counts = amplitude_counts(counts, coding, amplitude.topic)
-        return DepthImage(metres, counts).of(camera)
+            beside = amplitude.image(int(partner[place])), amplitude.topic
+        image = coded_image(coding, (depth.image(place), depth.topic), beside)
+        return of_size(image, camera)
 
     if not depth.stamped:
         warnings.append(
@@ -132,23 +145,6 @@ def _images(
         refused=refused,
         warnings=warnings,
         camera_frame=depth.frame_id.lstrip("/"),
-    )
-
-
-def _first_size(
-    depth: TopicMessages, order: np.ndarray, coding: DepthCoding, origin: str
-) -> tuple[int, int]:
-    """Return width and height of the first image that can be decoded."""
-    reason = ""
-    for place in order.tolist():
-        try:
-            height, width = turned(depth.image(place), coding.rotate).shape
-        except RefusedViewError as refusal:
-            reason = reason or str(refusal)
-            continue
-        return width, height
-    raise CalibrationDataError(
-        f"{origin}: none of {len(order)} depth images can be used; the first: {reason}."
     )
 
 
@@ -254,3 +250,128 @@ def _check(bag: Bag, topic: str, option: str, wanted: tuple[str, ...]) -> None:
 def _encoding(bag: Bag, topic: str) -> str:
     message = next((message for _, message in bag.messages(topic)), None)
     return str(getattr(message, "encoding", None) or getattr(message, "format", ""))
+
+
+def _read_tf(bag: Bag) -> tuple[dict[str, str], dict[str, PoseTrack]]:
+    """Read the parent of each frame, and its poses there: one without a time if it never moves.
+
+    Raises:
+        CalibrationDataError: There are none, one is not rigid, or a frame has two parents.
+    """
+    kinds = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+    topics = [topic for topic, kind in bag.types.items() if kind in kinds]
+    if not topics:
+        raise CalibrationDataError(
+            f"{bag.path}: no topic holds transforms (tf2_msgs/TFMessage); record /tf and "
+            f"/tf_static. The topics: {bag.listed_topics()}."
+        )
+    parents: dict[str, str] = {}
+    rows: dict[str, list[list[float]]] = {}
+    moving: set[str] = set()
+    for topic in topics:
+        for _, message in bag.messages(topic):
+            for one in message.transforms:
+                parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+                if parents.setdefault(child, parent) != parent:
+                    raise CalibrationDataError(
+                        f"{bag.path}: tf gives the frame '{child}' two parents, "
+                        f"'{parents[child]}' and '{parent}'."
+                    )
+                rows.setdefault(child, []).append(_row(one))
+                # A frame that is published on both topics moves.
+                moving |= set() if topic.rstrip("/").endswith("_static") else {child}
+    tracks = {}
+    for child, own in rows.items():
+        name, values = f"{bag.path}: tf {parents[child]} -> {child}", np.array(own)
+        poses = rigid_transforms(values[:, 1:4], values[:, 4:], lambda _, name=name: name)
+        order = np.argsort(values[:, 0], kind="stable") if child in moving else [-1]
+        times = values[order, 0] if child in moving else None
+        tracks[child] = PoseTrack.checked(poses[order], name, times)
+    return parents, tracks
+
+
+def _row(message: Any) -> list[float]:  # noqa: ANN401 - of rosbags
+    """Return the time of a transform, its translation, and its quaternion, scalar last."""
+    stamp, move, turn = (
+        message.header.stamp,
+        message.transform.translation,
+        message.transform.rotation,
+    )
+    return [
+        stamp.sec + 1e-9 * stamp.nanosec,
+        move.x,
+        move.y,
+        move.z,
+        turn.x,
+        turn.y,
+        turn.z,
+        turn.w,
+    ]
+
+
+def _base_from_tool(
+    parents: dict[str, str], tracks: dict[str, PoseTrack], base: str, tool: str, source: str
+) -> PoseTrack:
+    """Return the poses of the tool in the base.
+
+    Between the stamps of a frame its transform is interpolated; the result has the stamps of all
+    moving frames on the way, as far as all of them are known.
+
+    Args:
+        parents: From `_read_tf`.
+        tracks: From `_read_tf`.
+        base: Name of the robot's base.
+        tool: Name of its tool.
+        source: The bag, for messages.
+
+    Raises:
+        CalibrationDataError: A frame is missing, they are not connected, or do not move.
+    """
+    up, down = _chain(parents, base, source), _chain(parents, tool, source)
+    common = next((name for name in down if name in up), None)
+    if common is None:
+        raise CalibrationDataError(
+            f"{source}: tf does not connect '{base}' (under '{up[-1]}') with '{tool}' (under "
+            f"'{down[-1]}'). Is /tf_static recorded?"
+        )
+    to_tool = down[: down.index(common)][::-1]
+    to_base = up[: up.index(common)][::-1]
+    moving = [child for child in (*to_tool, *to_base) if tracks[child].timestamp is not None]
+    if not moving:
+        raise CalibrationDataError(
+            f"{source}: every transform between '{base}' and '{tool}' is static; the tool does "
+            "not move. Is --tool-frame the flange or the tool of the arm?"
+        )
+    # The stamps of all tracks within the time that all of them cover.
+    stamps = [np.asarray(tracks[child].timestamp) for child in moving]
+    times = np.unique(np.concatenate(stamps))
+    first, last = max(time[0] for time in stamps), min(time[-1] for time in stamps)
+    times = times[(times >= first) & (times <= last)]
+    if not len(times):
+        names = [f"tf {parents[child]} -> {child}" for child in moving[:2]]
+        raise CalibrationDataError(f"{source}: {' and '.join(names)} share no time.")
+
+    def product(children: Iterable[str]) -> torch.Tensor:
+        whole = torch.eye(4, dtype=torch.float64).expand(len(times), 4, 4)
+        for child in children:
+            track = tracks[child]
+            pose = track.at(times) if child in moving else track.world_from_tool[-1]
+            whole = whole @ torch.from_numpy(pose)
+        return whole
+
+    poses = se3.inverse(product(to_base)) @ product(to_tool)
+    return PoseTrack.checked(poses.numpy(), f"{source}: tf {base} -> {tool}", times)
+
+
+def _chain(parents: dict[str, str], name: str, source: str) -> list[str]:
+    """Return a frame and its ancestors, the root last."""
+    known = {*parents, *parents.values()}
+    if name not in known:
+        listed = ", ".join(sorted(known)[:40])
+        raise CalibrationDataError(f"{source}: tf has no frame '{name}'. Its frames: {listed}.")
+    chain = [name]
+    while (parent := parents.get(chain[-1])) is not None:
+        if parent in chain:
+            raise CalibrationDataError(f"{source}: tf goes round in a circle at '{parent}'.")
+        chain.append(parent)
+    return chain

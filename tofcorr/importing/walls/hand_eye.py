@@ -9,6 +9,8 @@ From each start planes are gathered into walls, and everything is fitted jointly
 
 A sensor of one ray sees no normals. Before named walls its start is looked for over the directions
 of its ray.
+
+Walls of the world are rows (n, d) of n . x + d = 0, shape (G, 4), metres, n towards the camera.
 """
 
 import math
@@ -25,21 +27,21 @@ from tofcorr.estimation.planes import Walls, estimate_walls, joint_image_equatio
 from tofcorr.estimation.robust import robust_weights
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.geometry import se3
-from tofcorr.importing.walls.gathering import (
-    TILT,
-    TYPICAL,
-    SeenPlanes,
-    WallPlanes,
-    distances,
-    gather,
-)
+from tofcorr.importing.walls.image_planes import ImagePlane
 from tofcorr.spread import sigma_from_mad
+
+_TYPICAL = 0.01
+"""What an uncalibrated camera's error typically measures, metres, beside a constant and a slope:
+the standard deviation of a plane's place. Widths below are multiples of it."""
+
+_TILT = math.radians(4.0)
+"""The tilt that a camera's error gives a plane: twice that between two normals of one wall, three
+times where the hand-eye is known to some degrees only."""
 
 _ERROR = torch.tensor([0.05, 0.02], dtype=torch.float64)
 """What a camera that is not calibrated yet is off by: a constant (metres), and a share of the
 distance. Both are held to that much, so that they cannot stand in for the hand-eye. Ten times as
 much no camera has: mirrored images would coincide behind the camera, at a slope of two."""
-
 
 _GRID = 20_000, math.radians(14.0)
 """Rotations of the grid, some 9 degrees apart, and the width of the search, within which half of
@@ -55,19 +57,173 @@ small. Then the one nearest the guess is taken."""
 
 
 @dataclass(frozen=True)
+class SeenPlanes:
+    """Planes in the frame of the camera that saw them, and the pose it saw them from.
+
+    Attributes:
+        image: The image of each plane, shape (M,).
+        number: Its number among the planes of its image, shape (M,).
+        normal: Unit normals towards the camera, camera frame, shape (M, 3).
+        points: Points that stand for the plane, camera frame, shape (M, P, 3), metres.
+        support: Share of the image's pixels, shape (M,).
+        gradient: The vectors g of the planes g . x = 1, shape (M, 3), per metre.
+        world_from_tool: The pose of each plane's image, shape (M, 4, 4).
+        label: The wall of each plane where it is known, shape (M,), counted from zero; None: not
+            known.
+    """
+
+    image: Tensor
+    number: Tensor
+    normal: Tensor
+    points: Tensor
+    support: Tensor
+    gradient: Tensor
+    world_from_tool: Tensor
+    label: Tensor | None = None
+
+    def __len__(self) -> int:
+        """Return the number of planes."""
+        return len(self.image)
+
+    def take(self, chosen: Tensor) -> "SeenPlanes":
+        """Return some of the planes, by number or by mask."""
+        parts = {name: part for name, part in vars(self).items() if part is not None}
+        return SeenPlanes(**{name: part[chosen] for name, part in parts.items()})
+
+    def may_be_one_wall(self) -> Tensor:
+        """Return which pairs of planes may show one wall, shape (M, M): not two of one image."""
+        pair = self.image[:, None] != self.image
+        return pair if self.label is None else pair & (self.label[:, None] == self.label)
+
+    @property
+    def rotation(self) -> Tensor:
+        """Rotations world_from_tool, shape (M, 3, 3)."""
+        return self.world_from_tool[:, :3, :3]
+
+    def in_world(self, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
+        """Return points (M, P, 3), metres, and normals (M, 3) in the world."""
+        pose = self.world_from_tool @ tool_from_camera
+        points = self.points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+        return points, (pose[:, :3, :3] @ self.normal[:, :, None])[:, :, 0]
+
+
+def seen_planes(
+    planes: Sequence[Sequence[ImagePlane]],
+    world_from_tool: Tensor,
+    pixels: int,
+    labels: Tensor | None = None,
+) -> SeenPlanes:
+    """Put the planes of all images together, sorted by what was measured, not by images' numbers.
+
+    Args:
+        planes: The planes of each image.
+        world_from_tool: The images' poses, shape (N, 4, 4).
+        pixels: Pixels of an image.
+        labels: The wall that each image shows, shape (N,); None: not known.
+    """
+    every = [(i, k, plane) for i, own in enumerate(planes) for k, plane in enumerate(own)]
+    pose = world_from_tool.flatten(1).tolist()
+    every.sort(key=lambda one: (pose[one[0]], one[2].offset, one[2].normal.tolist()))
+    image = torch.tensor([i for i, _, _ in every], dtype=torch.int64)
+    empty = torch.zeros(0, 3, dtype=torch.float64)
+    return SeenPlanes(
+        image=image,
+        number=torch.tensor([k for _, k, _ in every], dtype=torch.int64),
+        normal=torch.stack([plane.normal for *_, plane in every]) if every else empty,
+        points=torch.stack([plane.points for *_, plane in every]) if every else empty[:, None],
+        support=torch.tensor([plane.support / pixels for *_, plane in every]).double(),
+        gradient=torch.stack([plane.gradient for *_, plane in every]) if every else empty,
+        world_from_tool=world_from_tool[image],
+        label=None if labels is None else labels[image],
+    )
+
+
+def distances(points: Tensor, normal: Tensor, walls: Tensor) -> Tensor:
+    """Return how far planes are from walls (G, 4), shape (M, G), metres; infinite if turned away.
+
+    The distance is the root mean square of a plane's points' distances.
+
+    Args:
+        points: Points of each plane in the world, shape (M, P, 3), metres.
+        normal: Its normal there, shape (M, 3).
+        walls: The walls.
+    """
+    off = torch.einsum("mpa,ga->mpg", points, walls[:, :3]) + walls[:, 3]
+    facing = normal @ walls[:, :3].T > math.cos(3 * _TILT)
+    return torch.where(facing, off.square().mean(dim=1).sqrt(), torch.inf)
+
+
+def _gather(planes: SeenPlanes, tool_from_camera: Tensor, fewest: int) -> Tensor:
+    """Gather planes of many images into walls (G, 4), that of most images first.
+
+    Args:
+        planes: The planes.
+        tool_from_camera: The hand-eye transform (4, 4), known to some centimetres.
+        fewest: Images that make a wall; planes whose walls are known make one each.
+    """
+    points, normal = planes.in_world(tool_from_camera)
+
+    def fitted(members: Tensor) -> Tensor:
+        return _plane_of(points[members], normal[members], planes.support[members])
+
+    if planes.label is not None:
+        return torch.stack([fitted(planes.label == k) for k in planes.label.unique()])
+    left = torch.ones(len(planes), dtype=torch.bool)
+    found = [torch.zeros(0, 4, dtype=torch.float64)]
+    near = 6 * _TYPICAL
+    while int(left.sum()) >= fewest:
+        # Of a wall that a tenth of the planes show, thirty of 300 propose it. A single image's own
+        # error comes on top.
+        seeds = left.nonzero()[:, 0]
+        seeds = seeds[torch.linspace(0, len(seeds) - 1, min(len(seeds), 300)).long()]
+        offset = -(points[seeds].mean(dim=1) * normal[seeds]).sum(dim=1, keepdim=True)
+        proposed = torch.cat([normal[seeds], offset], dim=1)
+        close = left[:, None] & (distances(points, normal, proposed) < near + 2 * _TYPICAL)
+        # The most planes; between equals the larger ones.
+        best = (close * (1 + 1e-3 * planes.support[:, None])).sum(dim=0).argmax()
+        members, wall = close[:, best], proposed[best]
+        for _ in range(3):  # The choice hardly changes after the first.
+            wall = fitted(members)
+            members = left & (distances(points, normal, wall[None])[:, 0] < near)
+            if not bool(members.any()):
+                break
+        if len(planes.image[members].unique()) < fewest:
+            # No other wall has more images than this one.
+            break
+        found.append(wall[None])
+        left &= ~members
+    return torch.cat(found)
+
+
+def _plane_of(points: Tensor, normal: Tensor, weight: Tensor) -> Tensor:
+    """Fit a wall (4,) to the points of planes (M, P, 3); each plane's own normal counts as well."""
+    share = weight / weight.sum()
+    mean = (share[:, None] * points.mean(dim=1)).sum(dim=0)
+    centred = points - mean
+    second = torch.einsum("m,mpa,mpb->ab", share, centred, centred) / points.shape[1]
+    facing = torch.nn.functional.normalize((share[:, None] * normal).sum(dim=0), dim=0)
+    vector = torch.linalg.eigh(second).eigenvectors[:, 0]
+    vector = vector * torch.where(vector @ facing < 0, -1.0, 1.0)
+    # Points along a line leave a turn open: there the images' own normals decide.
+    if float(vector @ facing) < math.cos(3 * _TILT):
+        vector = facing
+    return torch.cat([vector, -(mean @ vector)[None]])
+
+
+@dataclass(frozen=True)
 class Joint:
     """Hand-eye and walls, and which plane shows which wall.
 
     Attributes:
         parameters: The hand-eye transform; a constant and a slope of the camera's error.
-        walls: The walls.
+        walls: The walls, shape (G, 4).
         wall: The wall of each plane, shape (M,); -1: none.
         deviation: How far each plane is from the wall nearest it, shape (M,), metres; infinite
             where it is turned away from all of them.
     """
 
     parameters: Parameters
-    walls: WallPlanes
+    walls: Tensor
     wall: Tensor
     deviation: Tensor
 
@@ -79,111 +235,110 @@ class Joint:
     def reordered(self, order: Tensor) -> "Joint":
         """Return the fit with its walls in another order (G,)."""
         rank = torch.cat([order.argsort(), torch.tensor([-1])])
-        walls = WallPlanes(self.walls.normal[order], self.walls.offset[order])
-        return replace(self, walls=walls, wall=rank[self.wall])
+        return replace(self, walls=self.walls[order], wall=rank[self.wall])
 
     def cost(self) -> float:
         """Return how badly planes lie on walls: squared deviations, 9 at most a plane; 1 a wall.
 
         The unit is twice the typical deviation.
         """
-        off = (self.deviation / (2 * TYPICAL)).square().clamp(max=9.0)
-        return float(off.sum()) + len(self.walls.offset)
+        off = (self.deviation / (2 * _TYPICAL)).square().clamp(max=9.0)
+        return float(off.sum()) + len(self.walls)
 
 
-def match(planes: SeenPlanes, guess: Tensor, fewest: int) -> Joint:
+def match(planes: SeenPlanes, fewest: int) -> Joint:
     """Find the walls that the planes of many images show, and the hand-eye transform with them.
+
+    What the images leave open stays near the identity.
 
     Args:
         planes: The planes of all images.
-        guess: A hand-eye transform (4, 4); it is tried, and decides what the images leave open.
         fewest: Images that make a wall.
     """
     few = _varied(planes)
     proposed = []
-    for rotation in _candidate_rotations(few, guess[:3, :3]):
-        translation, agreement = _candidate_translation(few, rotation, guess[:3, 3])
+    for rotation in _candidate_rotations(few):
+        translation, agreement = _candidate_translation(few, rotation)
         proposed.append((agreement, se3.assemble(rotation, translation)))
     proposed.sort(key=lambda one: -one[0])
     # Places of a wrong rotation agree by chance alone.
     starts = [start for agreement, start in proposed[:6] if 2 * agreement >= proposed[0][0]]
-    return _nearest_of_best([_followed(planes, start, fewest) for start in starts], guess)
+    return _nearest_of_best([_followed(planes, start, fewest) for start in starts])
 
 
-def match_single_ray(planes: SeenPlanes, guess: Tensor, directions: int = 1500) -> Joint:
+def match_single_ray(planes: SeenPlanes, directions: int = 1500) -> Joint:
     """Find a one-pixel sensor's hand-eye and the walls it looked at.
+
+    What cannot be seen, the turn about the ray at least, stays near the identity.
 
     Args:
         planes: One point an image, its wall known by label.
-        guess: A hand-eye transform (4, 4): it is tried, and decides what cannot be seen, which is
-            the turn about the ray at least.
         directions: Directions of the ray that are tried: 1500 are some 5 degrees apart.
     """
     assert planes.label is not None
-    ray = guess[:3, :3] @ torch.nn.functional.normalize(planes.points[0, 0], dim=0)
+    ray = torch.nn.functional.normalize(planes.points[0, 0], dim=0)
     # Directions spread evenly: a Fibonacci lattice.
     place = torch.arange(directions, dtype=torch.float64) + 0.5
     z, angle = 1 - 2 * place / directions, math.pi * (1 + math.sqrt(5)) * place
     radius = (1 - z.square()).sqrt()
     lattice = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
     along = torch.cat([ray[None], lattice])
-    loss, origin, normal, offset = _alternated(planes, along, guess[:3, 3])
+    loss, origin, walls = _alternated(planes, along)
     fits = []
     # Neighbours on the grid lead to one fit.
-    for k in _best_apart(along, -loss, math.cos(math.radians(6)), 12):
+    for k in _best_apart(along, -loss, math.cos(1.5 * _TILT), 12):
         turn = Rotation.align_vectors(along[k : k + 1].numpy(), ray[None].numpy())[0].as_matrix()
-        start = se3.assemble(torch.from_numpy(turn) @ guess[:3, :3], origin[k])
-        parameters = Parameters(start, torch.zeros(2, dtype=torch.float64))
-        walls = WallPlanes(normal[k], offset[k])
-        parameters, walls = _fit_assigned(planes, planes.label, parameters, walls, start)
-        points = _corrected(planes, parameters).in_world(parameters.tool_from_camera)[0]
-        off = (points[:, 0] * walls.normal[planes.label]).sum(dim=1) + walls.offset[planes.label]
-        fits.append(Joint(parameters, walls, planes.label, off.abs()))
-    return _nearest_of_best(fits, guess)
+        start = se3.assemble(torch.from_numpy(turn), origin[k])
+        fitted = _fit_assigned(planes, planes.label, _exact(start), walls[k], start)
+        points = _corrected(planes, fitted[0]).in_world(fitted[0].tool_from_camera)[0][:, 0]
+        own = fitted[1][planes.label]
+        fits.append(Joint(*fitted, planes.label, ((points * own[:, :3]).sum(1) + own[:, 3]).abs()))
+    return _nearest_of_best(fits)
 
 
-def _alternated(
-    planes: SeenPlanes, along: Tensor, guess: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _alternated(planes: SeenPlanes, along: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Fit walls and the sensor's origin in turn for each direction (K, 3) of its ray b.
 
     At pose (R, p) the sensor reads the distance D to its wall, n . (R (D b + t) + p) + d = 0. With
     the normals fixed, origin t and offsets d are linear; offsets are means over a wall's readings.
 
     Returns:
-        Mean squared deviations (K,), origins (K, 3), normals (K, G, 3) on the sensor's side, and
-        offsets (K, G).
+        Mean squared deviations (K,), origins (K, 3), and walls (K, G, 4) that face the sensor.
     """
     label, rotation = planes.label, planes.rotation
     assert label is not None
     member = torch.nn.functional.one_hot(label).double()
     share = member / member.sum(dim=0)
-    distance = planes.points[:, 0].norm(dim=1)[:, None]
-    place = planes.world_from_tool[:, :3, 3]
-    hit = place + distance * (rotation @ along[:, None, :, None])[..., 0]
-    origin, loss, normal = guess.expand(len(along), 3), along[:, 0], along
+
+    def mean(values: Tensor) -> Tensor:
+        """Return the means (K, G, ...) over each wall's readings of values (K, M, ...)."""
+        return torch.einsum("mg,km...->kg...", share, values)
+
+    def turned(vectors: Tensor) -> Tensor:
+        """Return vectors (K, 3) of the tool in the world at each pose, shape (K, M, 3)."""
+        return (rotation @ vectors[:, None, :, None])[..., 0]
+
+    way = planes.points[:, 0].norm(dim=1)[:, None] * turned(along)
+    hit = planes.world_from_tool[:, :3, 3] + way
+    origin, loss, normal = torch.zeros_like(along), along[:, 0], along
     # An origin is known to 150 mm beforehand, a distance to 10 mm.
-    prior = (TYPICAL / (_USUAL / 2)) ** 2
+    prior = (_TYPICAL / (_USUAL / 2)) ** 2
     for _ in range(12):
-        points = hit + (rotation @ origin[:, None, :, None])[..., 0]
-        centred = points - torch.einsum("mg,kma->kga", share, points)[:, label]
+        points = hit + turned(origin)
+        centred = points - mean(points)[:, label]
         second = torch.einsum("mg,kma,kmb->kgab", share, centred, centred)
         normal = torch.linalg.eigh(second).eigenvectors[..., 0]
         own = normal[:, label]
         lever = (own[:, :, None] @ rotation)[:, :, 0]
-        lever = lever - torch.einsum("mg,kma->kga", share, lever)[:, label]
+        lever = lever - mean(lever)[:, label]
         part = (own * hit).sum(dim=2)
-        part = part - torch.einsum("mg,km->kg", share, part)[:, label]
-        hessian = lever.transpose(1, 2) @ lever + prior * torch.eye(3).double()
-        right = (lever * part[:, :, None]).sum(dim=1) - prior * guess
-        origin = -torch.linalg.solve(hessian, right[:, :, None])[:, :, 0]
+        part = part - mean(part)[:, label]
+        hessian = lever.mT @ lever + prior * torch.eye(3).double()
+        origin = -torch.linalg.solve(hessian, lever.mT @ part[:, :, None])[:, :, 0]
         loss = (part + (lever * origin[:, None]).sum(dim=2)).square().mean(dim=1)
-    sensor = place + (rotation @ origin[:, None, :, None])[..., 0]
-    way = distance * (rotation @ along[:, None, :, None])[..., 0]
-    offset = -(normal * torch.einsum("mg,kma->kga", share, sensor + way)).sum(dim=2)
-    height = (normal * torch.einsum("mg,kma->kga", share, sensor)).sum(dim=2) + offset
-    side = torch.where(height < 0, -1.0, 1.0)
-    return loss, origin, normal * side[..., None], offset * side
+    normal = torch.where((normal * mean(way)).sum(dim=2, keepdim=True) > 0, -normal, normal)
+    offset = -(normal * mean(hit + turned(origin))).sum(dim=2, keepdim=True)
+    return loss, origin, torch.cat([normal, offset], dim=2)
 
 
 def _best_apart(vectors: Tensor, score: Tensor, closest: float, most: int) -> list[int]:
@@ -196,14 +351,10 @@ def _best_apart(vectors: Tensor, score: Tensor, closest: float, most: int) -> li
     return found
 
 
-def _nearest_of_best(fits: Sequence[Joint], guess: Tensor) -> Joint:
+def _nearest_of_best(fits: Sequence[Joint]) -> Joint:
     least = min(joint.cost() for joint in fits)
     good = [joint for joint in fits if joint.cost() <= (1 + _AS_GOOD) * least + 1e-9]
-
-    def turn(joint: Joint) -> float:
-        return float(se3.rotation_angle(guess[:3, :3].T @ joint.tool_from_camera[:3, :3]))
-
-    return min(good, key=turn)
+    return min(good, key=lambda joint: float(se3.rotation_angle(joint.tool_from_camera)))
 
 
 def _varied(planes: SeenPlanes, most: int = 90) -> SeenPlanes:
@@ -217,13 +368,12 @@ def _varied(planes: SeenPlanes, most: int = 90) -> SeenPlanes:
     taken: list[int] = []
     while int(count[taken].sum()) < min(most, len(planes)):
         taken.append(int(distance.argmax()))
-        away = (rotation - rotation[taken[-1]]).square().sum(dim=1)
-        distance = distance.minimum(away)
+        distance = distance.minimum((rotation - rotation[taken[-1]]).square().sum(dim=1))
         distance[taken] = -1.0  # Of equal poses the others remain, in order.
     return planes.take(torch.isin(planes.image, image[taken]))
 
 
-def rotation_grid(number: int) -> Tensor:
+def _rotation_grid(number: int) -> Tensor:
     """Return rotations spread evenly: a super-Fibonacci spiral (Alexa 2022), shape (K, 3, 3)."""
     # The constants of the paper: the square root of 2 and the real root of p^4 = p + 4.
     phi, psi = math.sqrt(2.0), 1.533751168755204288118041
@@ -234,12 +384,8 @@ def rotation_grid(number: int) -> Tensor:
     return torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
 
 
-def _candidate_rotations(planes: SeenPlanes, guess: Tensor) -> Tensor:
+def _candidate_rotations(planes: SeenPlanes) -> Tensor:
     """Return rotations tool_from_camera that make normals coincide, the best first.
-
-    Args:
-        planes: The planes.
-        guess: A rotation to try besides those of the grid, shape (3, 3).
 
     Returns:
         Rotations (K, 3, 3): those under which at least half as many pairs agree as under the best,
@@ -253,29 +399,20 @@ def _candidate_rotations(planes: SeenPlanes, guess: Tensor) -> Tensor:
         return torch.einsum("mab,kbc,mc->kma", planes.rotation, rotations, planes.normal)
 
     def score(rotations: Tensor, width: float) -> Tensor:
-        """Return the weight of pairs that agree to within about an angle, shape (K,).
-
-        Rotations are split so that their cosines (3 MB) stay in a processor's cache.
-        """
+        """Return the weight of pairs that agree to within about an angle, shape (K,)."""
+        # The Gaussian of an angle, through its cosine: falls to 1 / e at the width.
         steep = 1 / (1 - math.cos(width))
-        scores = []
-        for part in rotations.split(100):
-            normal = turned(part).float()
-            # The Gaussian of an angle, through its cosine: falls to 1 / e at the width.
-            agree = torch.baddbmm(
-                torch.tensor(-steep), normal, normal.transpose(1, 2), alpha=steep
-            ).exp_()
-            scores.append(agree.flatten(1) @ pair)
-        return torch.cat(scores).double()
+        normals = (turned(part).float() for part in rotations.split(100))
+        agree = ((steep * (one @ one.mT - 1)).exp_().flatten(1) @ pair for one in normals)
+        return torch.cat(list(agree)).double()
 
     number, coarse = _GRID
     fine = coarse / 3
-    grid = torch.cat([guess[None], rotation_grid(number)])
+    grid = torch.cat([torch.eye(3).double()[None], _rotation_grid(number)])
     left = score(grid, coarse)
-    left[0] = torch.inf  # The guess is refined in any case.
+    left[0] = torch.inf  # The identity is refined in any case.
     # The trace of a rotation by an angle a is 1 + 2 cos a.
-    close = 1 + 2 * math.cos(math.radians(15))
-    found = grid[_best_apart(grid.flatten(1), left, close, 80)]
+    found = grid[_best_apart(grid.flatten(1), left, 1 + 2 * math.cos(coarse), 80)]
     # From wide to narrow: the best of each rotation's neighbours, if it is better. Where the poses
     # say nothing of a turn, none is made.
     cube = torch.cartesian_prod(*[torch.tensor([0.0, -1.0, 1.0], dtype=torch.float64)] * 3)
@@ -295,63 +432,58 @@ def _candidate_rotations(planes: SeenPlanes, guess: Tensor) -> Tensor:
     kept: list[int] = []
     for k in range(len(found)):
         apart = (normal[kept] - normal[k]).norm(dim=2).mean(dim=1)
-        if not bool((apart < TILT).any()):
+        if not bool((apart < _TILT).any()):
             kept.append(k)
     return found[kept]
 
 
-def _candidate_translation(
-    planes: SeenPlanes, rotation: Tensor, guess: Tensor
-) -> tuple[Tensor, float]:
+def _candidate_translation(planes: SeenPlanes, rotation: Tensor) -> tuple[Tensor, float]:
     """Find the translation tool_from_camera under which most pairs of planes agree.
 
     Along the wall's normal two images of one wall agree, which is linear in the translation; two
-    parallel walls disagree by their distance.
+    parallel walls disagree by their distance. What the images leave open stays near zero.
 
     Args:
         planes: The planes of all images.
         rotation: The rotation tool_from_camera, shape (3, 3).
-        guess: A translation, shape (3,): what the images leave open stays near it.
 
     Returns:
         The translation (3,) in metres, and how many pairs agree, counted by their size.
     """
-    start = se3.assemble(rotation, torch.zeros_like(guess))
-    points, normal = planes.in_world(start)
+    points, normal = planes.in_world(se3.assemble(rotation, torch.zeros_like(rotation[0])))
     direction = normal  # Of each plane the mean normal of those of its direction (mean shift).
     for _ in range(4):
-        near = (direction @ normal.T > math.cos(2 * TILT)) * planes.support
+        near = (direction @ normal.T > math.cos(2 * _TILT)) * planes.support
         direction = torch.nn.functional.normalize(near @ normal, dim=1)
-    same = direction @ direction.T > math.cos(TILT / 4)
-    pair = (same & planes.may_be_one_wall()).triu().nonzero()
-    first, second = pair[:, 0], pair[:, 1]
-    if not len(pair):
-        return guess, 0.0
+    same = direction @ direction.T > math.cos(_TILT / 4)
+    first, second = (same & planes.may_be_one_wall()).triu().nonzero().unbind(dim=1)
+    if not len(first):
+        return torch.zeros_like(rotation[0]), 0.0
     weight = (planes.support[first] * planes.support[second]).sqrt()
     towards, middle = direction[first], points.mean(dim=1)
     apart = (towards * (middle[first] - middle[second])).sum(dim=1)
     lever = (towards[:, None] @ (planes.rotation[first] - planes.rotation[second]))[:, 0]
-    found = guess + torch.cartesian_prod(*[torch.tensor([-_USUAL, 0.0, _USUAL]).double()] * 3)
-    narrow, width = 3 * TYPICAL, 40 * TYPICAL
+    found = torch.cartesian_prod(*[torch.tensor([-_USUAL, 0.0, _USUAL]).double()] * 3)
+    narrow, width = 3 * _TYPICAL, 40 * _TYPICAL
     prior = torch.eye(3, dtype=torch.float64) * (narrow / _USUAL) ** 2 * weight.mean()
     for _ in range(12):  # From wide, when the translation is open, to the camera's error alone.
         agree = weight * (-((apart + found @ lever.T) / width).square()).exp()
         hessian = torch.einsum("kp,pa,pb->kab", agree, lever, lever) + prior
-        right = torch.einsum("kp,pa->ka", agree * apart, lever) - prior @ guess
+        right = (agree * apart) @ lever
         found = -torch.linalg.solve(hessian, right[:, :, None])[:, :, 0]
-        width = max(narrow, 0.7 * width)
+        width = max(narrow, width / math.sqrt(2))
     score = (-((apart + found @ lever.T) / narrow).square()).exp() @ weight
     good = score >= (1 - _AS_GOOD) * score.max()
-    best = int((found[good] - guess).norm(dim=1).argmin())
+    best = found[good].norm(dim=1).argmin()
     return found[good][best], float(score[good][best])
 
 
 def _followed(planes: SeenPlanes, transform: Tensor, fewest: int) -> Joint:
     """Gather walls under a proposed hand-eye transform (4, 4), and fit everything."""
-    joint = fit_jointly(planes, transform, gather(planes, transform, fewest))
+    joint = fit_jointly(planes, transform, _gather(planes, transform, fewest))
     for _ in range(2):
         # Better known poses show further walls, and which walls are one.
-        walls = gather(_corrected(planes, joint.parameters), joint.tool_from_camera, fewest)
+        walls = _gather(_corrected(planes, joint.parameters), joint.tool_from_camera, fewest)
         again = fit_jointly(planes, joint.tool_from_camera, walls)
         if again.cost() >= joint.cost():
             break
@@ -359,24 +491,22 @@ def _followed(planes: SeenPlanes, transform: Tensor, fewest: int) -> Joint:
     if planes.label is not None:
         return joint
     # Walls that too few images show after all are dropped.
-    count = [len(planes.image[joint.wall == k].unique()) for k in range(len(joint.walls.offset))]
-    kept = torch.tensor([number >= fewest for number in count], dtype=torch.bool)
+    count = [len(planes.image[joint.wall == k].unique()) for k in range(len(joint.walls))]
+    kept = torch.tensor(count) >= fewest
     if bool(kept.all()):
         return joint
-    walls = WallPlanes(joint.walls.normal[kept], joint.walls.offset[kept])
-    return fit_jointly(planes, joint.tool_from_camera, walls)
+    return fit_jointly(planes, joint.tool_from_camera, joint.walls[kept])
 
 
-def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: WallPlanes) -> Joint:
+def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: Tensor) -> Joint:
     """Fit hand-eye, walls and a constant error, planes that lie on no wall counting for little.
 
     Args:
         planes: The planes of all images.
         tool_from_camera: Where to start, shape (4, 4).
-        walls: Where to start, some centimetres off.
+        walls: Where to start, some centimetres off, shape (G, 4).
     """
-    start = Parameters(tool_from_camera, torch.zeros(2, dtype=torch.float64))
-    joint = _assigned(planes, start, walls)
+    joint = _assigned(planes, _exact(tool_from_camera), walls)
     for _ in range(6):  # Assignments rarely change after the second time.
         before, chosen = joint.wall, joint.wall >= 0
         if not bool(chosen.any()):
@@ -389,9 +519,14 @@ def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: WallPlanes)
     return joint
 
 
+def _exact(tool_from_camera: Tensor) -> Parameters:
+    """Return a hand-eye transform and a camera without error."""
+    return Parameters(tool_from_camera, torch.zeros_like(_ERROR))
+
+
 def _fit_assigned(
-    planes: SeenPlanes, wall: Tensor, start: Parameters, walls: WallPlanes, centre: Tensor
-) -> tuple[Parameters, WallPlanes]:
+    planes: SeenPlanes, wall: Tensor, start: Parameters, walls: Tensor, centre: Tensor
+) -> tuple[Parameters, Tensor]:
     """Fit hand-eye and walls to planes whose walls are known, robustly.
 
     Weights of planes that coincide settle with four reweightings of four steps each, and those of
@@ -401,24 +536,24 @@ def _fit_assigned(
         planes: The planes.
         wall: The wall of each, shape (M,).
         start: Hand-eye and error to start from.
-        walls: Walls to start from.
+        walls: Walls to start from, shape (G, 4).
         centre: Where the hand-eye transform (4, 4) stays in what the planes leave open.
     """
     moments = _point_moments(planes)
-    found = Walls(walls.normal, walls.offset, wall, planes.world_from_tool)
+    found = Walls(walls[:, :3], walls[:, 3], wall, planes.world_from_tool)
     for _ in range(4):
         points = _corrected(planes, start).in_world(start.tool_from_camera)[0]
         off = (points * found.normal_world[wall][:, None]).sum(dim=2) + found.offset[wall][:, None]
         off = off.square().mean(dim=1).sqrt()
-        scale = max(sigma_from_mad(float(off.median())), TYPICAL / 10)
+        scale = max(sigma_from_mad(float(off.median())), _TYPICAL / 10)
         weighted = moments.weighted(robust_weights(off / scale, "cauchy"))
         fitted = estimate_walls(weighted, start, found, _held(start, centre), 4)
         if bool((fitted[0].coefficients.abs() > 10 * _ERROR).any()):
             # Held at zero, to micrometres.
-            none = replace(start, coefficients=torch.zeros_like(start.coefficients))
+            none = _exact(start.tool_from_camera)
             fitted = estimate_walls(weighted, none, found, _held(none, centre, 1e8), 4)
         start, found = fitted
-    return start, WallPlanes(found.normal_world, found.offset)
+    return start, torch.cat([found.normal_world, found.offset[:, None]], dim=1)
 
 
 def _point_moments(planes: SeenPlanes) -> ImageMoments:
@@ -427,16 +562,15 @@ def _point_moments(planes: SeenPlanes) -> ImageMoments:
     Normals and offsets in the tool frame are left at zero: walls put theirs in.
     """
     distance = planes.points.norm(dim=2, keepdim=True)
-    ray = planes.points / distance
-    columns = torch.cat([distance, torch.ones_like(distance), distance], dim=2)
-    product = (columns[:, :, :, None] * ray[:, :, None, :]).flatten(2)
-    product = torch.cat([product, torch.ones_like(distance)], dim=2)
-    zero = torch.zeros(len(planes), dtype=torch.float64)
+    one = torch.ones_like(distance)
+    columns = torch.cat([distance, one, distance], dim=2)
+    product = (columns[:, :, :, None] * (planes.points / distance)[:, :, None, :]).flatten(2)
+    product = torch.cat([product, one], dim=2)
     return ImageMoments(
-        gram=product.transpose(1, 2) @ product,
-        normal_tool=zero[:, None].expand(-1, 3),
-        offset_tool=zero,
-        count=torch.full_like(zero, planes.points.shape[1]),
+        gram=product.mT @ product,
+        normal_tool=torch.zeros_like(planes.normal),
+        offset_tool=torch.zeros_like(planes.support),
+        count=one.sum(dim=(1, 2)),
         symbols=["c0", "slope"],
     )
 
@@ -447,9 +581,8 @@ def _held(start: Parameters, centre: Tensor, stiff: float = 1.0) -> NormalEquati
     Along what the images determine it is far too weak to matter, unless `stiff` holds the error.
     """
     sigma = torch.cat([torch.full((6,), PRIOR_SIGMA, dtype=torch.float64), _ERROR / stiff**0.5])
-    hessian = torch.diag((TYPICAL / sigma) ** 2)
-    turned = se3.log(se3.inverse(centre) @ start.tool_from_camera)
-    step = torch.cat([turned, start.coefficients])
+    hessian = torch.diag((_TYPICAL / sigma) ** 2)
+    step = _exact(centre).step_to(start)
     return NormalEquations(step @ hessian @ step, hessian @ step, hessian)
 
 
@@ -460,23 +593,23 @@ def _corrected(planes: SeenPlanes, parameters: Parameters) -> SeenPlanes:
     return replace(planes, points=planes.points * (1 - slope - constant / distance))
 
 
-def _assigned(planes: SeenPlanes, parameters: Parameters, walls: WallPlanes) -> Joint:
+def _assigned(planes: SeenPlanes, parameters: Parameters, walls: Tensor) -> Joint:
     """Give each plane the wall nearest it, at most one plane of an image to each wall.
 
     Five typical deviations off, but never nearer than 50 mm, a plane is an outlier: by chance one
     in a million is so far.
     """
-    count, known = len(planes), len(walls.offset)
-    if not known:
-        nothing = torch.full((count,), torch.inf, dtype=torch.float64)
-        return Joint(parameters, walls, torch.full((count,), -1), nothing)
-    distance = distances(_corrected(planes, parameters), parameters.tool_from_camera, walls)
+    if not len(walls):
+        nothing = torch.full((len(planes),), torch.inf, dtype=torch.float64)
+        return Joint(parameters, walls, torch.full((len(planes),), -1), nothing)
+    distance = distances(
+        *_corrected(planes, parameters).in_world(parameters.tool_from_camera), walls
+    )
     if planes.label is not None:
-        other = torch.arange(known) != planes.label[:, None]
+        other = torch.arange(len(walls)) != planes.label[:, None]
         distance = torch.where(other, torch.inf, distance)
     deviation, wall = distance.min(dim=1)
-    finite = deviation[deviation.isfinite()]
-    gate = 5 * max(TYPICAL, float(finite.median()) if len(finite) else 0.0)
+    gate = 5 * max(_TYPICAL, float(deviation[deviation.isfinite()].nanmedian().nan_to_num(0.0)))
     wall = torch.where(deviation <= gate, wall, -1)
     taken: set[tuple[int, int]] = set()
     for k in deviation.argsort(stable=True).tolist():
@@ -494,18 +627,16 @@ def undetermined(planes: SeenPlanes, joint: Joint, names: Sequence[str]) -> list
     of 100 mm and 100 mrad.
 
     Args:
-        planes: The planes of all images.
+        planes: The planes of all images, of which some lie on walls.
         joint: The fit.
         names: The walls' names.
     """
     chosen = joint.wall >= 0
-    if not bool(chosen.any()):
-        return ["everything: no wall was found"]
     planes = planes.take(chosen)
-    walls = Walls(*joint.walls, joint.wall[chosen], planes.world_from_tool)
+    walls = Walls(joint.walls[:, :3], joint.walls[:, 3], joint.wall[chosen], planes.world_from_tool)
     moments = walls.seen_by(_point_moments(planes))
     each = joint_image_equations(moments, joint.parameters, walls)
-    precision = each.hessian.sum(dim=0) / TYPICAL**2
+    precision = each.hessian.sum(dim=0) / _TYPICAL**2
     precision[6:8, 6:8] += torch.diag(1 / _ERROR**2)
     prior = torch.eye(len(precision), dtype=precision.dtype) / PRIOR_SIGMA**2
     variance, vectors = torch.linalg.eigh(torch.linalg.inv(precision + prior))
@@ -518,8 +649,7 @@ def undetermined(planes: SeenPlanes, joint: Joint, names: Sequence[str]) -> list
     left, found = vectors[:, 2 * variance > PRIOR_SIGMA**2], []
     for _ in range(left.shape[1]):
         inside = left @ left.T
-        vector = inside[:, int(inside.diagonal().argmax())]
-        vector = vector / vector.norm()
+        vector = torch.nn.functional.normalize(inside[:, inside.diagonal().argmax()], dim=0)
         left = left - vector[:, None] * (vector @ left)
         size = vector.abs()
         order = [k for k in size.argsort(descending=True).tolist() if 5 * size[k] > size.max()]

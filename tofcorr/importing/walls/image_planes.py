@@ -5,10 +5,8 @@ is a linear one. The search looks at a thinned image; all pixels are assigned af
 """
 
 import math
-from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-import numpy as np
 import torch
 from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
@@ -88,8 +86,14 @@ def planes_of_image(
         seed: Of the hypotheses; the same for every image, so that an image's planes do not depend
             on its number.
     """
-    if named:
-        return _only_plane(distance, valid, rays)
+    if named:  # A sensor of one pixel sees no normal: it is put opposite to the ray.
+        ray, measured = rays[valid].double(), distance[valid].double()
+        if len(measured) < min(3, valid.numel()):
+            return []
+        if valid.numel() == 1:
+            return [ImagePlane(-ray[0], float(measured[0]), 1, ray * measured[:, None])]
+        gradient = fit_plane(ray, measured[None], torch.ones(1, len(measured)).bool())[0]
+        return [_described(rays, valid, gradient)]
     step = max(1, math.isqrt(distance.numel() // _SEARCHED_PIXELS))
     start = step // 2
     seen = valid[start::step, start::step]
@@ -135,50 +139,10 @@ def plane_masks(
         gradients: The planes g . x = 1, shape (K, 3).
         tolerance: Largest deviation along the ray, metres.
     """
-    near = near_planes(distance, valid, rays, gradients, tolerance)
-    return near & (near.sum(dim=0) == 1)
-
-
-def near_planes(
-    distance: Tensor, valid: Tensor, rays: Tensor, gradients: Tensor, tolerance: float
-) -> Tensor:
-    """Return which pixels are near which plane, shape (K, H, W); arguments of `plane_masks`."""
     inverse = rays.flatten(0, 1).to(torch.float32) @ gradients.to(torch.float32).T
     fitted = torch.where(inverse > 0, 1 / inverse, torch.inf).T.unflatten(1, distance.shape)
-    return valid & ((fitted - distance.to(torch.float32)).abs() <= tolerance)
-
-
-def wall_masks(
-    distance: Tensor,
-    valid: Tensor,
-    rays: Tensor,
-    gradients: Sequence[np.ndarray | None],
-    tolerance: float,
-) -> np.ndarray:
-    """Return which pixels of an image look at each of its walls, shape (V, H, W), bool.
-
-    Args:
-        distance: As in `plane_masks`.
-        valid: As in `plane_masks`.
-        rays: As in `plane_masks`.
-        gradients: Of each wall the plane g . x = 1 in the image; None: the image shows that wall
-            and nothing else.
-        tolerance: As in `plane_masks`.
-    """
-    given = [torch.from_numpy(one) for one in gradients if one is not None]
-    if not given:
-        return valid.expand(len(gradients), *valid.shape).numpy()
-    return plane_masks(distance, valid, rays, torch.stack(given), tolerance).numpy()
-
-
-def representative_points(points: Tensor) -> Tensor:
-    """Return four points with the mean and second moments in their plane of (M, 3) points."""
-    mean = points.mean(dim=0)
-    centred = points - mean
-    values, vectors = torch.linalg.eigh(centred.T @ centred / len(points))
-    # Two pairs, each 2^(1/2) standard deviations either side of the mean: the same moments.
-    arms = (vectors[:, 1:] * (2 * values[1:].clamp(min=0)).sqrt()).T
-    return mean + torch.stack([arms[0], -arms[0], arms[1], -arms[1]])
+    near = valid & ((fitted - distance.to(torch.float32)).abs() <= tolerance)
+    return near & (near.sum(dim=0) == 1)
 
 
 def _described(rays: Tensor, mask: Tensor, gradient: Tensor, most: int = 20_000) -> ImagePlane:
@@ -188,23 +152,14 @@ def _described(rays: Tensor, mask: Tensor, gradient: Tensor, most: int = 20_000)
     """
     used = mask.flatten().nonzero()[:, 0]
     direction = rays.flatten(0, 1)[used[:: max(1, len(used) // most)]].double()
-    points = representative_points(direction / (direction @ gradient)[:, None])
+    points = direction / (direction @ gradient)[:, None]
+    mean = points.mean(dim=0)
+    values, vectors = torch.linalg.eigh((points - mean).T @ (points - mean) / len(points))
+    # Two pairs, each 2^(1/2) standard deviations either side of the mean: the same moments.
+    arms = (vectors[:, 1:] * (2 * values[1:].clamp(min=0)).sqrt()).T
     length = float(gradient.norm())
-    return ImagePlane(-gradient / length, 1 / length, len(used), points)
-
-
-def _only_plane(distance: Tensor, valid: Tensor, rays: Tensor) -> list[ImagePlane]:
-    """Return the plane of an image that shows one wall only; none if fewer than 3 pixels see it.
-
-    A sensor of one pixel sees a plane of unknown normal: the normal is put opposite to the ray.
-    """
-    if int(valid.sum()) < min(3, valid.numel()):
-        return []
-    ray, measured = rays[valid].double(), distance[valid].double()
-    if valid.numel() == 1:
-        return [ImagePlane(-ray[0], float(measured[0]), 1, ray * measured[:, None])]
-    every = torch.ones(1, len(measured), dtype=torch.bool)
-    return [_described(rays, valid, fit_plane(ray, measured[None], every)[0])]
+    four = mean + torch.cat([arms, -arms])
+    return ImagePlane(-gradient / length, 1 / length, len(used), four)
 
 
 def _triples(seen: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:
