@@ -231,9 +231,21 @@ def _read_table(path: Path) -> PoseTrack:
     """
     delimiter, columns, rows = _table(path)
 
-    def first_of(choices: Iterable[tuple[str, ...]]) -> tuple[str, ...] | None:
-        """Return the first choice whose columns all exist."""
-        return next((one for one in choices if set(one) <= set(columns)), None)
+    def first_of(choices: Iterable[tuple[str, ...]], wanted: str = "") -> tuple[str, ...]:
+        """Return the first choice whose columns all exist; none if there is none and none wanted.
+
+        Raises:
+            CalibrationDataError: There is none of those wanted.
+        """
+        found = next((one for one in choices if set(one) <= set(columns)), ())
+        if wanted and not found:
+            euler = any(name.startswith(("roll", "pitch", "yaw")) for name in columns)
+            advice = " Turn roll, pitch and yaw into quaternions: their order has no standard."
+            raise CalibrationDataError(
+                f"{path}: expected the columns {wanted}, got {one_line(', '.join(columns))}."
+                + advice * euler
+            )
+        return found
 
     def cells(name: str) -> list[str]:
         """Return the text of a column, the last of that name."""
@@ -262,24 +274,16 @@ def _read_table(path: Path) -> PoseTrack:
                 ) from None
         return found
 
-    move, turn = first_of(_TRANSLATION), first_of(_ROTATION)
-    if move is None or turn is None:
-        wanted = "tx, ty, tz" if move is None else "qx, qy, qz, qw or rx, ry, rz"
-        euler = any(name.startswith(("roll", "pitch", "yaw")) for name in columns)
-        advice = " Turn roll, pitch and yaw into quaternions: their order has no standard."
-        raise CalibrationDataError(
-            f"{path}: expected the columns {wanted}, got {one_line(', '.join(columns))}."
-            + advice * (euler and move is not None)
-        )
+    move = first_of(_TRANSLATION, "tx, ty, tz")
+    translation = _TRANSLATION[move] * np.array([numbers(one) for one in move]).T
+    turn = first_of(_ROTATION, "qx, qy, qz, qw or rx, ry, rz")
+    rotation = np.array([numbers(one) for one in turn]).T
     time, name = first_of(_TIME), first_of(_NAME)
-    translation, rotation = (np.array([numbers(one) for one in names]).T for names in (move, turn))
     return PoseTrack.checked(
-        rigid_transforms(
-            _TRANSLATION[move] * translation, rotation, lambda k: f"{path}, row {k + 1}"
-        ),
+        rigid_transforms(translation, rotation, lambda k: f"{path}, row {k + 1}"),
         str(path),
-        None if time is None else np.array(_TIME[time]) @ [numbers(one) for one in time],
-        None if name is None else cells(name[0]),
+        np.array(_TIME[time]) @ [numbers(one) for one in time] if time else None,
+        cells(name[0]) if name else None,
     )
 
 
