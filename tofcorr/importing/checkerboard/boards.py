@@ -4,6 +4,7 @@ Active illumination falls with the square of the distance, so that counts span d
 of board is searched in several renderings of an image, and its points are refined on the counts.
 """
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -41,6 +42,8 @@ class FlatBoard(ABC):
 
     kind: ClassVar[str]
     """What the recording calls the target."""
+    called: ClassVar[str] = "{size}"
+    """What messages call the board."""
     usual: ClassVar[tuple[str, float]] = ("", 0.0)
     """Dictionary and share of markers where none are given."""
     columns: int
@@ -62,15 +65,6 @@ class FlatBoard(ABC):
             board is not seen.
         """
 
-    def outline(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smallest and largest x and y of the points, in squares, each (2,)."""
-        places = self.corner_points()[:, :2] / self.square_length
-        return places.min(axis=0), places.max(axis=0)
-
-    def scaled(self, factor: float) -> Self:
-        """Return the board enlarged by a factor."""
-        return replace(self, square_length=self.square_length * factor)
-
     def fewer(self) -> Self | None:
         """Return the board that a user means who counted squares instead of corners.
 
@@ -78,14 +72,19 @@ class FlatBoard(ABC):
         """
         return None
 
+    def __str__(self) -> str:
+        """Name the board."""
+        size = f"{self.columns}x{self.rows}"
+        return self.called.format(size=size, dictionary=self.dictionary or self.usual[0])
+
     def markers(self) -> tuple[cv2.aruco.Dictionary, float]:
         """Return the dictionary of the markers, and their share.
 
         Raises:
             ConfigError: There is no such dictionary.
         """
-        name = self.dictionary or self.usual[0]
         known = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
+        name = self.dictionary or self.usual[0]
         wanted = f"DICT_{name.upper().removeprefix('DICT_')}"
         if wanted not in known:
             listed = ", ".join(sorted(key.removeprefix("DICT_") for key in known))
@@ -132,10 +131,6 @@ class Board(FlatBoard):
             return None
         return replace(self, columns=self.columns - 1, rows=self.rows - 1)
 
-    def __str__(self) -> str:
-        """Name the board by its inner corners."""
-        return f"{self.columns}x{self.rows}"
-
     def _refined(self, image: np.ndarray, corners: np.ndarray) -> np.ndarray:
         """Refine corners on the logarithm of the counts around the board.
 
@@ -156,6 +151,7 @@ class CharucoBoard(FlatBoard):
     """A ChArUco board: a checkerboard whose white squares carry markers, found even in part."""
 
     kind = "charuco"
+    called = "ChArUco {size} ({dictionary})"
     usual = ("4X4_50", 0.75)
 
     def corner_points(self) -> np.ndarray:
@@ -165,21 +161,16 @@ class CharucoBoard(FlatBoard):
     def find(self, image: np.ndarray) -> np.ndarray | None:
         """Find the corners in an image; in the rendering that shows most of them."""
         detector = cv2.aruco.CharucoDetector(self._board())
-        best, most, count = None, _FEWEST_CORNERS - 1, (self.columns - 1) * (self.rows - 1)
+        best = np.full(((self.columns - 1) * (self.rows - 1), 2), np.nan)
+        most = _FEWEST_CORNERS - 1
         for rendering, scale in _renderings(image):
             corners, numbers, _, _ = detector.detectBoard(rendering)
-            if numbers is None or len(numbers) <= most:
-                continue
-            most = len(numbers)
-            best = np.full((count, 2), np.nan)
-            best[np.ravel(numbers).astype(np.int64)] = _unscaled(corners, scale)
-            if most == count:
+            if numbers is not None and len(numbers) > most:
+                most, best[:] = len(numbers), np.nan
+                best[np.ravel(numbers)] = _unscaled(corners, scale)
+            if most == len(best):
                 break
-        return best
-
-    def __str__(self) -> str:
-        """Name the board."""
-        return f"ChArUco {self.columns}x{self.rows} ({self.dictionary or self.usual[0]})"
+        return best if most >= _FEWEST_CORNERS else None
 
     def _board(self) -> cv2.aruco.CharucoBoard:
         dictionary, side = self.markers()
@@ -194,6 +185,7 @@ class AprilGrid(FlatBoard):
     """
 
     kind = "apriltag"
+    called = "{size} tags ({dictionary})"
     usual = ("APRILTAG_36H11", 0.3)
 
     def corner_points(self) -> np.ndarray:
@@ -209,7 +201,7 @@ class AprilGrid(FlatBoard):
         found = np.full((self.columns * self.rows, 4, 2), np.nan)
         for rendering, scale in _renderings(image):
             corners, numbers, _ = detector.detectMarkers(rendering)
-            tags = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
+            tags = () if numbers is None else np.ravel(numbers).tolist()
             for four, number in zip(corners, tags, strict=True):
                 if number < len(found) and np.isnan(found[number]).any():
                     found[number] = _unscaled(four, scale)
@@ -225,10 +217,6 @@ class AprilGrid(FlatBoard):
         refined = _to_subpixels(image.astype(np.float32), tags.reshape(-1, 2), sides.min() / 10)
         found[seen] = refined.reshape(tags.shape)
         return found.reshape(-1, 2)
-
-    def __str__(self) -> str:
-        """Name the board."""
-        return f"{self.columns}x{self.rows} tags ({self.dictionary or self.usual[0]})"
 
 
 BOARDS = {board.kind: board for board in (Board, CharucoBoard, AprilGrid)}
@@ -247,29 +235,15 @@ def read_board(text: str) -> dict[str, Any]:
     Raises:
         ConfigError: The text is something else.
     """
-    kind, *rest = text.split(":") if ":" in text else ("checkerboard", text)
-    size = rest[0].lower().split("x")
-    shaped = len(size) == 2 and all(part.isdecimal() and int(part) > 0 for part in size)
-    if kind not in BOARDS or not shaped or len(rest) > (1 if kind == "checkerboard" else 3):
+    number, word = r"(\d+)", "(?::([^:]+))?"
+    match = re.fullmatch(f"(?:({'|'.join(BOARDS)}):)?{number}[xX]{number}{word}{word}", text)
+    if match is None or (match[1] in (None, Board.kind) and match[4] is not None):
         raise ConfigError(
             f"expected inner corners such as 5x7, or charuco:5x7:4X4_50:0.75 or "
             f"apriltag:6x6:APRILTAG_36H11:0.3, got '{text[:60]}'."
         )
-    share = None
-    if len(rest) == 3:
-        try:
-            share = float(rest[2])
-        except ValueError:
-            share = 0.0
-        if not 0 < share < 1:
-            raise ConfigError(f"the share in '{text[:60]}' must be between 0 and 1.")
-    return {
-        "board_kind": kind,
-        "board_columns": int(size[0]),
-        "board_rows": int(size[1]),
-        "board_dictionary": rest[1] if len(rest) > 1 else None,
-        "board_share": share,
-    }
+    keys = ("board_kind", "board_columns", "board_rows", "board_dictionary", "board_share")
+    return dict(zip(keys, (match[1] or Board.kind, *match.groups()[1:]), strict=True))
 
 
 def _renderings(infrared: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:

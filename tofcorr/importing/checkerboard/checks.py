@@ -137,8 +137,8 @@ def typical_ratio(views: Sequence[BoardView]) -> float:
     return ratio
 
 
-def refuse_mixed_up(view: BoardView, ratio: float) -> None:
-    """Refuse a view whose ratio of measured to true distance differs much from `ratio` of all.
+def refuse_mixed_up(view: BoardView, ratio: float) -> BoardView:
+    """Return a view, unless its ratio of measured to true distance differs much from that of all.
 
     Raises:
         RefusedViewError: Depth and infrared image are not of the same view, or the pose is wrong.
@@ -149,16 +149,18 @@ def refuse_mixed_up(view: BoardView, ratio: float) -> None:
             f"stands at {view.distance:.3f} m, other views {ratio:.3f} times the distance; "
             "are the two images of the same view?"
         )
+    return view
 
 
-def agreement_warnings(views: Sequence[BoardView], depth_kind: DepthKind) -> list[str]:
+def agreement_warnings(
+    views: Sequence[BoardView], ratio: float, depth_kind: DepthKind
+) -> list[str]:
     """Return warnings about the unit and the kind of depth.
 
     The radial error is regressed on D (1 - cosine), with a constant and D as further regressors:
     radial depth declared as z gives a slope of +1, z depth declared as radial gives -1.
     """
     warnings = []
-    ratio = typical_ratio(views)
     if abs(ratio - 1.0) > _TENTH / 2:
         warnings.append(
             f"Depth reads {100 * (ratio - 1):+.1f} % against the board: check the square length, "
@@ -168,7 +170,7 @@ def agreement_warnings(views: Sequence[BoardView], depth_kind: DepthKind) -> lis
     # After removing constant and D, D (1 - cosine) must vary by more than the camera's own error,
     # some millimetres, to estimate its slope.
     explained = moments[2, :2] @ np.linalg.pinv(moments[:2, :2]) @ moments[:2, 2]
-    spread_mm = 1e3 * np.sqrt(max(moments[2, 2] - explained, 0.0) / moments[0, 0])
+    spread_mm = 1000 * np.sqrt(max(moments[2, 2] - explained, 0.0) / moments[0, 0])
     if spread_mm < 5:
         return warnings
     slope = float(np.linalg.solve(moments[:3, :3], moments[:3, 3])[2])
@@ -207,7 +209,7 @@ def study_degeneracy(
     def read_with(focal: float, square: float) -> dict[str, Any]:
         (fx, skew, cx), (_, fy, cy), last = camera.matrix
         other = replace(camera, matrix=((fx * focal, skew, cx), (0.0, fy * focal, cy), last))
-        larger = board.scaled(square)
+        larger = replace(board, square_length=board.square_length * square)
         poses = [poses_of(corners, larger, other, pose.used)[0] for corners, pose, _ in views]
         distances = np.array([distance(pose, larger) for pose in poses])
         errors = np.array([error + distance(pose, board) for _, pose, error in views]) - distances

@@ -200,19 +200,15 @@ def _prepared(
             usable &= amplitude < options.saturation_counts
         return compare_depth(view, pose, depth, usable, area, rays, options.depth_kind)
 
-    def check(view: BoardView) -> BoardView:
-        refuse_mixed_up(view, ratio)
-        return view
-
     sieve.apply(detect, sieve.progress(list(images.views), "finding boards"), str)
     camera, about_camera, warnings = _camera(list(detected.values()), board, intrinsics)
     rays = ray_directions(camera).numpy()
     views = sieve.apply(place, sieve.progress(list(detected), "placing boards"), str)
     ratio = typical_ratio(views)
-    views = sieve.apply(check, views, lambda view: view.name)
+    views = sieve.apply(partial(refuse_mixed_up, ratio=ratio), views, lambda view: view.name)
     posed = [(detected[view.name][0], view.pose, view.error) for view in views]
     degeneracy = study_degeneracy(posed, board, camera, options.depth_kind)
-    warnings += agreement_warnings(views, options.depth_kind)
+    warnings += agreement_warnings(views, ratio, options.depth_kind)
 
     def frames() -> Iterator[Frame]:
         for index, view in enumerate(views):

@@ -83,7 +83,8 @@ class BoardPose:
         distance = self.distance(np.where(meets[..., None], rays, -self.plane()[0]))
         on_plane = np.where(meets, distance, 0.0)[..., None] * rays
         in_squares = (on_plane - self.translation) @ self.rotation[:, :2] / board.square_length
-        low, high = board.outline()
+        places = board.corner_points()[:, :2] / board.square_length
+        low, high = places.min(axis=0), places.max(axis=0)
         beyond = np.maximum(low - in_squares, in_squares - high)
         return meets & (beyond.max(axis=-1) <= margin)
 
@@ -104,10 +105,11 @@ def estimate_pose(
             poses fit them almost equally well.
     """
     used = seen = np.asarray(np.isfinite(corners).all(axis=1))
-    poses = poses_of(corners, board, camera, used)
+    points = board.corner_points()
+    best, *others = poses_of(corners, board, camera, used)
     for _ in range(10):
-        vector = cv2.Rodrigues(poses[0].rotation)[0]
-        projected = _project(board.corner_points(), camera, vector, poses[0].translation)[0]
+        vector = cv2.Rodrigues(best.rotation)[0]
+        projected = _project(points, camera, vector, best.translation)[0]
         errors = np.linalg.norm(projected - corners, axis=1)
         deviation = sigma_from_mad(float(np.nanmedian(errors)))
         inliers = errors < max(_SMALLEST_OUTLIER_PIXELS, 4 * deviation)
@@ -118,14 +120,13 @@ def estimate_pose(
                 f"only {inliers.sum()} of {seen.sum()} corners fit one pose of the board"
             )
         used = inliers
-        poses = poses_of(corners, board, camera, used)
-    best = poses[0]
+        best, *others = poses_of(corners, board, camera, used)
     if not best.reprojection_rms <= max_reprojection:
         raise RefusedViewError(
             f"the corners miss the board by {best.reprojection_rms:.2f} px (root mean square), "
             f"{max_reprojection:g} px are allowed; is the image blurred or the board bent?"
         )
-    for other in poses[1:]:
+    for other in others:
         # Poses whose normals differ by less than 3 degrees are the same pose.
         same = best.plane()[0] @ other.plane()[0] > np.cos(np.radians(3))
         if not same and other.reprojection_rms < _AMBIGUOUS_RATIO * best.reprojection_rms:
@@ -203,9 +204,11 @@ def calibrate(
             "calibrate the camera. Record more, at several tilts, or give the intrinsics."
         )
     chosen = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
-    camera, about, errors = _solve(corner_sets, chosen, board, size)
-    for _ in range(5):
-        limit = _outlier_limit(errors)
+    for _ in range(6):
+        camera, about, errors = _solve(corner_sets, chosen, board, size)
+        # Five standard deviations of a coordinate: the median length of an error is 1.18.
+        deviation = float(np.nanmedian(np.concatenate(errors))) / np.sqrt(2 * np.log(2))
+        limit = max(_SMALLEST_OUTLIER_PIXELS, 5 * deviation)
         # An outlier shifts its whole view, so the best corners of each view are always kept.
         inliers = [
             error <= max(limit, np.nanquantile(error, _SMALLEST_SHARE_OF_CORNERS))
@@ -214,8 +217,6 @@ def calibrate(
         if all(np.array_equal(a, b) for a, b in zip(inliers, chosen, strict=True)):
             break
         chosen = inliers
-        camera, about, errors = _solve(corner_sets, chosen, board, size)
-    limit = _outlier_limit(errors)
     keep = [
         i
         for i, error in enumerate(errors)
@@ -239,12 +240,6 @@ def calibration_warning(camera: CameraIntrinsics, about: dict[str, Any]) -> str:
         f"{deviation:.1f} px (one standard deviation); by itself that leaves the slope of the "
         f"distance error uncertain by {1e3 * deviation / focal_length:.1f} mm/m."
     )
-
-
-def _outlier_limit(errors: list[np.ndarray]) -> float:
-    """Return five standard deviations of a coordinate: the median length of an error is 1.18."""
-    deviation = float(np.nanmedian(np.concatenate(errors))) / np.sqrt(2 * np.log(2))
-    return max(_SMALLEST_OUTLIER_PIXELS, 5 * deviation)
 
 
 def _solve(
@@ -272,11 +267,10 @@ def _solve(
         )
         for own, turn, move in zip(corner_sets, rotations, translations, strict=True)
     ]
-    fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     camera = CameraIntrinsics(
         width=size[0],
         height=size[1],
-        matrix=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)),
+        matrix=tuple(map(tuple, matrix.tolist())),  # type: ignore[arg-type]
         distortion=tuple(distortion.tolist()),
     )
     seen = sum(int(np.isfinite(corners).all(axis=1).sum()) for corners in corner_sets)
@@ -298,14 +292,14 @@ def _refuse_undetermined(
     """Refuse focal lengths that are uncertain by a fifth, or unlike any camera's."""
     focal_lengths = matrix[[0, 1], [0, 1]]
     sound = np.isfinite(matrix).all() and np.isfinite(deviations).all()
-    sound &= bool(np.all((5 * focal_lengths > max(size)) & (focal_lengths < 20 * max(size))))
-    sound &= bool(np.all(5 * deviations[:2] < focal_lengths))
+    sane = (5 * focal_lengths > max(size)) & (focal_lengths < 20 * max(size))
+    sane &= 5 * deviations[:2] < focal_lengths
     # The root mean square angle between the boards' normals and their mean.
     normals = np.stack([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     mean = normals.mean(axis=0)
     cosines = np.clip(normals @ mean / np.linalg.norm(mean), -1.0, 1.0)
     tilt = float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2))))
-    if not sound or tilt < _SMALLEST_TILT_DEG:
+    if not (sound and sane.all()) or tilt < _SMALLEST_TILT_DEG:
         raise CalibrationDataError(
             "these views do not determine the camera: the board's tilts vary by "
             f"{tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed), and the focal length came out as "
