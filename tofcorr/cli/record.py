@@ -124,9 +124,7 @@ def _table(plan: "PosePlan", start: "np.ndarray") -> str:
 
 @click.group(
     cls=LazyGroup,
-    lazy={
-        name: (f"importing.{name}:command", summary) for name, summary in IMPORTERS.items()
-    },
+    lazy={name: (f"importing.{name}:command", summary) for name, summary in IMPORTERS.items()},
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 def import_command() -> None:
