@@ -14,11 +14,11 @@ from tofcorr.importing.registry import IMPORTERS
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFINED = {
-    "cv2": {"tofcorr/importing"},
+    "cv2": {"tofcorr/importing", "tofcorr/correction/export/opencv.py"},
     "torch.utils.tensorboard": {
         "tofcorr/training/monitor.py",
     },
-    "yaml": {"tofcorr/options", "tofcorr/data", "tofcorr/importing"},
+    "yaml": {"tofcorr/options.py", "tofcorr/data", "tofcorr/importing"},
 }
 
 

@@ -1,10 +1,8 @@
-"""The calibration as a YAML file of cv::FileStorage, written as text: OpenCV is not needed."""
+"""The calibration as a YAML file of cv::FileStorage."""
 
 import json
-import math
-import re
-from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +11,8 @@ from tofcorr.correction.export.pose import Mount, write_pose
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.model import ErrorModel
 
-Value = str | int | float | np.ndarray | Sequence[Mapping[str, "Value"]]
+Value = str | int | float | np.ndarray | list[dict[str, "Value"]]
 """What a key of cv::FileStorage may hold; matrices have two dimensions, written as double."""
-
-_HEADER = "%YAML:1.0\n---\n"
-_MATRIX_TAG = "!!opencv-matrix"
-_INDENT = "   "
 
 
 def export_opencv(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -37,10 +31,17 @@ def export_opencv(corrector: DepthCorrector, path: Path | str, reference: Calibr
     Raises:
         ExportError: What was written is not the calibration, or the file cannot be written.
     """
+    import cv2
+
     mount = Mount(reference, "opencv") if reference.hand_eye_estimated else None
-    values = _content(json.loads(corrector.metadata()), reference, mount)
-    text = _HEADER + "".join(_entry(key, value, "") for key, value in values.items())
-    write_pose(path, text, lambda part: read_matrix(part, "tool_from_camera"), mount)
+
+    def write(part: Path) -> None:
+        storage = cv2.FileStorage(str(part), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
+        for key, value in _content(json.loads(corrector.metadata()), reference, mount).items():
+            _put(storage, key, value)
+        storage.release()
+
+    write_pose(path, write, _transform_in, mount)
 
 
 def _content(metadata: dict, state: CalibrationState, mount: Mount | None) -> dict[str, Value]:
@@ -98,46 +99,26 @@ def _coefficients(error: ErrorModel) -> list[dict[str, Value]]:
     ]
 
 
-def read_matrix(path: Path, key: str) -> np.ndarray:
-    """Return a matrix of a file that `export_opencv` wrote; empty if there is none."""
-    text = path.read_text(encoding="utf-8")
-    pattern = rf"^{key}: {_MATRIX_TAG}\s+rows: (\d+)\s+cols: (\d+)\s+dt: d\s+data: \[([^\]]*)\]"
-    found = re.search(pattern, text, re.MULTILINE)
-    if found is None:
-        return np.zeros((0, 0))
-    numbers = [float(word) for word in found[3].split(",")]
-    return np.array(numbers).reshape(int(found[1]), int(found[2]))
+def _put(storage: Any, key: str, value: Value) -> None:  # noqa: ANN401 - cv2.FileStorage
+    """Write an entry; those of a list of mappings one below the other."""
+    if not isinstance(value, list):
+        storage.write(key, value)
+        return
+    import cv2
+
+    storage.startWriteStruct(key, cv2.FILE_NODE_SEQ)
+    for item in value:
+        storage.startWriteStruct("", cv2.FILE_NODE_MAP)
+        for name, one in item.items():
+            _put(storage, name, one)
+        storage.endWriteStruct()
+    storage.endWriteStruct()
 
 
-def _entry(key: str, value: Value, indent: str) -> str:
-    if isinstance(value, np.ndarray):
-        rows, columns = value.shape
-        inner = indent + _INDENT
-        lines = (", ".join(_number(number) for number in row) for row in value.tolist())
-        data = f",\n{inner}{_INDENT}".join(lines)
-        return (
-            f"{indent}{key}: {_MATRIX_TAG}\n{inner}rows: {rows}\n{inner}cols: {columns}\n"
-            f"{inner}dt: d\n{inner}data: [ {data} ]\n"
-        )
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'{indent}{key}: "{escaped}"\n'
-    if isinstance(value, int):
-        return f"{indent}{key}: {value}\n"
-    if isinstance(value, float):
-        return f"{indent}{key}: {_number(value)}\n"
-    inner = indent + 2 * _INDENT
-    items = (
-        f"{indent}{_INDENT}-\n" + "".join(_entry(name, one, inner) for name, one in item.items())
-        for item in value
-    )
-    return f"{indent}{key}:\n" + "".join(items)
+def _transform_in(path: Path) -> np.ndarray:
+    """Return the transform that a file states, shape (4, 4); empty if there is none."""
+    import cv2
 
-
-def _number(value: float) -> str:
-    """Return a float with all its digits, as OpenCV reads it."""
-    if math.isnan(value):
-        return ".NaN"
-    if math.isinf(value):
-        return ".Inf" if value > 0 else "-.Inf"
-    return f"{value:.16e}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    found = storage.getNode("tool_from_camera").mat()
+    return np.zeros((0, 0)) if found is None else found

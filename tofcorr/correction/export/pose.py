@@ -86,13 +86,16 @@ class Mount:
 
 
 def write_pose(
-    path: Path | str, text: str, read: Callable[[Path], np.ndarray], mount: Mount | None
+    path: Path | str,
+    content: str | Callable[[Path], None],
+    read: Callable[[Path], np.ndarray],
+    mount: Mount | None,
 ) -> None:
     """Write a file, read it back, and refuse one that states another transform (4, 4).
 
     Args:
         path: The file; an older one is replaced.
-        text: Its content.
+        content: Its text, or what writes it.
         read: Returns the transform that the file states.
         mount: The pose; None: there is none to compare with.
 
@@ -100,7 +103,10 @@ def write_pose(
         ExportError: They differ, or the file cannot be written.
     """
     with staged_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+        if isinstance(content, str):
+            part.write_text(content, encoding="utf-8")
+        else:
+            content(part)
         if mount is None:
             return
         found = read(part)
