@@ -3,7 +3,6 @@
 import copy
 import json
 import math
-import platform
 from collections.abc import Iterable
 
 import numpy as np
@@ -12,7 +11,7 @@ from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.correction.frame_correction import AGREEMENT
-from tofcorr.correction.state import CalibrationState
+from tofcorr.correction.state import CalibrationState, corrector_metadata
 from tofcorr.error_terms.base import (
     EVERYTHING,
     Domain,
@@ -24,7 +23,6 @@ from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.error_terms.signal_terms import unscale
 from tofcorr.geometry.se3 import transformed
-from tofcorr.version import __version__
 
 # The error is computed times -2^40, so that `torch.lerp` with the weight w = 2^-40 subtracts it:
 # depth + w (-e / w - depth). Unlike a plain subtraction this turns an infinite depth into NaN in
@@ -505,44 +503,6 @@ class RuntimeSigma(nn.Module):
             spread = torch.tensordot(self.factor, torch.cat(functions), dims=1)
             calibration = torch.where(seen, spread.square().sum(0).sqrt(), unknown)
         return noise, calibration
-
-
-def corrector_metadata(state: CalibrationState) -> dict[str, object]:
-    """Return camera, model, validity range and versions, ready for JSON."""
-    error = state.model().error
-    limits = error.limits(state.domain)
-    return {
-        "format": "tofcorr-corrector",
-        "version": 1,
-        "model": state.name,
-        "terms": state.error_model.to_mapping()["terms"],
-        "residual_network": state.residual and state.residual.options.to_mapping(),
-        "symbols": error.symbols(),
-        "coefficients": state.coefficients.tolist(),
-        "needs_amplitude": error.needs_amplitude(),
-        "sign": "error = measured - true; corrected = measured - error",
-        "depth_kind": state.depth_kind,
-        "camera": state.camera.section(),
-        "validity": {
-            "radial_distance_m": list(limits.radial_distance),
-            "amplitude": _finite(limits.amplitude),
-            "normalised_amplitude": _finite(limits.normalised_amplitude),
-            "saturation_amplitude": state.saturation_amplitude,
-            "conditions": {name: list(known) for name, known in state.domain.conditions.items()},
-        },
-        "conditions_assumed": dict(zip(CONDITIONS, state.domain.mean_conditions(), strict=True)),
-        "tool_from_camera": state.tool_from_camera.tolist(),
-        "versions": {
-            "tofcorr": __version__,
-            "torch": str(torch.__version__),
-            "python": platform.python_version(),
-        },
-    }
-
-
-def _finite(interval: Interval | None) -> list[float] | None:
-    """Return the interval, or None for one without ends."""
-    return list(interval) if interval and all(map(math.isfinite, interval)) else None
 
 
 def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> None:

@@ -1,7 +1,9 @@
 """A calibration as numbers: from which training is resumed, and every format exported."""
 
 import io
+import math
 import pickle
+import platform
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -10,6 +12,7 @@ import torch
 from pydantic import AfterValidator, ConfigDict, InstanceOf, model_validator
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.frame_correction import FrameCorrection
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.base import Domain
@@ -19,6 +22,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.files import refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
 from tofcorr.options import LARGEST_NUMBER, FiniteNumber, Options, PositiveNumber, one_line
+from tofcorr.version import __version__
 
 STATE_FILE = "state.pt"
 """Its name in a run folder."""
@@ -178,6 +182,44 @@ class CalibrationState(CalibrationExtras):
         """Correct frames (..., H, W) in float64: return corrected depth and where it is valid."""
         reference, frames = self.correction(), (depth.double(), amplitude.double())
         return reference(*frames), reference.valid(*frames)
+
+
+def corrector_metadata(state: CalibrationState) -> dict[str, object]:
+    """Return camera, model, validity range and versions, ready for JSON."""
+    error = state.model().error
+    limits = error.limits(state.domain)
+    return {
+        "format": "tofcorr-corrector",
+        "version": 1,
+        "model": state.name,
+        "terms": state.error_model.to_mapping()["terms"],
+        "residual_network": state.residual and state.residual.options.to_mapping(),
+        "symbols": error.symbols(),
+        "coefficients": state.coefficients.tolist(),
+        "needs_amplitude": error.needs_amplitude(),
+        "sign": "error = measured - true; corrected = measured - error",
+        "depth_kind": state.depth_kind,
+        "camera": state.camera.section(),
+        "validity": {
+            "radial_distance_m": list(limits.radial_distance),
+            "amplitude": _finite(limits.amplitude),
+            "normalised_amplitude": _finite(limits.normalised_amplitude),
+            "saturation_amplitude": state.saturation_amplitude,
+            "conditions": {name: list(known) for name, known in state.domain.conditions.items()},
+        },
+        "conditions_assumed": dict(zip(CONDITIONS, state.domain.mean_conditions(), strict=True)),
+        "tool_from_camera": state.tool_from_camera.tolist(),
+        "versions": {
+            "tofcorr": __version__,
+            "torch": str(torch.__version__),
+            "python": platform.python_version(),
+        },
+    }
+
+
+def _finite(interval: Interval | None) -> list[float] | None:
+    """Return the interval, or None for one without ends."""
+    return list(interval) if interval and all(map(math.isfinite, interval)) else None
 
 
 def save_calibration(path: Path | str, state: CalibrationState) -> None:
