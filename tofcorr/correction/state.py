@@ -15,7 +15,7 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.frame_correction import FrameCorrection
 from tofcorr.correction.model import CalibrationModel, HandEye
-from tofcorr.error_terms.base import Domain
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError
