@@ -1,11 +1,13 @@
 """Play in the gears of a robot: it stays behind, on the side from which it came."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
+from tofcorr.geometry import se3
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
 from tofcorr.simulation.effects.inputs import ROBOT, FrameFacts
-from tofcorr.simulation.hooks import FrameState
 
 # A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:
 # above what the encoders of a robot at rest report, below the play that matters.
@@ -30,18 +32,13 @@ class BacklashEffect(GeometryEffect):
     moves_images = True
     fixed_terms = tuple(Coefficient(f"play_{axis}", "m", 0.002) for axis in "xyz")
 
-    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> FrameFacts:
         """Shift each pose to the side from which the tool came."""
         if facts.approach is None:
-            raise ValueError("The order of the poses is unknown; backlash needs it.")
-        pose = _moved(facts.world_from_tool, facts.approach * coefficients)
-        return pose, facts.normal_world, facts.offset
-
-    def on_pose(self, state: FrameState) -> None:
-        """Move the tool."""
-        if state.approach is not None:
-            play = state.approach * self.coefficients
-            state.world_from_tool = _moved(state.world_from_tool, play)
+            return facts
+        pose = facts.world_from_tool
+        position = pose[:, :3, 3] + facts.approach * coefficients
+        return replace(facts, world_from_tool=se3.assemble(pose[:, :3, :3], position))
 
 
 def sides_of_approach(world_from_tool: Tensor) -> Tensor:
@@ -59,10 +56,3 @@ def sides_of_approach(world_from_tool: Tensor) -> Tensor:
     number = torch.arange(len(moved), device=moved.device)[:, None]
     last = torch.where(turned, number, 0).cummax(0).values
     return torch.where(turned, moved.sign(), 0.0).gather(0, last)
-
-
-def _moved(poses: Tensor, shift: Tensor) -> Tensor:
-    """Return poses (..., 4, 4) with their origins shifted by (..., 3)."""
-    change = torch.zeros_like(poses)
-    change[..., :3, 3] = shift
-    return poses + change

@@ -7,18 +7,24 @@ metres, and `columns`, the derivative of `shift` at zero: the effect's columns i
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
+from pydantic import create_model
 from torch import Tensor
 
-from tofcorr.errors import ConfigError
-from tofcorr.geometry.rays import distance_along_rays
-from tofcorr.options import Options
-from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts, Need, inputs_from_state
+from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.options import FiniteNumber, Options
+from tofcorr.simulation.effects.inputs import (
+    EffectInputs,
+    FrameFacts,
+    Need,
+    facts_from_state,
+    inputs_from_state,
+)
 from tofcorr.simulation.effects.numerics import by_frame, by_parameters
 from tofcorr.simulation.hooks import Effect, FrameState
 
@@ -99,16 +105,13 @@ class CatalogueEffect(Effect, ABC):
         Raises:
             ConfigError: A key is unknown or a value is not a number.
         """
-        known = set(cls.shape_type.model_fields)
-        shape = cls.shape_type.from_mapping(
-            {key: value for key, value in values.items() if key in known}, where
-        )
+        known = cls.shape_type.model_fields.keys()
+        shape = cls.shape_type.from_mapping({k: values[k] for k in values.keys() & known}, where)
         names = [coefficient.name for coefficient in cls.terms(shape)]
-        for key in values.keys() - known - set(names):
-            close = get_close_matches(key, [*names, *known], n=1)
-            hint = f"Did you mean '{close[0]}'?" if close else f"Known: {', '.join(names)}."
-            raise ConfigError(f"{where}: '{key}' is not a known key. {hint}")
-        return cls(shape, _numbers([values.get(name, 0.0) for name in names], names, where))
+        fields: dict[str, Any] = dict.fromkeys(names, (FiniteNumber, 0.0))
+        entry = create_model("Entry", __base__=cls.shape_type, **fields).from_mapping(values, where)
+        given = [getattr(entry, name) for name in names]
+        return cls(shape, torch.tensor(given, dtype=torch.float64))
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
@@ -167,8 +170,8 @@ class CatalogueEffect(Effect, ABC):
         return {"name": self.name, **self.shape.to_mapping(), **values}
 
 
-class LinearDelay(CatalogueEffect):
-    """An effect that delays the signal by a weighted sum of known functions, its columns."""
+class LinearEffect(CatalogueEffect):
+    """An effect whose shift is a weighted sum of known functions, its columns."""
 
     linear = True
 
@@ -185,24 +188,51 @@ class LinearDelay(CatalogueEffect):
         """Return the sum of the functions, shape (M,), metres."""
         return self.columns(inputs) @ coefficients
 
+
+class LinearDelay(LinearEffect):
+    """An effect that delays the signal by a weighted sum of known functions, its columns."""
+
     def on_delay(self, state: FrameState) -> None:
         """Add the shift to the delay of each pixel."""
-        shift = self.shift(inputs_from_state(state), self.coefficients)
-        state.delay = state.delay + shift.reshape(state.radial_distance.shape)
+        add_delay(state, self.shift(inputs_from_state(state), self.coefficients))
+
+
+def add_delay(state: FrameState, shift: Tensor) -> None:
+    """Delay the signal of every pixel of a simulated frame, by metres (H W,) or ()."""
+    state.delay = state.delay + shift.expand(state.delay.numel()).reshape(state.delay.shape)
 
 
 class GeometryEffect(CatalogueEffect):
     """An effect that moves camera or target, so that the rays meet the target elsewhere."""
 
     @abstractmethod
-    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the true world_from_tool (F, 4, 4), normals (F, 3) and offsets (F,), metres."""
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> FrameFacts:
+        """Return where tool and target truly are, instead of where they were recorded.
+
+        Frames of which it is not known how they move stay where they are.
+        """
+
+    def on_pose(self, state: FrameState) -> None:
+        """Move tool and target."""
+        if not bool(self.coefficients.any()):
+            return
+        here = replace(
+            facts_from_state(state),
+            world_from_tool=state.world_from_tool[None],
+            normal_world=state.normal_world[None],
+            offset=state.offset[None],
+        )
+        moved = self.moved(here, self.coefficients)
+        state.world_from_tool = moved.world_from_tool[0]
+        state.normal_world, state.offset = moved.normal_world[0], moved.offset[0]
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return how much farther the rays meet the true plane, shape (M,), metres."""
-        facts = inputs.facts
-        recorded = facts.world_from_tool, facts.normal_world, facts.offset
-        return _distances(inputs, *self.moved(facts, coefficients)) - _distances(inputs, *recorded)
+        recorded, true = (
+            plane_in_camera(inputs, facts)
+            for facts in (inputs.facts, self.moved(inputs.facts, coefficients))
+        )
+        return distance_to(inputs, *true) - distance_to(inputs, *recorded)
 
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the derivative of `shift`, shape (M, K): planes are differentiated by frame.
@@ -211,33 +241,27 @@ class GeometryEffect(CatalogueEffect):
         """
 
         def plane(at: Tensor) -> Tensor:
-            return torch.cat(
-                plane_in_camera(inputs, *self.moved(inputs.facts, at)), dim=1
-            ).flatten()
+            moved = self.moved(inputs.facts, at)
+            return torch.cat(plane_in_camera(inputs, moved), dim=1).flatten()
 
-        count = len(inputs.facts.offset)
-        by_plane = by_parameters(plane, coefficients).reshape(count, 4, -1)
-        normal, height = plane_in_camera(inputs, *self.moved(inputs.facts, coefficients))
         frame, rays = inputs.frame, inputs.rays
+        by_plane = by_parameters(plane, coefficients).reshape(len(inputs.facts.offset), 4, -1)
+        normal, height = plane_in_camera(inputs, self.moved(inputs.facts, coefficients))
         along = (rays * normal[frame]).sum(-1, keepdim=True)
         values = torch.cat([rays * (height[frame] / along**2), -1 / along], dim=1)
         return by_frame(values, by_plane, frame)
 
 
-def plane_in_camera(
-    inputs: EffectInputs, world_from_tool: Tensor, normal_world: Tensor, offset: Tensor
-) -> tuple[Tensor, Tensor]:
+def plane_in_camera(inputs: EffectInputs, facts: FrameFacts) -> tuple[Tensor, Tensor]:
     """Return the target's normal (F, 3) and offset (F, 1) in the camera frame."""
-    pose = world_from_tool @ inputs.tool_from_camera
-    normal = (normal_world[:, None, :] @ pose[:, :3, :3])[:, 0]
-    return normal, ((normal_world * pose[:, :3, 3]).sum(-1) + offset)[:, None]
+    pose = facts.world_from_tool @ inputs.tool_from_camera
+    normal, height = plane_in_frame(facts.normal_world, facts.offset, pose)
+    return normal, height[:, None]
 
 
-def _distances(
-    inputs: EffectInputs, world_from_tool: Tensor, normal_world: Tensor, offset: Tensor
-) -> Tensor:
-    pose = world_from_tool @ inputs.tool_from_camera
-    return distance_along_rays(inputs.rays, inputs.frame, pose, normal_world, offset)
+def distance_to(inputs: EffectInputs, normal: Tensor, height: Tensor) -> Tensor:
+    """Return how far along each ray the plane of its frame is, shape (M,), metres."""
+    return -height[inputs.frame, 0] / (inputs.rays * normal[inputs.frame]).sum(-1)
 
 
 class SignalEffect(CatalogueEffect):
@@ -249,31 +273,20 @@ class SignalEffect(CatalogueEffect):
     """
 
     @abstractmethod
-    def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
-        """Return real and imaginary part of s_k, shape (M, K) each."""
+    def shares(self, inputs: EffectInputs) -> Tensor:
+        """Return s_k, shape (M, K), complex."""
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase as distance, shape (M,), metres."""
-        real, imaginary = self._light(inputs, coefficients)
-        return inputs.metres_per_radian * torch.atan2(imaginary, real)
+        shares = self.shares(inputs)
+        light = torch.view_as_real(1 + shares @ coefficients.to(shares.dtype))
+        return inputs.metres_per_radian * torch.atan2(light[..., 1], light[..., 0])
 
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the derivative of `shift`: of the angle by the shares, shape (M, K)."""
-        real, imaginary = self._light(inputs, coefficients)
-        scale = inputs.metres_per_radian / (real**2 + imaginary**2)
-        by_real, by_imaginary = self.shares(inputs)
-        return (scale * real)[:, None] * by_imaginary - (scale * imaginary)[:, None] * by_real
-
-    def _light(self, inputs: EffectInputs, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        real, imaginary = (part.to(coefficients) @ coefficients for part in self.shares(inputs))
-        return 1 + real, imaginary
-
-
-def _numbers(values: Sequence[Any], names: Sequence[str], where: str) -> Tensor:
-    for name, value in zip(names, values, strict=True):
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ConfigError(f"{where}: '{name}': expected a number, got {value!r}.")
-    return torch.tensor([float(value) for value in values], dtype=torch.float64)
+        shares = self.shares(inputs)
+        light = 1 + shares @ coefficients.to(shares.dtype)
+        return inputs.metres_per_radian * (shares / light[:, None]).imag
 
 
 # Effects with one value for each place in the image: too many for columns of a fit.
@@ -314,13 +327,13 @@ class MapEffect(CatalogueEffect):
 
     def cells_of(self, inputs: EffectInputs) -> Tensor:
         """Return the cells of the chosen pixels, shape (M, G), int64."""
-        width = inputs.camera.width
-        row = torch.div(inputs.pixel, width, rounding_mode="floor")
-        return self.cells(self.shape, row, torch.remainder(inputs.pixel, width))
+        return self._cells_at(inputs.pixel, inputs.camera.width)
 
     def cells_of_image(self, height: int, width: int) -> Tensor:
         """Return the cells of all pixels of an image, shape (H W, G), int64."""
-        pixel = torch.arange(height * width)
+        return self._cells_at(torch.arange(height * width), width)
+
+    def _cells_at(self, pixel: Tensor, width: int) -> Tensor:
         row = torch.div(pixel, width, rounding_mode="floor")
         return self.cells(self.shape, row, torch.remainder(pixel, width))
 
@@ -337,8 +350,7 @@ class MapEffect(CatalogueEffect):
     def on_delay(self, state: FrameState) -> None:
         """Delay every pixel by its values."""
         height, width = state.radial_distance.shape
-        cells = self.cells_of_image(height, width)
-        state.delay = state.delay + self.coefficients[cells].sum(-1).reshape(height, width)
+        add_delay(state, self.coefficients[self.cells_of_image(height, width)].sum(-1))
 
 
 def drawn_values(count: int, rms: float, seed: int) -> Tensor:

@@ -4,7 +4,13 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, plane_in_camera
+from tofcorr.geometry.rays import moved_rays
+from tofcorr.simulation.effects.base import (
+    CatalogueEffect,
+    Coefficient,
+    distance_to,
+    plane_in_camera,
+)
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.hooks import FrameState
 
@@ -41,30 +47,23 @@ class LensEffect(CatalogueEffect):
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return how much farther the true ray meets the target, shape (M,), metres.
 
-        n . (d v) = n . (d' v') for the rays v and v' of unit length along (x, y, 1), (x', y', 1).
+        n . (d v) = n . (d' v') for the unit rays v and v' and the normal n.
         """
-        normals, distance = _surfaces(inputs)
-        x, y = _places(inputs.rays)
-        true_x, true_y = _true_places(x, y, coefficients, _focal(inputs.camera))
-        facing = _facing(normals, x, y) / _facing(normals, true_x, true_y)
-        longer = (true_x.square() + true_y.square() + 1).sqrt() * inputs.rays[:, 2]
-        return distance * (facing * longer - 1)
+        normal, distance = _surfaces(inputs)
+        rays = true_rays(inputs.rays, coefficients, _focal(inputs.camera))
+        facing = (inputs.rays * normal).sum(-1) / (rays * normal).sum(-1)
+        return distance * (facing - 1)
 
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the derivative of `shift`, shape (M, K), metres.
-
-        With h = n . (d v), the ray b of any length meets the plane at d' = h |b| / (n . b). The
-        derivative of d' by b is d' (b / |b|^2 - n / (n . b)).
-        """
-        normals, distance = _surfaces(inputs)
-        x, y = _places(inputs.rays)
-        by_x, by_y = (torch.stack(part, dim=-1) for part in _changes(x, y, _focal(inputs.camera)))
-        x, y = _true_places(x, y, coefficients, _focal(inputs.camera))
+        """Return the derivative of `shift`, shape (M, K), metres: rays that move, at the true."""
+        normal, distance = _surfaces(inputs)
+        moves = torch.stack(_changes(inputs.rays, _focal(inputs.camera)), dim=0)
+        rays = true_rays(inputs.rays, coefficients, _focal(inputs.camera))[:, None]
+        rays, normal = rays.expand(*moves.shape[1:], 3), normal[:, None].expand(*moves.shape[1:], 3)
         true = distance + self.shift(inputs, coefficients)
-        along, square = _facing(normals, x, y), 1 + x**2 + y**2
-        own_x = true * (x / square - normals[:, 0] / along)
-        own_y = true * (y / square - normals[:, 1] / along)
-        return own_x[:, None] * by_x + own_y[:, None] * by_y
+        true = true[:, None].expand(moves.shape[1:])
+        moved = moved_rays(rays, normal, true, (moves[0], moves[1]), "radial")
+        return -moved / (rays * normal).sum(-1)
 
     def on_pose(self, state: FrameState) -> None:
         """Bend the rays."""
@@ -80,8 +79,9 @@ def true_rays(rays: Tensor, coefficients: Tensor, focal: float) -> Tensor:
         coefficients: In the order of `fixed_terms`, shape (11,).
         focal: Focal length, pixels.
     """
-    x, y = _true_places(*_places(rays), coefficients, focal)
-    bent = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    x, y = _changes(rays, focal)
+    moved = torch.stack([x @ coefficients.to(x), y @ coefficients.to(y)], dim=-1)
+    bent = rays / rays[..., 2:] + torch.nn.functional.pad(moved, (0, 1))
     return bent / bent.norm(dim=-1, keepdim=True)
 
 
@@ -93,35 +93,17 @@ def _surfaces(inputs: EffectInputs) -> tuple[Tensor, Tensor]:
     """Return the normals (M, 3) that the rays meet, in the camera frame, and distances (M,)."""
     if inputs.normals_camera is not None:
         return inputs.normals_camera, inputs.radial_distance
-    facts, frame = inputs.facts, inputs.frame
-    recorded = facts.world_from_tool, facts.normal_world, facts.offset
-    normal, height = plane_in_camera(inputs, *recorded)
-    return normal[frame], -height[frame, 0] / (inputs.rays * normal[frame]).sum(-1)
+    normal, height = plane_in_camera(inputs, inputs.facts)
+    return normal[inputs.frame], distance_to(inputs, normal, height)
 
 
-def _places(rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Return x and y of rays (..., 3) along (x, y, 1)."""
-    return rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-
-
-def _facing(normals: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    return normals[:, 0] * x + normals[:, 1] * y + normals[:, 2]
-
-
-def _true_places(x: Tensor, y: Tensor, coefficients: Tensor, focal: float) -> tuple[Tensor, Tensor]:
-    """Return x' and y' of the true rays, of the shape of x."""
-    for coefficient, by_x, by_y in zip(coefficients, *_changes(x, y, focal), strict=True):
-        x, y = x + coefficient.to(x) * by_x, y + coefficient.to(y) * by_y
-    return x, y
-
-
-def _changes(x: Tensor, y: Tensor, focal: float) -> tuple[list[Tensor], list[Tensor]]:
-    """Return by how much each coefficient moves x and y of the ray (x, y, 1), of their shape."""
+def _changes(rays: Tensor, focal: float) -> tuple[Tensor, Tensor]:
+    """Return by how much each coefficient moves x and y of rays along (x, y, 1), (..., K) each."""
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
     square, product = x**2 + y**2, 2 * x * y
-    none = torch.zeros_like(x)
-    pixel = torch.full_like(x, 1 / focal)
+    none, pixel = torch.zeros_like(x), torch.full_like(x, 1 / focal)
     far, wide, high = square**2, square + 2 * x**2, square + 2 * y**2
     # In the order of the coefficients: focal length, centre, radial, tangential, skew, prism.
     by_x = [x, none, pixel, none, x * square, x * far, wide, product, y, square, none]
     by_y = [none, y, none, pixel, y * square, y * far, product, high, none, none, square]
-    return by_x, by_y
+    return torch.stack(by_x, dim=-1), torch.stack(by_y, dim=-1)

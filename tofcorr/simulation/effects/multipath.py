@@ -274,16 +274,13 @@ class MultipathEffect(SignalEffect):
         if not bool(self.coefficients.any()):
             return
         inputs, coefficients = inputs_from_state(state), self.coefficients.to(torch.complex128)
-        added = [self._response(inputs, order) @ coefficients for order in state.orders.tolist()]
+        orders = state.orders.tolist()
+        added = [_response(inputs, self.shape, order) @ coefficients for order in orders]
         state.signal = state.signal * (1 + torch.stack(added).reshape(state.signal.shape))
 
-    def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
-        """Return real and imaginary part of each coefficient's light, each (M, K)."""
-        light = self._response(inputs, 1)
-        return light.real, light.imag
-
-    def _response(self, inputs: EffectInputs, order: int) -> Tensor:
-        return inputs.remembered(_response, self.shape, order)
+    def shares(self, inputs: EffectInputs) -> Tensor:
+        """Return each coefficient's light over the direct light, shape (M, K), complex."""
+        return inputs.remembered(_response, self.shape, 1)
 
 
 def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor:

@@ -78,19 +78,6 @@ def products(x: Tensor, y: Tensor, low: int, high: int) -> Tensor:
     return torch.stack([of_x[:, i] * of_y[:, j] for i, j in exponents(low, high)], dim=-1)
 
 
-def weighted_products(x: Tensor, y: Tensor, low: int, high: int, weights: Tensor) -> Tensor:
-    """Return `products(x, y, low, high) @ weights`, shape (M,), without the large matrix."""
-    weight = dict(zip(exponents(low, high), weights, strict=True))
-    one = torch.ones_like(x)
-    of_x, of_y = ([one, *legendre(values, high).unbind(-1)] for values in (x, y))
-    total = torch.zeros_like(x)
-    for j, factor in enumerate(of_y):
-        powers = [i for i in range(high + 1) if (i, j) in weight]
-        inner = sum((weight[i, j] * of_x[i] for i in powers), torch.zeros_like(x))
-        total = torch.addcmul(total, factor, inner)
-    return total
-
-
 def exponents(low: int, high: int) -> list[tuple[int, int]]:
     """Return all (i, j) with low <= i + j <= high."""
     return [(total - j, j) for total in range(low, high + 1) for j in range(total + 1)]

@@ -8,7 +8,7 @@ from torch import Tensor
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.numerics import exponents, products, weighted_products
+from tofcorr.simulation.effects.numerics import exponents, products
 
 
 class PixelShape(Options):
@@ -51,18 +51,10 @@ class PixelEffect(LinearDelay):
         growth = [Coefficient(f"growth_{part}", "m", 0.02) for part in ("x", "y", "r2")]
         return (*surface, *growth)
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the surface and what grows with the distance, shape (M,), metres."""
-        x, y = inputs.columns, inputs.rows
-        surface, growing = coefficients[:-3], coefficients[-3:]
-        growth = inputs.radial_distance / self.shape.reference_distance_m - 1
-        slope = growing[0] * x + growing[1] * y + growing[2] * (x**2 + y**2)
-        return weighted_products(x, y, 1, self.shape.degree, surface) + growth * slope
-
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the functions of image position and distance, shape (M, K)."""
         x, y = inputs.columns, inputs.rows
         surface = products(x, y, 1, self.shape.degree)
         growth = inputs.radial_distance / self.shape.reference_distance_m - 1
-        growing = torch.stack([growth * x, growth * y, growth * (x**2 + y**2)], dim=-1)
+        growing = growth[:, None] * torch.stack([x, y, x**2 + y**2], dim=-1)
         return torch.cat([surface, growing], dim=-1)

@@ -1,5 +1,6 @@
 """Errors of the poses that the robot reports."""
 
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import torch
@@ -9,7 +10,6 @@ from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
 from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs, FrameFacts
-from tofcorr.simulation.hooks import FrameState
 
 _AXES = "xyz"
 _PAIRS = tuple(f"{i}{j}" for i in _AXES for j in _AXES)
@@ -60,27 +60,17 @@ class RobotKinematicsEffect(GeometryEffect):
         centre = inputs.facts.world_from_tool[:, :3, 3].mean(0).tolist()
         return cls(RobotKinematicsShape(centre_m=(centre[0], centre[1], centre[2])))
 
-    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> FrameFacts:
         """Return where the tool truly is."""
-        pose = _applied(self._error(facts.world_from_tool, coefficients), facts.world_from_tool)
-        return pose, facts.normal_world, facts.offset
-
-    def on_pose(self, state: FrameState) -> None:
-        """Move the tool."""
-        error = self._error(state.world_from_tool_recorded[None], self.coefficients)
-        state.world_from_tool = _applied(error, state.world_from_tool[None])[0]
-
-    def _error(self, world_from_tool: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-        """Return shift and turn of the tool in the world, each (F, 3)."""
-        shape = self.shape
-        away = world_from_tool[:, :3, 3] - world_from_tool.new_tensor(shape.centre_m)
-        sag = (away**2).sum(1, keepdim=True) * c[9:12]
-        base = _base_turn(world_from_tool[:, :3, 3], c[21:28])
-        shift = away @ c[:9].reshape(3, 3).T + sag
-        shift = shift + torch.linalg.cross(base, world_from_tool[:, :3, 3])
-        shift = shift + c[28] * world_from_tool[:, :3, 3]
-        bend = _bracket_turn(world_from_tool[:, :3, :3], c[29:32])
-        return shift, away @ c[12:21].reshape(3, 3).T + base + bend
+        c, pose = coefficients, facts.world_from_tool
+        rotation, position = pose[:, :3, :3], pose[:, :3, 3]
+        away = position - position.new_tensor(self.shape.centre_m)
+        base = _base_turn(position, c[21:28])
+        shift = away @ c[:9].reshape(3, 3).T + away.square().sum(1, keepdim=True) * c[9:12]
+        shift = shift + torch.linalg.cross(base, position) + c[28] * position
+        turn = away @ c[12:21].reshape(3, 3).T + base + _bracket_turn(rotation, c[29:32])
+        true = se3.assemble(small_rotation(turn) @ rotation, position + shift)
+        return replace(facts, world_from_tool=true)
 
 
 def _base_turn(position: Tensor, c: Tensor) -> Tensor:
@@ -103,15 +93,7 @@ def _bracket_turn(rotation: Tensor, c: Tensor) -> Tensor:
     return (rotation @ turn[:, :, None])[:, :, 0]
 
 
-def _applied(error: tuple[Tensor, Tensor], world_from_tool: Tensor) -> Tensor:
-    shift, turn = error
-    turned = _small_rotation(turn) @ world_from_tool[:, :3, :3]
-    return se3.assemble(turned, world_from_tool[:, :3, 3] + shift)
-
-
-def _small_rotation(turn: Tensor) -> Tensor:
+def small_rotation(turn: Tensor) -> Tensor:
     """Return exp of small rotation vectors (F, 3) to second order, exact to 1e-7 at 10 mrad."""
-    zero = torch.zeros_like(turn[:, 0])
-    x, y, z = turn.unbind(1)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
-    return torch.eye(3, dtype=turn.dtype) + skew + skew @ skew / 2
+    skew = (turn[:, :, None, None] * se3.GENERATORS[3:, :3, :3].to(turn)).sum(1)
+    return torch.eye(3).to(turn) + skew + skew @ skew / 2

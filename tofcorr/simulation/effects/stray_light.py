@@ -55,11 +55,13 @@ class StrayLightEffect(SignalEffect):
         ghosts = [Coefficient(f"ghost_{size:g}", "1", 0.1) for size in shape.ghost_sizes]
         return (*widths, Coefficient("veil", "1", 0.2), *ghosts)
 
-    def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+    def shares(self, inputs: EffectInputs) -> Tensor:
         """Return the scattered light over the direct light; none where there is no light."""
+        spread = [inputs.blurred_signal(sigma) for sigma in self._widths(inputs.camera.width)]
+        ghosts = inputs.from_images(_ghosts, inputs.known_frequency, inputs.camera, self.shape)
+        scattered = torch.cat([torch.stack([*spread, inputs.mean_signal()], dim=1), ghosts], dim=1)
         own = inputs.signal()[:, None]
-        relative = torch.where(own == 0, 0, self._scattered(inputs) / own)
-        return relative.real, relative.imag
+        return torch.where(own == 0, 0, scattered / own)
 
     def on_signal(self, state: FrameState) -> None:
         """Scatter the light of every harmonic."""
@@ -77,15 +79,7 @@ class StrayLightEffect(SignalEffect):
         state.signal = total
 
     def _widths(self, image_width: int) -> list[float]:
-        shape = self.shape
-        return [sigma * image_width for sigma in shape.sigma_of_width]
-
-    def _scattered(self, inputs: EffectInputs) -> Tensor:
-        """Return the light that each coefficient adds, shape (M, K), complex128."""
-        spread = [inputs.blurred_signal(sigma) for sigma in self._widths(inputs.camera.width)]
-        ghosts = inputs.from_images(_ghosts, inputs.known_frequency, inputs.camera, self.shape)
-        spread = torch.stack([*spread, inputs.mean_signal()], dim=1)
-        return torch.cat([spread, ghosts.to(torch.complex128)], dim=1)
+        return [sigma * image_width for sigma in self.shape.sigma_of_width]
 
 
 def _ghosts(

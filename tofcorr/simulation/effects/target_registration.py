@@ -14,9 +14,7 @@ from tofcorr.simulation.effects.inputs import (
     MEASURED_PLANES,
     EffectInputs,
     FrameFacts,
-    facts_from_state,
 )
-from tofcorr.simulation.hooks import FrameState
 
 # Planes whose entries (n, d) differ by less (no unit, metres) are one plane. Set by hand: far above
 # rounding in a file, far below any accuracy of a plane.
@@ -99,49 +97,26 @@ class TargetRegistrationEffect(GeometryEffect):
         shape = self.shape.model_copy(update={"duration_s": 0.0})
         return type(self)(shape, self.coefficients[: len(self.terms(shape))])
 
-    def on_pose(self, state: FrameState) -> None:
-        """Move the plane."""
-        facts = facts_from_state(state)
-        facts = replace(facts, normal_world=state.normal_world[None], offset=state.offset[None])
-        _, normal, offset = self.moved(facts, self.coefficients)
-        state.normal_world, state.offset = normal[0], offset[0]
-
-    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> FrameFacts:
         """Return where the target truly is."""
-        normal, offset, shape = facts.normal_world, facts.offset, self.shape
+        normal = facts.normal_world
         error = self._shares(facts) @ coefficients.reshape(-1, 3)
-        u, v = _leans(normal).unbind(-2)
+        u, v = -tangents(normal).movedim(1, 0)
         leaning = normal + error[:, 1:2] * u + error[:, 2:3] * v
         leaning = leaning / leaning.norm(dim=1, keepdim=True)
-        pivot = normal.new_tensor(shape.pivot_m)
-        shifted = offset + error[:, 0] - ((leaning - normal) * pivot).sum(1)
-        return facts.world_from_tool, leaning, shifted
+        pivot = normal.new_tensor(self.shape.pivot_m)
+        shifted = facts.offset + error[:, 0] - ((leaning - normal) * pivot).sum(1)
+        return replace(facts, normal_world=leaning, offset=shifted)
 
     def _shares(self, facts: FrameFacts) -> Tensor:
         """Return how much of each plane's error, then of each move, frames have, shape (F, G)."""
-        number = self._numbers(facts.normal_world, facts.offset)
-        planes = torch.nn.functional.one_hot(number, max(1, len(self.shape.planes)))
-        shares = planes.to(facts.offset.dtype)
-        if self.shape.duration_s > 0:
-            shares = torch.cat([shares, self._moves(facts.timestamp)], dim=1)
+        shape, shares = self.shape, torch.ones_like(facts.offset)[:, None]
+        if shape.planes:
+            planes = torch.cat([facts.normal_world, facts.offset[:, None]], dim=1)
+            own = torch.cdist(planes, planes.new_tensor(shape.planes)).argmin(dim=1)
+            shares = torch.nn.functional.one_hot(own, len(shape.planes)).to(facts.offset.dtype)
+        if shape.duration_s > 0:
+            passed = ((facts.timestamp - shape.start_s) / shape.duration_s).clamp(0.0, 1.0)
+            steps = [(passed > share).to(passed.dtype) for share in _BUMPED]
+            shares = torch.cat([shares, torch.stack([passed, *steps], dim=1)], dim=1)
         return shares
-
-    def _moves(self, timestamp: Tensor) -> Tensor:
-        """Return how much of each move there is in frames at these times, shape (F, 3)."""
-        shape = self.shape
-        passed = ((timestamp - shape.start_s) / shape.duration_s).clamp(0.0, 1.0)
-        steps = [(passed > share).to(passed.dtype) for share in _BUMPED]
-        return torch.stack([passed, *steps], dim=-1)
-
-    def _numbers(self, normal: Tensor, offset: Tensor) -> Tensor:
-        """Return the index of each frame's plane in the shape, shape (F,)."""
-        shape = self.shape
-        if not shape.planes:
-            return torch.zeros(len(offset), dtype=torch.int64)
-        planes = torch.cat([normal, offset[:, None]], dim=1)
-        return torch.cdist(planes, planes.new_tensor(shape.planes)).argmin(dim=1)
-
-
-def _leans(normal: Tensor) -> Tensor:
-    """Return in which directions normals (F, 3) lean by both angles, shape (F, 2, 3)."""
-    return -tangents(normal)

@@ -5,7 +5,7 @@ from typing import ClassVar, Self
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import Coefficient, LinearEffect
 from tofcorr.simulation.effects.inputs import FIXED_TARGET, EffectInputs, inputs_from_state
 from tofcorr.simulation.effects.numerics import exponents, products
 from tofcorr.simulation.hooks import FrameState
@@ -19,7 +19,7 @@ class TargetShapeShape(Options):
     degree: int = 6
 
 
-class TargetShapeEffect(CatalogueEffect):
+class TargetShapeEffect(LinearEffect):
     r"""A surface with bumps.
 
     .. math:: \Delta d = -h(x, y) / \cos \theta, \quad
@@ -35,7 +35,6 @@ class TargetShapeEffect(CatalogueEffect):
     remedy = "look at another part of the target, or rotate it in its plane"
     needs = (FIXED_TARGET,)
     shape_type: ClassVar[type[Options]] = TargetShapeShape
-    linear = True
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
@@ -50,18 +49,12 @@ class TargetShapeEffect(CatalogueEffect):
             Coefficient(f"x{i}_y{j}", "m", 0.03 / (i + j)) for i, j in exponents(2, shape.degree)
         )
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return how much earlier the ray meets the raised surface, shape (M,), metres."""
-        return -(self._heights(inputs.target_xy) @ coefficients) / inputs.incidence_cosine
-
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return the shift per unit of each height, shape (M, K), metres."""
-        return -self._heights(inputs.target_xy) / inputs.incidence_cosine[:, None]
-
-    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the columns: the shift is linear everywhere, shape (M, K)."""
-        del coefficients
-        return self.columns(inputs)
+        """Return how much earlier the ray meets the surface per unit of each height, (M, K)."""
+        shape, xy = self.shape, inputs.target_xy
+        low, high = xy.new_tensor(shape.low_xy_m), xy.new_tensor(shape.high_xy_m)
+        x, y = (2 * (xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
+        return -products(x, y, 2, shape.degree) / inputs.incidence_cosine[:, None]
 
     def on_geometry(self, state: FrameState) -> None:
         """Raise the surface."""
@@ -70,10 +63,3 @@ class TargetShapeEffect(CatalogueEffect):
         rays_world = state.ray_directions @ state.world_from_camera[:3, :3].T
         state.radial_distance = state.radial_distance + shift
         state.points_world = state.points_world + shift[..., None] * rays_world
-
-    def _heights(self, target_xy: Tensor) -> Tensor:
-        shape = self.shape
-        low = target_xy.new_tensor(shape.low_xy_m)
-        high = target_xy.new_tensor(shape.high_xy_m)
-        scaled = (2 * (target_xy - low) / (high - low) - 1).clamp(-1.0, 1.0)
-        return products(scaled[:, 0], scaled[:, 1], 2, shape.degree)

@@ -1,5 +1,6 @@
 """A time difference between images and poses."""
 
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import torch
@@ -8,11 +9,7 @@ from torch import Tensor
 from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
-from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs, FrameFacts, facts_from_state
-from tofcorr.simulation.hooks import FrameState
-
-# Least half length of a recording, seconds: far below the time between two frames. Set by hand.
-_SHORTEST_S = 1e-6
+from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs, FrameFacts
 
 
 class TimestampOffsetShape(Options):
@@ -47,14 +44,12 @@ class TimestampOffsetEffect(GeometryEffect):
         """Take the time that the recording lasted, and integration times where they differ."""
         times, exposure = inputs.facts.timestamp, inputs.facts.integration_time
         first, last = float(times.min()), float(times.max())
-        differs = False
-        if exposure is not None and bool(exposure.isfinite().all()):
-            differs = float(exposure.max()) > float(exposure.min())
         return cls(
             TimestampOffsetShape(
                 middle_s=(first + last) / 2,
-                half_s=max((last - first) / 2, _SHORTEST_S),
-                knows_exposure=differs,
+                half_s=(last - first) / 2 or 1.0,
+                # It differs, and is known of every frame.
+                knows_exposure=exposure is not None and bool(exposure.max() > exposure.min()),
             )
         )
 
@@ -70,38 +65,21 @@ class TimestampOffsetEffect(GeometryEffect):
         kept[1] = 0.0
         return self.with_coefficients(kept)
 
-    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> FrameFacts:
         """Move the tool to its pose at the time of the image."""
         if facts.tool_twist is None:
-            raise ValueError("The tool's velocity is unknown; timestamp_offset needs it.")
-        late = self._late(facts, coefficients)[:, None]
-        pose = _later(facts.world_from_tool, facts.tool_twist * late)
-        return pose, facts.normal_world, facts.offset
-
-    def on_pose(self, state: FrameState) -> None:
-        """Move the tool to its pose at the time of the image."""
-        if state.tool_twist is None or not bool(self.coefficients.any()):
-            return
-        twist = state.tool_twist[None] * self._late(facts_from_state(state), self.coefficients)
-        state.world_from_tool = _later(state.world_from_tool[None], twist)[0]
-
-    def _late(self, facts: FrameFacts, c: Tensor) -> Tensor:
-        """Return how long after its pose each frame was taken, shape (F,), s."""
-        shape = self.shape
+            return facts
+        shape, c = self.shape, coefficients
         late = c[0] + c[1] * (facts.timestamp - shape.middle_s) / shape.half_s
-        if not shape.knows_exposure:
-            return late
-        exposure = facts.integration_time
-        if exposure is None:
-            raise ValueError("timestamp_offset was fitted with integration times: unknown here.")
-        return late + c[2] * exposure
+        if shape.knows_exposure:
+            if facts.integration_time is None:
+                raise ValueError("timestamp_offset was fitted with integration times: unknown.")
+            late = late + c[2] * facts.integration_time
+        later = facts.world_from_tool @ _small_motion(facts.tool_twist * late[:, None])
+        return replace(facts, world_from_tool=later)
 
 
-def _later(world_from_tool: Tensor, twist: Tensor) -> Tensor:
-    """Move poses (F, 4, 4) by twists (F, 6), to second order: exact to 1e-6 m at 10 cm."""
-    zero = torch.zeros_like(twist[:, 0])
-    x, y, z = twist[:, 3:].unbind(1)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
-    step = torch.eye(3, dtype=twist.dtype) + skew + skew @ skew / 2
-    shift = twist[:, :3] + (skew @ twist[:, :3, None])[..., 0] / 2
-    return world_from_tool @ se3.assemble(step, shift)
+def _small_motion(twist: Tensor) -> Tensor:
+    """Return exp of twists (F, 6) to second order, exact to 1e-6 m at 10 cm, shape (F, 4, 4)."""
+    matrix = (twist[:, :, None, None] * se3.GENERATORS.to(twist)).sum(1)
+    return torch.eye(4).to(twist) + matrix + matrix @ matrix / 2

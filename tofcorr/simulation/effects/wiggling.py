@@ -73,21 +73,17 @@ class WigglingEffect(SignalEffect):
             for wave in ("sin", "cos")
         )
 
-    def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+    def shares(self, inputs: EffectInputs) -> Tensor:
         """Return sine and cosine of each number of periods: its wave, and that a quarter on."""
-        first = inputs.remembered(_first_wave)
-        waves = torch.stack(self._waves(first, inputs), dim=-1) / inputs.metres_per_radian
-        real, imaginary = torch.view_as_real(waves).unbind(-1)
-        parts = torch.stack([real, -imaginary]), torch.stack([imaginary, real])
-        return parts[0].movedim(0, -1).flatten(1), parts[1].movedim(0, -1).flatten(1)
+        waves = torch.stack(self._waves(inputs.remembered(_turn), inputs), dim=-1)
+        return torch.stack([waves, 1j * waves], dim=-1).flatten(1) / inputs.metres_per_radian
 
     def on_signal(self, state: FrameState) -> None:
         """Add the harmonics of order n + 1 to the light."""
         scale = unambiguous_range(state.modulation_frequency) / (2 * torch.pi)
         fundamental = state.signal[0]
         turn = fundamental / fundamental.abs().clamp(min=1e-30)
-        # Products: a power takes torch 60 times as long.
-        waves = self._waves(turn.square().square(), inputs_from_state(state))
+        waves = self._waves(turn, inputs_from_state(state))
         orders = [*(cycles + 1 for cycles in _CYCLES), _CYCLES[0] + 1]
         pairs = self.coefficients.reshape(-1, 2).unbind(0)
         for (sine, cosine), order, own in zip(pairs, orders, waves, strict=False):
@@ -95,8 +91,10 @@ class WigglingEffect(SignalEffect):
                 share = torch.complex(sine, cosine) / scale
                 _add_harmonic(state, order, share * fundamental * own)
 
-    def _waves(self, first: Tensor, inputs: EffectInputs) -> list[Tensor]:
+    def _waves(self, turn: Tensor, inputs: EffectInputs) -> list[Tensor]:
         """Return e^(j n phase) for each number of periods, then the first one times u."""
+        # Products: a power takes torch 60 times as long.
+        first = turn.square().square()
         waves = [first, first.square(), first.square() * first]
         if self.shape.knows_amplitude:
             waves.append(self._level(inputs).reshape(first.shape) * first)
@@ -111,16 +109,14 @@ class WigglingEffect(SignalEffect):
         return 2 * (inputs.amplitude.clamp(*ends).log() - low) / (high - low) - 1
 
 
-def _first_wave(inputs: EffectInputs) -> Tensor:
-    return torch.polar(torch.ones_like(inputs.phase), _CYCLES[0] * inputs.phase)
+def _turn(inputs: EffectInputs) -> Tensor:
+    return torch.polar(torch.ones_like(inputs.phase), inputs.phase)
 
 
 def _add_harmonic(state: FrameState, order: int, phasor: Tensor) -> None:
-    place = torch.nonzero(state.orders == order).reshape(-1)
-    if len(place):
-        signal = state.signal.clone()
-        signal[place[0]] += phasor
-        state.signal = signal
-        return
-    state.orders = torch.cat([state.orders, state.orders.new_tensor([order])])
-    state.signal = torch.cat([state.signal, phasor[None]])
+    same = state.orders == order
+    if bool(same.any()):
+        state.signal = state.signal + same[:, None, None] * phasor
+    else:
+        state.orders = torch.cat([state.orders, state.orders.new_tensor([order])])
+        state.signal = torch.cat([state.signal, phasor[None]])
