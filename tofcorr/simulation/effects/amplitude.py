@@ -9,7 +9,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import AMPLITUDE, EffectInputs
-from tofcorr.simulation.effects.numerics import legendre
+from tofcorr.simulation.effects.numerics import legendre, side_by_side
 
 
 class AmplitudeShape(Options):
@@ -69,5 +69,5 @@ class AmplitudeEffect(LinearDelay):
         amplitude = inputs.known_amplitude.clamp(low, high)
         ends = torch.tensor([low, high], dtype=torch.float64).log()
         scaled = 2 * (amplitude.log() - ends[0]) / (ends[1] - ends[0]).clamp(min=1e-9) - 1
-        share = (amplitude / high)[:, None]
-        return torch.cat([legendre(scaled, self.shape.degree), share, share**2], dim=-1)
+        share = amplitude / high
+        return side_by_side([*legendre(scaled, self.shape.degree)[1:], share, share**2])

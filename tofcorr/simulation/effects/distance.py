@@ -2,13 +2,12 @@
 
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.numerics import legendre
+from tofcorr.simulation.effects.numerics import legendre, side_by_side
 
 
 class DistanceShape(Options):
@@ -51,9 +50,6 @@ class DistanceEffect(LinearDelay):
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the Legendre polynomials, shape (M, K)."""
-        return legendre(self._scaled(inputs), self.shape.degree)
-
-    def _scaled(self, inputs: EffectInputs) -> Tensor:
         low, high = self.shape.low_m, self.shape.high_m
         scaled = 2 * (inputs.radial_distance - low) / max(high - low, 1e-9) - 1
-        return torch.clamp(scaled, -1.0, 1.0)
+        return side_by_side(legendre(scaled.clamp(-1.0, 1.0), self.shape.degree)[1:])

@@ -14,7 +14,6 @@ from tofcorr.geometry.rays import phase_from_radial_distance, unambiguous_range
 from tofcorr.simulation.effects.image_filters import blur
 from tofcorr.simulation.hooks import FrameState
 
-_TWO_PI = 2 * torch.pi
 # Brightness varies where its squared second differences exceed this many times the variance of its
 # noise. Chosen: four standard deviations.
 _VARIES = 16.0
@@ -101,13 +100,13 @@ class EffectInputs:
     def rows(self) -> Tensor:
         """Rows scaled to [-1, 1] from the top to the bottom edge, shape (M,)."""
         row = torch.div(self.pixel, self.camera.width, rounding_mode="floor")
-        return 2 * row.double() / max(self.camera.height - 1, 1) - 1
+        return 2 * row.to(self.radial_distance) / max(self.camera.height - 1, 1) - 1
 
     @cached_property
     def columns(self) -> Tensor:
         """Columns scaled to [-1, 1] from the left to the right edge, shape (M,)."""
         column = torch.remainder(self.pixel, self.camera.width)
-        return 2 * column.double() / max(self.camera.width - 1, 1) - 1
+        return 2 * column.to(self.radial_distance) / max(self.camera.width - 1, 1) - 1
 
     @cached_property
     def phase(self) -> Tensor:
@@ -117,34 +116,30 @@ class EffectInputs:
     @property
     def known_frequency(self) -> float:
         """Modulation frequency in Hz; an effect that uses it lists it among its needs."""
-        if self.modulation_frequency is None:
-            raise ValueError("modulation_frequency_hz is unknown; this effect needs it.")
-        return self.modulation_frequency
+        return known(self, "modulation_frequency")
 
     @property
     def metres_per_radian(self) -> float:
         """Distance per radian of phase."""
-        return unambiguous_range(self.known_frequency) / _TWO_PI
+        return unambiguous_range(self.known_frequency) / (2 * torch.pi)
 
     @property
     def known_amplitude(self) -> Tensor:
         """Amplitudes in counts; an effect that uses them lists them among its needs."""
-        if self.amplitude is None:
-            raise ValueError("The amplitude is unknown; this effect needs it.")
-        return self.amplitude
+        return known(self, "amplitude")
 
     def signal(self) -> Tensor:
-        """Return the fundamental's phasor in every chosen pixel, shape (M,), complex128."""
+        """Return the fundamental's phasor in every chosen pixel, shape (M,), complex."""
         return torch.polar(self.known_amplitude, self.phase)
 
-    def blurred_signal(self, sigma: float) -> Tensor:
-        """Return the phasor image blurred by a Gaussian, in the chosen pixels: (M,), complex128.
+    def from_signal(self, function: Callable[..., Tensor], *arguments: Hashable) -> Tensor:
+        """Apply a function to images of the phasor, and return its value in the chosen pixels.
 
         Args:
-            sigma: Standard deviation in pixels.
+            function: Takes complex images (B, H, W), then the arguments; returns (B, H, W, ...).
+            arguments: Of the function.
         """
-        found = self.from_images(_blurred_signal, self.known_frequency, sigma)
-        return found.to(torch.complex128)
+        return self.from_images(_from_signal, self.known_frequency, function, *arguments)
 
     def brightness_varies(self, sigma: float) -> Tensor:
         r"""Return where brightness varies by more than noise that neighbours share, (M,), bool.
@@ -160,10 +155,6 @@ class EffectInputs:
         """
         assert self.amplitude_noise is not None
         return self.from_images(_bent_square, sigma) > _VARIES * self.amplitude_noise**2
-
-    def mean_signal(self) -> Tensor:
-        """Return the mean phasor of the whole image, in the chosen pixels: (M,), complex128."""
-        return self.from_images(_mean_signal, self.known_frequency).to(torch.complex128)
 
     def from_images(
         self, function: Callable[..., Tensor], *arguments: Hashable, of_frames: Tensor | None = None
@@ -182,7 +173,20 @@ class EffectInputs:
         """
         key = (function, *arguments)
         if key not in self._remembered:
-            self._remembered[key] = self._from_images(function, arguments, of_frames)
+            whole = [known(self, "amplitude_images"), known(self, "distance_images")]
+            whole += [] if of_frames is None else [of_frames]
+            step = max(1, _CHUNK_PIXELS // whole[0][0].numel())
+            values = []
+            for start in range(0, len(whole[0]), step):
+                some = (each[start : start + step] for each in whole)
+                images = function(*some, *arguments).flatten(0, 2)
+                inside = slice(None)
+                if step < len(whole[0]):
+                    inside = (self.frame >= start) & (self.frame < start + step)
+                place = (self.frame[inside] - start) * whole[0][0].numel() + self.pixel[inside]
+                every = torch.equal(place, torch.arange(len(images)))
+                values.append(images if every else images[place])
+            self._remembered[key] = torch.cat(values)
         return self._remembered[key]
 
     def remembered(self, function: Callable[..., Tensor], *arguments: Hashable) -> Tensor:
@@ -192,38 +196,28 @@ class EffectInputs:
             self._remembered[key] = function(self, *arguments)
         return self._remembered[key]
 
-    def _from_images(
-        self,
-        function: Callable[..., Tensor],
-        arguments: tuple[Hashable, ...],
-        of_frames: Tensor | None,
-    ) -> Tensor:
-        if self.amplitude_images is None or self.distance_images is None:
-            raise ValueError("Amplitude images are unknown; this effect needs them.")
-        whole = [self.amplitude_images, self.distance_images]
-        whole += [] if of_frames is None else [of_frames]
-        step = max(1, _CHUNK_PIXELS // whole[0][0].numel())
-        values = []
-        for start in range(0, len(whole[0]), step):
-            some = (each[start : start + step] for each in whole)
-            images = function(*some, *arguments).flatten(1, 2)
-            inside = (self.frame >= start) & (self.frame < start + step)
-            values.append(images[self.frame[inside] - start, self.pixel[inside]])
-        return torch.cat(values)
+
+def known(holder: "EffectInputs | FrameFacts", name: str) -> Any:  # noqa: ANN401 - of any attribute
+    """Return what an effect uses; it lists it among its needs.
+
+    Raises:
+        ValueError: It is unknown.
+    """
+    value = getattr(holder, name)
+    if value is None:
+        raise ValueError(f"{name} is unknown; an effect needs it.")
+    return value
 
 
-def signal_of(amplitude: Tensor, distance: Tensor, frequency: float) -> Tensor:
-    """Return the fundamental's phasor of images (B, H, W), at a modulation frequency in Hz."""
-    return torch.polar(amplitude, phase_from_radial_distance(distance, frequency))
-
-
-def _blurred_signal(amplitude: Tensor, distance: Tensor, frequency: float, sigma: float) -> Tensor:
-    return blur(signal_of(amplitude, distance, frequency), sigma)
-
-
-def _mean_signal(amplitude: Tensor, distance: Tensor, frequency: float) -> Tensor:
-    signal = signal_of(amplitude, distance, frequency)
-    return signal.mean((1, 2), keepdim=True).expand_as(signal)
+def _from_signal(
+    amplitude: Tensor,
+    distance: Tensor,
+    frequency: float,
+    function: Callable[..., Tensor],
+    *arguments: Hashable,
+) -> Tensor:
+    signal = torch.polar(amplitude, phase_from_radial_distance(distance, frequency))
+    return function(signal, *arguments)
 
 
 def _bent_square(amplitude: Tensor, _distance: Tensor, sigma: float) -> Tensor:
@@ -246,8 +240,9 @@ def inputs_from_state(state: FrameState) -> EffectInputs:
     Amplitudes are known from stage light on.
     """
     count = state.radial_distance.numel()
-    has_light = state.amplitude.numel() == count
-    counts = state.amplitude / state.electrons_per_count if has_light else None
+    counts = None
+    if state.amplitude.numel() == count:
+        counts = state.amplitude / state.electrons_per_count
     return EffectInputs(
         camera=state.camera,
         modulation_frequency=state.modulation_frequency,

@@ -57,13 +57,14 @@ class LensEffect(CatalogueEffect):
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the derivative of `shift`, shape (M, K), metres: rays that move, at the true."""
         normal, distance = _surfaces(inputs)
-        moves = torch.stack(_changes(inputs.rays, _focal(inputs.camera)), dim=0)
-        rays = true_rays(inputs.rays, coefficients, _focal(inputs.camera))[:, None]
-        rays, normal = rays.expand(*moves.shape[1:], 3), normal[:, None].expand(*moves.shape[1:], 3)
-        true = distance + self.shift(inputs, coefficients)
-        true = true[:, None].expand(moves.shape[1:])
-        moved = moved_rays(rays, normal, true, (moves[0], moves[1]), "radial")
-        return -moved / (rays * normal).sum(-1)
+        rays, focal = inputs.rays, _focal(inputs.camera)
+        moves = _changes(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2], focal)
+        rays = true_rays(rays, coefficients, focal)
+        true = -(distance + self.shift(inputs, coefficients)) / (rays * normal).sum(-1)
+        moved = [
+            moved_rays(rays, normal, true, move, "radial") for move in zip(*moves, strict=True)
+        ]
+        return torch.stack(moved, dim=-1)
 
     def on_pose(self, state: FrameState) -> None:
         """Bend the rays."""
@@ -79,9 +80,10 @@ def true_rays(rays: Tensor, coefficients: Tensor, focal: float) -> Tensor:
         coefficients: In the order of `fixed_terms`, shape (11,).
         focal: Focal length, pixels.
     """
-    x, y = _changes(rays, focal)
-    moved = torch.stack([x @ coefficients.to(x), y @ coefficients.to(y)], dim=-1)
-    bent = rays / rays[..., 2:] + torch.nn.functional.pad(moved, (0, 1))
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    for coefficient, by_x, by_y in zip(coefficients.to(x), *_changes(x, y, focal), strict=True):
+        x, y = x + coefficient * by_x, y + coefficient * by_y
+    bent = torch.stack([x, y, torch.ones_like(x)], dim=-1)
     return bent / bent.norm(dim=-1, keepdim=True)
 
 
@@ -97,13 +99,12 @@ def _surfaces(inputs: EffectInputs) -> tuple[Tensor, Tensor]:
     return normal[inputs.frame], distance_to(inputs, normal, height)
 
 
-def _changes(rays: Tensor, focal: float) -> tuple[Tensor, Tensor]:
-    """Return by how much each coefficient moves x and y of rays along (x, y, 1), (..., K) each."""
-    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+def _changes(x: Tensor, y: Tensor, focal: float) -> tuple[list[Tensor], list[Tensor]]:
+    """Return by how much each coefficient moves x and y of the ray (x, y, 1), of their shape."""
     square, product = x**2 + y**2, 2 * x * y
     none, pixel = torch.zeros_like(x), torch.full_like(x, 1 / focal)
     far, wide, high = square**2, square + 2 * x**2, square + 2 * y**2
     # In the order of the coefficients: focal length, centre, radial, tangential, skew, prism.
     by_x = [x, none, pixel, none, x * square, x * far, wide, product, y, square, none]
     by_y = [none, y, none, pixel, y * square, y * far, product, high, none, none, square]
-    return torch.stack(by_x, dim=-1), torch.stack(by_y, dim=-1)
+    return by_x, by_y

@@ -61,7 +61,7 @@ class MixedPixelsEffect(CatalogueEffect):
         own = inputs.signal()
         mixed = own
         for share, sigma in zip(coefficients, shape.sigma_px, strict=False):
-            mixed = mixed + share * (inputs.blurred_signal(sigma) - own)
+            mixed = mixed + share * (inputs.from_signal(blur, sigma) - own)
         phase = phase_difference(mixed, own)
         return inputs.metres_per_radian * phase + _at_edges(inputs, coefficients)
 

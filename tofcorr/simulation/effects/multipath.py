@@ -20,7 +20,7 @@ from tofcorr.simulation.effects.inputs import (
     EffectInputs,
     inputs_from_state,
 )
-from tofcorr.simulation.effects.numerics import exponents, products
+from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.scene import planes_from_world
 
@@ -299,6 +299,6 @@ def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor
     low, high = (inputs.target_xy.new_tensor(v) for v in area)
     x, y = (2 * (inputs.target_xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
     strength = far**2 / inputs.incidence_cosine.clamp(min=_LEAST_COSINE)
-    smooth = strength[:, None] * products(x, y, 0, _ROOM_DEGREE)
+    smooth = strength[:, None] * side_by_side(products(x, y, 0, _ROOM_DEGREE))
     room = 1j * turn * torch.cat([smooth, (far - 1)[:, None] * smooth], dim=1)
     return torch.cat([light, room, flange[:, None]], dim=1)

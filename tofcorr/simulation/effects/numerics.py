@@ -60,22 +60,23 @@ def by_frame(values: Tensor, matrices: Tensor, frame: Tensor) -> Tensor:
 # Legendre polynomials on [-1, 1], in one and two variables.
 
 
-def legendre(scaled: Tensor, degree: int) -> Tensor:
-    """Return the Legendre polynomials P_1 ... P_degree of values (M,), shape (M, degree)."""
-    previous, current = torch.ones_like(scaled), scaled
-    columns = [current]
+def legendre(scaled: Tensor, degree: int) -> list[Tensor]:
+    """Return the Legendre polynomials P_0 ... P_degree of values (M,), each (M,)."""
+    found = [torch.ones_like(scaled), scaled]
     for k in range(1, degree):
-        previous, current = current, ((2 * k + 1) * scaled * current - k * previous) / (k + 1)
-        columns.append(current)
-    return torch.stack(columns[:degree]).movedim(0, -1)
+        found.append(((2 * k + 1) * scaled * found[-1] - k * found[-2]) / (k + 1))
+    return found[: degree + 1]
 
 
-def products(x: Tensor, y: Tensor, low: int, high: int) -> Tensor:
-    """Return P_i(x) P_j(y) for low <= i + j <= high, ordered as `exponents`, shape (M, K)."""
-    one = torch.ones_like(x)[:, None]
-    of_x = torch.cat([one, legendre(x, high)], dim=1)
-    of_y = torch.cat([one, legendre(y, high)], dim=1)
-    return torch.stack([of_x[:, i] * of_y[:, j] for i, j in exponents(low, high)], dim=-1)
+def products(x: Tensor, y: Tensor, low: int, high: int) -> list[Tensor]:
+    """Return P_i(x) P_j(y) for low <= i + j <= high, ordered as `exponents`, each (M,)."""
+    of_x, of_y = legendre(x, high), legendre(y, high)
+    return [of_x[i] * of_y[j] for i, j in exponents(low, high)]
+
+
+def side_by_side(columns: list[Tensor]) -> Tensor:
+    """Return columns (M,) as a matrix (M, K), each of them in one piece of memory."""
+    return torch.stack(columns).movedim(0, -1)
 
 
 def exponents(low: int, high: int) -> list[tuple[int, int]]:

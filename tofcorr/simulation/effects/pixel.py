@@ -2,13 +2,12 @@
 
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.numerics import exponents, products
+from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
 
 
 class PixelShape(Options):
@@ -54,7 +53,6 @@ class PixelEffect(LinearDelay):
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the functions of image position and distance, shape (M, K)."""
         x, y = inputs.columns, inputs.rows
-        surface = products(x, y, 1, self.shape.degree)
         growth = inputs.radial_distance / self.shape.reference_distance_m - 1
-        growing = growth[:, None] * torch.stack([x, y, x**2 + y**2], dim=-1)
-        return torch.cat([surface, growing], dim=-1)
+        growing = [growth * part for part in (x, y, x**2 + y**2)]
+        return side_by_side([*products(x, y, 1, self.shape.degree), *growing])

@@ -1,5 +1,6 @@
 """Light scattered inside the lens."""
 
+from functools import cache, partial
 from typing import ClassVar
 
 import torch
@@ -9,7 +10,7 @@ from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.image_filters import blur, ghost
-from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs, signal_of
+from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
 from tofcorr.simulation.hooks import FrameState
 
 
@@ -57,42 +58,24 @@ class StrayLightEffect(SignalEffect):
 
     def shares(self, inputs: EffectInputs) -> Tensor:
         """Return the scattered light over the direct light; none where there is no light."""
-        spread = [inputs.blurred_signal(sigma) for sigma in self._widths(inputs.camera.width)]
-        ghosts = inputs.from_images(_ghosts, inputs.known_frequency, inputs.camera, self.shape)
-        scattered = torch.cat([torch.stack([*spread, inputs.mean_signal()], dim=1), ghosts], dim=1)
+        scattered = inputs.from_signal(_scattered, inputs.camera, self.shape)
         own = inputs.signal()[:, None]
-        return torch.where(own == 0, 0, scattered / own)
+        return scattered * torch.where(own == 0, 0, 1 / own)
 
     def on_signal(self, state: FrameState) -> None:
         """Scatter the light of every harmonic."""
-        signal, camera, shape = state.signal, state.camera, self.shape
-        widths = len(shape.sigma_of_width)
-        shares, veil, ghosts = self.coefficients.split([widths, 1, len(shape.ghost_sizes)])
-        total = signal + veil * signal.mean((1, 2), keepdim=True)
-        for share, sigma in zip(shares, self._widths(camera.width), strict=True):
-            if share != 0:
-                total = total + share * blur(signal, sigma)
-        if bool(ghosts.any()):
-            blurred = _out_of_focus(signal, shape)
-            for share, size in zip(ghosts, shape.ghost_sizes, strict=True):
-                total = total + share * ghost(blurred, camera, size)
-        state.signal = total
-
-    def _widths(self, image_width: int) -> list[float]:
-        return [sigma * image_width for sigma in self.shape.sigma_of_width]
+        chosen = self.coefficients.nonzero()[:, 0]
+        if len(chosen):
+            ways = _scattered(state.signal, state.camera, self.shape, tuple(chosen.tolist()))
+            state.signal = state.signal + ways @ self.coefficients[chosen].to(ways)
 
 
-def _ghosts(
-    amplitude: Tensor,
-    distance: Tensor,
-    frequency: float,
-    camera: CameraIntrinsics,
-    shape: StrayLightShape,
+def _scattered(
+    signal: Tensor, camera: CameraIntrinsics, shape: StrayLightShape, chosen: tuple[int, ...] = ()
 ) -> Tensor:
-    """Return the phasor of each ghost of images, shape (B, H, W, G)."""
-    blurred = _out_of_focus(signal_of(amplitude, distance, frequency), shape)
-    return torch.stack([ghost(blurred, camera, size) for size in shape.ghost_sizes], dim=-1)
-
-
-def _out_of_focus(signal: Tensor, shape: StrayLightShape) -> Tensor:
-    return blur(signal, shape.ghost_sigma_of_width * signal.shape[-1])
+    """Return the light that some coefficients add to phasor images, shape (B, H, W, K); (): all."""
+    ways = [partial(blur, signal, sigma * camera.width) for sigma in shape.sigma_of_width]
+    ways.append(lambda: signal.mean((1, 2), keepdim=True).expand_as(signal))
+    out_of_focus = cache(partial(blur, signal, shape.ghost_sigma_of_width * camera.width))
+    ways += [lambda size=size: ghost(out_of_focus(), camera, size) for size in shape.ghost_sizes]
+    return torch.stack([ways[number]() for number in chosen or range(len(ways))], dim=-1)

@@ -7,7 +7,7 @@ from torch import Tensor
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearEffect
 from tofcorr.simulation.effects.inputs import FIXED_TARGET, EffectInputs, inputs_from_state
-from tofcorr.simulation.effects.numerics import exponents, products
+from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
 from tofcorr.simulation.hooks import FrameState
 
 
@@ -54,7 +54,7 @@ class TargetShapeEffect(LinearEffect):
         shape, xy = self.shape, inputs.target_xy
         low, high = xy.new_tensor(shape.low_xy_m), xy.new_tensor(shape.high_xy_m)
         x, y = (2 * (xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
-        return -products(x, y, 2, shape.degree) / inputs.incidence_cosine[:, None]
+        return -side_by_side(products(x, y, 2, shape.degree)) / inputs.incidence_cosine[:, None]
 
     def on_geometry(self, state: FrameState) -> None:
         """Raise the surface."""
