@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.correction.frame_correction import AGREEMENT
+from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState, corrector_metadata
 from tofcorr.error_terms.base import (
     EVERYTHING,

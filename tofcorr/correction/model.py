@@ -1,4 +1,7 @@
-"""Everything that a calibration fits: the error model and the camera's pose on the robot's tool."""
+"""The correction: what a calibration fits, and how it corrects frames, differentiable in everything.
+
+In float64 it is the reference: the runtime is folded from it, and every export must agree with it.
+"""
 
 from collections.abc import Sequence
 
@@ -6,9 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tofcorr.conditions import CONDITIONS
+from tofcorr.error_terms.base import DescribedModule, Domain
+from tofcorr.error_terms.condition_terms import Condition, in_si_units, with_means
 from tofcorr.error_terms.model import ErrorModel
+from tofcorr.errors import FrameError
 from tofcorr.geometry import se3
-from tofcorr.geometry.se3 import product, projected
+from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.se3 import product, projected, transformed
 
 # Largest deviation of R^T R from the identity (no unit). More than that is a mistake rather than
 # rounding: float32 rounds to 1e-7.
@@ -159,3 +168,335 @@ def _rigid(transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> Tensor
             f"got {matrix.tolist()}."
         )
     return matrix
+
+
+AGREEMENT = 1e-6
+"""How far runtime and exports may be from this correction in float64, metres: float32 resolves
+1e-7 m at one metre."""
+# OpenCV's longest list of distortion coefficients; shorter ones are filled with zeros, so that
+# the buffer has one shape for every camera.
+_MOST_COEFFICIENTS = 14
+
+
+def refuse_other_than_tensor(name: str, frame: object) -> None:
+    """Refuse a frame that is no tensor, by the name that its caller knows.
+
+    Raises:
+        FrameError: It is something else; the message says how to make a tensor of it.
+    """
+    if not isinstance(frame, Tensor):
+        raise FrameError(
+            f"{name}: expected a torch tensor, got {type(frame).__name__}. Make one with "
+            "torch.tensor(array), or torch.full(shape, number)."
+        )
+
+
+class CameraGeometry(nn.Module):
+    """Image size, pinhole matrix, distortion and rays of a camera, and what its depth means.
+
+    Args:
+        camera: The lateral parameters.
+        depth_kind: `radial`: depth is along the ray; `z`: along the optical axis.
+
+    Attributes:
+        matrix: The pinhole matrix K, shape (3, 3), pixels.
+        distortion: OpenCV's coefficients, filled with zeros, shape (14,).
+        ray_directions: Unit rays in the camera frame, shape (H, W, 3).
+        radial_of_depth: Radial distance over depth, shape (H, W): 1 for radial depth.
+    """
+
+    matrix: Tensor
+    distortion: Tensor
+    ray_directions: Tensor
+    radial_of_depth: Tensor
+
+    def __init__(self, camera: CameraIntrinsics, depth_kind: DepthKind) -> None:
+        super().__init__()
+        distortion = torch.zeros(_MOST_COEFFICIENTS, dtype=torch.float64)
+        distortion[: len(camera.distortion)] = torch.tensor(camera.distortion)
+        size = (camera.height, camera.width)
+        self.register_buffer("matrix", camera.matrix_tensor())
+        self.register_buffer("distortion", distortion)
+        self.register_buffer("ray_directions", ray_directions(camera).clone())
+        self.register_buffer("radial_of_depth", torch.ones(size, dtype=torch.float64))
+        self.set_depth_kind(depth_kind)
+
+    @torch.no_grad()
+    def set_depth_kind(self, depth_kind: DepthKind) -> None:
+        """State what depth means."""
+        self.radial_of_depth.fill_(1.0)
+        if depth_kind == "z":
+            self.radial_of_depth.div_(self.ray_directions[..., 2])
+
+    def points(self, depth: Tensor) -> Tensor:
+        """Return the points of depths (..., H, W) in the camera frame, (..., H, W, 3), metres."""
+        rays = self.ray_directions * self.radial_of_depth[..., None]
+        return depth[..., None] * rays.to(depth.dtype)
+
+    def check(self, depth: Tensor, amplitude: Tensor | None) -> None:
+        """Refuse tensors that are not frames of the camera.
+
+        Raises:
+            FrameError: Shape or dtype are not those of the camera's frames.
+        """
+        given = {"depth": depth} if amplitude is None else {"depth": depth, "amplitude": amplitude}
+        for name, frame in given.items():
+            refuse_other_than_tensor(name, frame)
+        size = list(self.radial_of_depth.shape)
+        if depth.dim() < 2 or list(depth.shape[-2:]) != size:
+            raise FrameError(
+                f"depth: expected shape (..., {size[0]}, {size[1]}), the size of the camera; got "
+                f"{list(depth.shape)}. Was the frame cropped, binned or transposed?"
+            )
+        if amplitude is not None and amplitude.shape != depth.shape:
+            raise FrameError(
+                f"amplitude: expected the shape of depth, {list(depth.shape)}; got "
+                f"{list(amplitude.shape)}."
+            )
+        for name, frame in given.items():
+            if not frame.dtype.is_floating_point:
+                raise FrameError(
+                    f"{name}: expected a floating-point type, got {frame.dtype}. Convert with "
+                    f"{name}.float(), and depth to metres."
+                )
+
+
+class CalibratedRanges(nn.Module):
+    """Where a correction is valid, and the mean conditions it was calibrated in.
+
+    Attributes:
+        radial_distance: Lowest and highest distance along the ray, shape (2,), metres.
+        amplitude: Of the amplitude, shape (2,); infinite if the model does not depend on it.
+        normalised_amplitude: Of N = I D^2, shape (2,); infinite likewise.
+        saturation_amplitude: A pixel at or above it is not valid, shape (); infinite if unknown.
+        mean_conditions: In the order of `CONDITIONS`, shape (C,); 0 where unknown.
+    """
+
+    radial_distance: Tensor
+    amplitude: Tensor
+    normalised_amplitude: Tensor
+    saturation_amplitude: Tensor
+    mean_conditions: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in ("radial_distance", "amplitude", "normalised_amplitude"):
+            self.register_buffer(name, torch.zeros(2, dtype=torch.float64))
+        self.register_buffer("saturation_amplitude", torch.zeros((), dtype=torch.float64))
+        means = torch.zeros(len(CONDITIONS), dtype=torch.float64)
+        self.register_buffer("mean_conditions", means)
+
+    @torch.no_grad()
+    def set(self, domain: Domain, saturation: float | None, error: ErrorModel) -> None:
+        """Take the ranges of a calibration.
+
+        Args:
+            domain: The calibrated ranges.
+            saturation: Amplitude from which on pixels are saturated; None if unknown.
+            error: The model, whose terms say which variables it depends on.
+        """
+        limits = error.limits(domain)
+        for name in ("radial_distance", "amplitude", "normalised_amplitude"):
+            getattr(self, name).copy_(torch.tensor(getattr(limits, name), dtype=torch.float64))
+        most = torch.tensor(torch.inf if saturation is None else saturation)
+        self.saturation_amplitude.copy_(most.float())  # Rounded as the runtime's.
+        means = torch.tensor(domain.mean_conditions(), dtype=torch.float64)
+        self.mean_conditions.copy_(means)
+
+
+class FrameCorrection(DescribedModule):
+    r"""Corrects frames, differentiable in depth, amplitude and every parameter.
+
+    .. math:: D_\mathrm{corrected} = D - E(D, I, r, c, \text{conditions})
+
+    A pixel without a return (NaN, infinite, or not positive) gives NaN, and so does an amplitude of
+    NaN that the model needs. Each variable of the error is clamped to its calibrated range; where
+    that changes it, or the amplitude is saturated, the pixel is not valid. The inputs of a residual
+    network are not clamped: it fades to zero outside.
+
+    Args:
+        camera: The lateral parameters.
+        depth_kind: What depth means.
+        error_model: The terms and the residual network, which predict the error E.
+        hand_eye: tool_from_camera, as a twist around a starting transform.
+        domain: The calibrated ranges.
+        saturation_amplitude: A pixel at or above it is not valid; None if unknown.
+
+    Attributes:
+        geometry: The camera, as buffers.
+        ranges: The calibrated ranges, as buffers.
+    """
+
+    error_model: ErrorModel
+    hand_eye: HandEye
+
+    def __init__(
+        self,
+        camera: CameraIntrinsics,
+        depth_kind: DepthKind,
+        error_model: ErrorModel,
+        hand_eye: HandEye,
+        domain: Domain,
+        saturation_amplitude: float | None,
+    ) -> None:
+        super().__init__()
+        self.error_model = error_model
+        self.hand_eye = hand_eye
+        self.geometry = CameraGeometry(camera, depth_kind)
+        self.ranges = CalibratedRanges()
+        self.ranges.set(domain, saturation_amplitude, error_model)
+
+    def forward(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return corrected depth.
+
+        Args:
+            depth: Of the camera's `depth_kind`, shape (..., H, W), metres.
+            amplitude: The camera's units, the shape of `depth`; None where no term needs it.
+            **conditions: `timestamp_s`, `integration_time_us`, `room_temperature_c`,
+                `body_temperature_c`, `ambient`: one number, or one for each frame (...). What is
+                not given is taken as the mean of the calibration.
+
+        Returns:
+            A new tensor of the shape and dtype of `depth`, metres; NaN where there is no return.
+
+        Raises:
+            FrameError: The frames are of another size or dtype, or amplitudes are missing.
+        """
+        error, seen = self._error(depth, amplitude, conditions)
+        corrected = depth.to(error.dtype) - error
+        return torch.where(seen, corrected, torch.nan).to(depth.dtype)
+
+    def error(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return the predicted error, measured - true: depth - error is the corrected depth.
+
+        Arguments, shape and dtype are those of `forward`.
+        """
+        error, seen = self._error(depth, amplitude, conditions)
+        return torch.where(seen, error, torch.nan).to(depth.dtype)
+
+    def valid(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return where the correction is valid, bool, the shape of `depth`.
+
+        Not valid is a pixel without a return, a saturated one, and one whose distance, amplitude
+        or conditions are outside the calibrated range. The rule is that of `corrector.ts`.
+        """
+        model, ranges = self.error_model, self.ranges
+        seen, radial, strength, distance, held = self._variables(depth, amplitude)
+        valid = seen & (distance == radial)
+        if model.needs_amplitude():
+            valid = valid & (held == strength)
+        if model.needs_normalised_amplitude():
+            normalised = held * distance.square()
+            low, high = ranges.normalised_amplitude.unbind()
+            valid = valid & (normalised == normalised.clamp(low, high))
+        if amplitude is not None:
+            saturated = amplitude >= ranges.saturation_amplitude
+            valid = valid & ~(saturated & ranges.saturation_amplitude.isfinite())
+        known = self._conditions(depth, conditions)
+        for term in () if known is None else model.condition_terms:
+            valid = valid & term.covers(known)[..., None, None]  # type: ignore[operator]
+        return valid
+
+    def points(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return corrected points in the camera frame, shape (..., H, W, 3), metres."""
+        return self.geometry.points(self(depth, amplitude, **conditions))
+
+    def points_tool(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return corrected points in the tool frame, shape (..., H, W, 3), metres."""
+        points = self.points(depth, amplitude, **conditions)
+        return transformed(self.hand_eye().to(points.dtype), points)
+
+    def _error(
+        self, depth: Tensor, amplitude: Tensor | None, conditions: dict[str, Condition]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the error in the camera's kind of depth, in the module's dtype, and where seen."""
+        model = self.error_model
+        seen, radial, strength, distance, held = self._variables(depth, amplitude)
+        error = model.pixel_error() + signal_error(
+            model, distance, held, self.ranges.normalised_amplitude
+        )
+        known = self._conditions(depth, conditions)
+        if known is not None:
+            error = error + model.condition_error(known)[..., None, None]
+        if model.residual is not None:
+            error = error + model.residual(radial, strength, *model.pixel_grid())
+        return error / self.geometry.radial_of_depth, seen
+
+    def _variables(
+        self, depth: Tensor, amplitude: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Turn frames into the variables of the error model, in the dtype of its parameters.
+
+        Where there is no measurement the variables are those of the middle of the calibrated
+        ranges, so that neither the error nor its gradient is NaN there.
+
+        Returns:
+            Where distance, and amplitude if the model needs it, were measured, bool; radial
+            distance and amplitude as measured; both clamped to their calibrated ranges. Without
+            need for amplitudes these are the radial distances.
+        """
+        self.geometry.check(depth, amplitude)
+        ranges, dtype = self.ranges, self.error_model.constant.dtype
+        depth = depth.to(dtype)
+        seen = torch.isfinite(depth) & (depth > 0)
+        strength = None
+        if self.error_model.needs_amplitude():
+            strength = required_amplitude(amplitude).to(dtype)
+            seen = seen & ~torch.isnan(strength)
+        radial = depth * self.geometry.radial_of_depth
+        radial = torch.where(seen, radial, ranges.radial_distance.mean())
+        distance = radial.clamp(*ranges.radial_distance.unbind())
+        if strength is None:
+            return seen, radial, radial, distance, radial
+        strength = torch.where(seen, strength, ranges.amplitude.mean())
+        return seen, radial, strength, distance, strength.clamp(*ranges.amplitude.unbind())
+
+    def _conditions(self, depth: Tensor, given: dict[str, Condition]) -> Tensor | None:
+        mean = self.ranges.mean_conditions
+        known = in_si_units(given, depth.shape[:-2], mean.dtype, mean.device)
+        return with_means(known, mean) if known and len(self.error_model.condition_terms) else None
+
+
+def signal_error(
+    model: ErrorModel, distance: Tensor, amplitude: Tensor, normalised_range: Tensor
+) -> Tensor:
+    """Return the sum of the signal terms, shape (...), metres.
+
+    Args:
+        model: The error model.
+        distance: Radial distances inside their range, shape (...), metres.
+        amplitude: Amplitudes inside their range, same shape.
+        normalised_range: Range of N = I D^2, shape (2,), to which N is clamped here.
+    """
+    error = torch.zeros_like(distance)
+    for term in model.signal_terms:
+        strength = amplitude
+        if term.uses_normalised_amplitude:
+            square = distance.square()
+            strength = (strength * square).clamp(*normalised_range.unbind()) / square
+        error = error + term(distance, strength)
+    return error
+
+
+def required_amplitude(amplitude: Tensor | None) -> Tensor:
+    """Return the amplitudes that a model needs.
+
+    Raises:
+        FrameError: There are none.
+    """
+    if amplitude is None:
+        raise FrameError(
+            "amplitude: the model has a term of the amplitude and got no amplitudes; pass them, or "
+            "choose terms without amplitude."
+        )
+    return amplitude

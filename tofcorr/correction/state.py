@@ -13,8 +13,7 @@ from pydantic import AfterValidator, ConfigDict, InstanceOf, model_validator
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.correction.frame_correction import FrameCorrection
-from tofcorr.correction.model import CalibrationModel, HandEye
+from tofcorr.correction.model import CalibrationModel, FrameCorrection, HandEye
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions

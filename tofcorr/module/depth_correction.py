@@ -15,8 +15,7 @@ from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
-from tofcorr.correction.frame_correction import FrameCorrection, required_amplitude
-from tofcorr.correction.model import CalibrationModel, HandEye
+from tofcorr.correction.model import CalibrationModel, FrameCorrection, HandEye, required_amplitude
 from tofcorr.correction.state import (
     STATE_FILE,
     CalibrationExtras,

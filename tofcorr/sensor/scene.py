@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tofcorr.correction.frame_correction import refuse_other_than_tensor
+from tofcorr.correction.model import refuse_other_than_tensor
 from tofcorr.error_terms.condition_terms import Condition, in_si_units
 from tofcorr.errors import ConfigError, FrameError
 from tofcorr.geometry.camera import CameraIntrinsics

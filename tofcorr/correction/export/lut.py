@@ -10,8 +10,8 @@ from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.frame_correction import signal_error
 from tofcorr.correction.lookup import FORMAT, LookupTable, digest_of, interpolate, read_lut
+from tofcorr.correction.model import signal_error
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING, Interval
 from tofcorr.errors import ConfigError

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from tofcorr.correction.frame_correction import AGREEMENT
+from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING
 from tofcorr.errors import ExportError

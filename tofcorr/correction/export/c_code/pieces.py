@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tofcorr.correction.frame_correction import AGREEMENT
+from tofcorr.correction.model import AGREEMENT
 from tofcorr.error_terms.base import EVERYTHING, Axis, Domain, SignalTerm
 from tofcorr.errors import ConfigError
 

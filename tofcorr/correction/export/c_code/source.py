@@ -17,7 +17,7 @@ from tofcorr.correction.corrector import (
 )
 from tofcorr.correction.export.c_code.pieces import Pieces, pieces_of
 from tofcorr.correction.export.parity import probe_frames
-from tofcorr.correction.frame_correction import AGREEMENT
+from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING, Axis
 from tofcorr.error_terms.residual import ResidualNetwork
