@@ -1,6 +1,6 @@
 """The correction: what a calibration fits, and how it corrects frames, differentiable in everything.
 
-In float64 it is the reference: the runtime is folded from it, and every export must agree with it.
+In float64 it is the reference: the runtime is folded from it, every export must agree with it.
 """
 
 from collections.abc import Sequence
