@@ -1,4 +1,4 @@
-"""The correction: what a calibration fits, and how it corrects frames, differentiable in everything.
+"""The correction: what a calibration fits, and how it corrects frames, differentiable throughout.
 
 In float64 it is the reference: the runtime is folded from it, every export must agree with it.
 """
