@@ -27,7 +27,7 @@ from benchmarks.wrong_recordings.clean import drawn_simulator
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift
-from tofcorr.drift.offset import OffsetSums, PixelCount, Wall, corrected_images
+from tofcorr.drift.offset import OffsetSums, Wall
 from tofcorr.errors import TofcorrError
 from tofcorr.fit.reference import Reference, unknown_reference
 from tofcorr.options import resolve_options
@@ -139,10 +139,9 @@ def drifted(known: Known, folder: Path) -> list[dict[str, Any]]:
     reference = known.reference
     lines = []
     for wall in WALLS:
-        sums = OffsetSums(reference or unknown_reference(known.state, wall_is_known=False), wall)
-        images = corrected_images(known.state, dataset, wall, PixelCount())
-        for frames, image in enumerate(images, 1):
-            sums.add(image)
+        own = reference or unknown_reference(known.state, wall_is_known=False)
+        sums = OffsetSums(known.state, dataset, wall, own)
+        for frames, _ in enumerate(sums.read(), 1):
             if frames in FRAMES:
                 found = sums.estimate()
                 middle, half = 1e3 * found.value, 1e3 * found.half_width

@@ -226,7 +226,7 @@ def test_a_wedge_of_glass_before_the_lens_is_named(
     found = examine(Dataset((recording,)))
     shape = found.look.shape
     assert shape is not None
-    square = np.square(found.look.rays[..., :2] / found.look.rays[..., 2:]).sum(-1)
+    square = np.square(found.look.scene.rays[..., :2] / found.look.scene.rays[..., 2:]).sum(-1)
     # Where rays are bent to the right, the image is bent to the left.
     expected = -square.max() * np.array([right, down])
     away = np.abs(shape["bend"].value - expected) / shape["bend"].error

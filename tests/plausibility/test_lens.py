@@ -11,7 +11,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 from tofcorr.plausibility.linear import Estimate
-from tofcorr.plausibility.look import Look, read_sample
+from tofcorr.plausibility.look import Look
 
 
 def _lens_findings(clean: Path, k1: float) -> list[str]:
@@ -56,7 +56,7 @@ def test_an_error_by_an_amplitude_that_is_not_recorded_is_none_of_the_camera_mat
 
     def shape(depth: np.ndarray) -> Estimate:
         alone = replace(white_wall, depth=depth.astype(np.float32), amplitude=None)
-        found = Look(read_sample(Dataset((alone,)))).shape
+        found = Look(Dataset((alone,))).shape
         assert found is not None
         return found[name]
 

@@ -10,7 +10,7 @@ from small_recordings import frame_rows, small_images, write_small_recording
 from tofcorr.data.recording import Recording
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.plausibility.look import read_sample
+from tofcorr.plausibility.look import Look
 
 
 @pytest.mark.parametrize("depth_kind", ["radial", "z"])
@@ -30,6 +30,6 @@ def test_noise_of_a_few_wide_pixels_is_that_of_their_depth(
     images |= {"depth": depth.astype(np.float32), "mask": None, "amplitude": None}
     rows = frame_rows(generator, number)
     folder = write_small_recording(tmp_path / "wide", rows=rows, depth_kind=depth_kind, **images)
-    sample = read_sample(Dataset((Recording.open(folder),)))
+    sample = Look(Dataset((Recording.open(folder),)))
     # 1500 differences give the noise to 4 %. The lens bends a row a little, which leaves 0.06 mm.
     assert sample.noise == pytest.approx(noise, rel=0.12, abs=1e-4)

@@ -9,16 +9,8 @@ import numpy as np
 import torch
 
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
-from tofcorr.drift.offset import (
-    FEWEST_PIXELS,
-    Offset,
-    OffsetSums,
-    PixelCount,
-    Wall,
-    corrected_images,
-    departure_from_plane,
-)
-from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
+from tofcorr.drift.offset import FEWEST_PIXELS, Offset, OffsetSums, Wall
+from tofcorr.drift.result import DriftResult, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import solvable
 from tofcorr.files import file_to_replace, staged_file
@@ -28,7 +20,6 @@ from tofcorr.fit.reference import (
     load_reference,
     share_unlike,
     unknown_reference,
-    view_of,
 )
 from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.plausibility.examine import vet
@@ -86,17 +77,25 @@ def check(
         raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
     dataset = Dataset(opened(recordings))
     state = load_calibration(path)
-    _refuse_other_camera(state, dataset)
+    _refuse_unfit(state, dataset, "per_image")
     planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
     headline = vet(dataset, planes, fits=False, force=force).headline
     reference = load_reference(path.with_name(REFERENCE_FILE), state)
     with solvable(dataset.first.path, "check", _NO_SOLUTION):
         result = check_drift(state, dataset, wall, threshold_mm / 1e3, reference)
-    if not force:
-        _refuse_impossible(result, dataset)
+    low, high = result.interval
+    if abs(result.offset) > _IMPOSSIBLE and not low <= 0 <= high and not force:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: the distances would be {1e3 * result.offset:+.0f} mm off, and "
+            f"no camera drifts by more than {1e3 * _IMPOSSIBLE:.0f} mm: check unit and kind of the "
+            "depth, the mask and the wall (`tofcorr inspect` shows more; --force, in Python "
+            "force=True, measures all the same)."
+        )
     result = replace(result, headline=headline or result.headline)
     if out is not None:
-        _write(Path(out), result)
+        text = json.dumps(result.to_mapping(), indent=1, allow_nan=False) + "\n"
+        with staged_file(Path(out), CalibrationDataError) as part:
+            part.write_text(text, encoding="utf-8")
     return result
 
 
@@ -123,63 +122,43 @@ def check_drift(
         CalibrationDataError: The camera is another one, no image has enough usable pixels, or one
             wall is asked for and no robot moves.
     """
-    _refuse_other_camera(state, dataset)
-    if wall == "one" and not dataset.moves:
-        raise CalibrationDataError(
-            f"{dataset.first.path}: one wall seen from several poses needs a robot's poses in "
-            "frames.csv, and there none changes; use the plane per image, or the recorded one."
-        )
-    if wall != "per_image":
-        _refuse_estimated_planes(dataset, wall)
+    _refuse_unfit(state, dataset, wall)
     known = reference or unknown_reference(state, wall_is_known=wall == "recorded")
-    count, sums = PixelCount(), OffsetSums(known, wall)
-    seen: list[tuple[int, float, int]] = []
-    views: list[torch.Tensor] = []
-    images = corrected_images(state, dataset, wall, count)
-    for image in through(images, "checking", total=dataset.num_frames):
-        sums.add(image)
-        seen.append((image.frame, departure_from_plane(image), len(image.points)))
-        views.append(view_of(image.linear))
-    if not seen:
+    sums = OffsetSums(state, dataset, wall, known)
+    if not list(through(sums.read(), "checking", total=dataset.num_frames)):
         raise CalibrationDataError(
             f"{dataset.first.path}: no image has {FEWEST_PIXELS} usable pixels on a wall within "
             "the calibrated ranges of distance and amplitude; record a wall there."
         )
     found = sums.estimate()
-    half_width = found.half_width
-    flatness = math.sqrt(sum(departure**2 for _, departure, _ in seen) / len(seen))
+    low, high = found.value - found.half_width, found.value + found.half_width
+    flatness = math.sqrt(np.mean([one.flatness**2 for one in found.images]))
+    verdict: Verdict = "holds" if max(-low, high) <= threshold else "undecided"
+    if max(low, -high, flatness) > threshold:
+        verdict = "drifted"
     return DriftResult(
-        verdict=_verdict(found.value, half_width, flatness, threshold),
+        verdict=verdict,
         wall=wall,
         offset=found.value,
-        interval=(found.value - half_width, found.value + half_width),
+        interval=(low, high),
         flatness=flatness,
         threshold=threshold,
-        images=[
-            ImageDrift(frame, offset, departure, pixels)
-            for (frame, departure, pixels), offset in zip(
-                seen, found.of_image.tolist(), strict=True
-            )
-        ],
-        outside=count.share_outside,
+        images=found.images,
+        outside=1 - sums.calibrated / max(sums.on_wall, 1),
         form_is_known=reference is not None,
-        unlike=0.0 if known.views is None else share_unlike(torch.stack(views), known.views),
+        unlike=0.0 if known.views is None else share_unlike(torch.stack(sums.views), known.views),
         headline=_headline(found),
     )
 
 
 def _headline(found: Offset) -> str | None:
     """Return what to say first of images that are not of one camera and one wall, or not of it."""
-    if not found.disagrees:
-        return _odd_offset(found)
-    return (
-        f"Doubtful frames: they disagree with each other {found.disagreement:.1f} times as much as "
-        "those of the calibration: two cameras, walls that are not flat or elsewhere than "
-        "recorded, or wrong poses."
-    )
-
-
-def _odd_offset(found: Offset) -> str | None:
+    if found.disagrees:
+        return (
+            f"Doubtful frames: they disagree with each other {found.disagreement:.1f} times as "
+            "much as those of the calibration: two cameras, walls that are not flat or elsewhere "
+            "than recorded, or wrong poses."
+        )
     if abs(found.value) <= max(_ODD, found.half_width):
         return None
     return (
@@ -189,54 +168,30 @@ def _odd_offset(found: Offset) -> str | None:
     )
 
 
-def _refuse_impossible(result: DriftResult, dataset: Dataset) -> None:
-    low, high = result.interval
-    if abs(result.offset) <= _IMPOSSIBLE or low <= 0 <= high:
-        return
-    raise CalibrationDataError(
-        f"{dataset.first.path}: the distances would be {1e3 * result.offset:+.0f} mm off, and no "
-        f"camera drifts by more than {1e3 * _IMPOSSIBLE:.0f} mm: check unit and kind of the "
-        "depth, the mask and the wall (`tofcorr inspect` shows more; --force, in Python "
-        "force=True, measures all the same)."
-    )
-
-
-def _verdict(offset: float, half_width: float, flatness: float, threshold: float) -> Verdict:
-    if abs(offset) - half_width > threshold or flatness > threshold:
-        return "drifted"
-    return "holds" if abs(offset) + half_width <= threshold else "undecided"
-
-
-def _refuse_estimated_planes(dataset: Dataset, wall: Wall) -> None:
-    """Refuse to use planes of which the recording says that they were found in its depth."""
-    if not dataset.planes_are_estimated:
-        return
-    if wall == "recorded":
-        raise CalibrationDataError(
-            f"{dataset.first.path}: the planes are estimated from the depth (recording.yaml: "
-            "planes), so they cannot show an offset of the camera; use the wall per image, or one "
-            "wall."
-        )
-    walls = np.unique(dataset.targets)
-    if len(walls) > 1:
-        raise CalibrationDataError(
-            f"{dataset.first.path}: one wall is asked for, and the frames show {len(walls)} "
-            f"({', '.join(walls)}); use the wall per image."
-        )
-
-
-def _refuse_other_camera(state: CalibrationState, dataset: Dataset) -> None:
-    first = dataset.first
+def _refuse_unfit(state: CalibrationState, dataset: Dataset, wall: Wall) -> None:
+    """Refuse frames of another camera, or that cannot show what is asked of their walls."""
+    first, walls = dataset.first, np.unique(dataset.targets)
+    reason = None
     if first.camera != state.camera or first.depth_kind != state.depth_kind:
-        raise CalibrationDataError(
-            f"{first.path}: this is not the camera that was calibrated: expected "
+        reason = (
+            "this is not the camera that was calibrated: expected "
             f"{state.camera.width}x{state.camera.height} pixels, depth_kind {state.depth_kind} and "
             "the same K and distortion."
         )
-
-
-def _write(path: Path, result: DriftResult) -> None:
-    """Write the JSON file whole or not at all."""
-    text = json.dumps(result.to_mapping(), indent=1, allow_nan=False) + "\n"
-    with staged_file(path, CalibrationDataError) as part:
-        part.write_text(text, encoding="utf-8")
+    elif wall == "one" and not dataset.moves:
+        reason = (
+            "one wall seen from several poses needs a robot's poses in frames.csv, and there none "
+            "changes; use the plane per image, or the recorded one."
+        )
+    elif wall == "recorded" and dataset.planes_are_estimated:
+        reason = (
+            "the planes are estimated from the depth (recording.yaml: planes), so they cannot show "
+            "an offset of the camera; use the wall per image, or one wall."
+        )
+    elif wall == "one" and dataset.planes_are_estimated and len(walls) > 1:
+        reason = (
+            f"one wall is asked for, and the frames show {len(walls)} ({', '.join(walls)}); use "
+            "the wall per image."
+        )
+    if reason is not None:
+        raise CalibrationDataError(f"{first.path}: {reason}")

@@ -1,10 +1,10 @@
 """What a drift check found, in words, as plain values and as a figure."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 from tofcorr.digits import known, known_interval
-from tofcorr.drift.offset import Wall
+from tofcorr.drift.offset import ImageDrift, Wall
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -16,22 +16,6 @@ _VERDICTS = {
     "drifted": "The camera has drifted: calibrate anew.",
     "undecided": "Undecided: these frames neither show a drift nor exclude one.",
 }
-
-
-class ImageDrift(NamedTuple):
-    """One image of a drift check.
-
-    Attributes:
-        frame: Its number.
-        offset: How much farther than at calibration the camera reads there, metres.
-        flatness: Root mean square departure of its corrected wall from a plane, metres.
-        num_pixels: Pixels used.
-    """
-
-    frame: int
-    offset: float
-    flatness: float
-    num_pixels: int
 
 
 @dataclass(frozen=True, repr=False)
@@ -72,45 +56,35 @@ class DriftResult:
         interval = 1e3 * self.interval[0], 1e3 * self.interval[1]
         offset = known(1e3 * self.offset, interval, most=2, sign="+")
         low, high = known_interval(interval, most=2, sign="+")
+        how = "Add frames at different distances and tilts."
+        if self.wall == "per_image":
+            how = (
+                "A wall at an unknown place in each image shows an offset only by the bow that "
+                f"this gives to a plane, here to within {(interval[1] - interval[0]) / 2:.2g} mm. "
+                "Use a measured wall (wall: recorded), or one wall seen from known robot poses "
+                "(wall: one)."
+            )
         lines = [
-            *([self.headline] if self.headline else []),
+            self.headline,
             _VERDICTS[self.verdict],
             f"Its distances are {offset} mm off, compared with the calibration (positive: too far; "
             f"95 % interval {low} to {high} mm; threshold {1e3 * self.threshold:g} mm).",
             f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",
+            # Some are expected: the ranges are the central 99.8 % of the training pixels.
+            self.outside > 1 / 10
+            and f"{100 * self.outside:.0f} % of the pixels lie outside the calibrated ranges and "
+            "were not used.",
+            # Of views like the calibrated ones a twentieth counts as unlike.
+            self.unlike > 1 / 2
+            and f"{100 * self.unlike:.0f} % of the images see the wall as no calibrated one did "
+            "(distance, tilt, place in the image): errors of such views were not measured, and "
+            "the interval may be too narrow. Check at the views of the calibration.",
+            not self.form_is_known
+            and "The run has no reference.json (an older version trained it): the interval takes "
+            "the form of its model as right, and is too narrow where that is wrong.",
+            self.verdict == "undecided" and how,
         ]
-        # Some are expected: the ranges are the central 99.8 % of the training pixels.
-        if self.outside > 0.1:
-            lines.append(
-                f"{100 * self.outside:.0f} % of the pixels lie outside the calibrated ranges and "
-                "were not used."
-            )
-        # Of views like the calibrated ones a twentieth counts as unlike.
-        if self.unlike > 0.5:
-            lines.append(
-                f"{100 * self.unlike:.0f} % of the images see the wall as no calibrated one did "
-                "(distance, tilt, place in the image): errors of such views were not measured, and "
-                "the interval may be too narrow. Check at the views of the calibration."
-            )
-        if not self.form_is_known:
-            lines.append(
-                "The run has no reference.json (an older version trained it): the interval takes "
-                "the form of its model as right, and is too narrow where that is wrong."
-            )
-        if self.verdict == "undecided":
-            lines.append(self._what_to_do())
-        return "\n".join(lines)
-
-    def _what_to_do(self) -> str:
-        """Return how to come to a decision."""
-        if self.wall != "per_image":
-            return "Add frames at different distances and tilts."
-        half_width = 1e3 * (self.interval[1] - self.interval[0]) / 2
-        return (
-            "A wall at an unknown place in each image shows an offset only by the bow that this "
-            f"gives to a plane, here to within {half_width:.2g} mm. Use a measured wall (wall: "
-            "recorded), or one wall seen from known robot poses (wall: one)."
-        )
+        return "\n".join(line for line in lines if line)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the finding as plain values, as in the command's JSON file."""
@@ -127,12 +101,8 @@ class DriftResult:
             "outside_calibrated_range": self.outside,
             "unlike_calibrated_views": self.unlike,
             "images": [
-                {
-                    "frame": image.frame,
-                    "flatness_mm": 1e3 * image.flatness,
-                    "pixels": image.num_pixels,
-                }
-                for image in self.images
+                {"frame": frame, "flatness_mm": 1e3 * flatness, "pixels": pixels}
+                for frame, _, flatness, pixels in self.images
             ],
         }
 
@@ -140,21 +110,19 @@ class DriftResult:
         """Draw offset and flatness of each image, with the overall interval and the threshold."""
         from matplotlib.figure import Figure
 
-        figure, threshold = Figure(figsize=(7.0, 5.0), layout="constrained"), 1e3 * self.threshold
+        figure, threshold = Figure(figsize=(7, 5), layout="constrained"), 1e3 * self.threshold
         top, bottom = figure.subplots(2, 1, sharex=True)
-        frames = [image.frame for image in self.images]
+        frames, offset, flatness, _ = zip(*self.images, strict=True)
         low, high = (1e3 * end for end in self.interval)
-        top.axhspan(low, high, color="C0", alpha=0.2, label="all images, 95 % interval")
-        offsets = [1e3 * image.offset for image in self.images]
-        top.plot(frames, offsets, "o", color="C0", label="one image")
-        bottom.plot(frames, [1e3 * image.flatness for image in self.images], "o", color="C1")
+        top.axhspan(low, high, color="C0", alpha=1 / 5, label="all images, 95 % interval")
+        top.plot(frames, [1e3 * one for one in offset], "o", color="C0", label="one image")
+        bottom.plot(frames, [1e3 * one for one in flatness], "o", color="C1")
         for axes, ends in ((top, (-threshold, threshold)), (bottom, (threshold,))):
             for end in ends:
                 axes.axhline(end, color="C3", linestyle="--", linewidth=1)
-            axes.grid(alpha=0.25)
+            axes.grid(alpha=1 / 4)
         top.set_ylabel("reads too far by [mm]")
         top.legend(fontsize=8)
-        bottom.set_ylabel("departure from a plane [mm]")
-        bottom.set_ylim(bottom=0.0)
+        bottom.set(ylabel="departure from a plane [mm]", ylim=(0, None))
         bottom.set_xlabel("frame (dashed: threshold)")
         return figure

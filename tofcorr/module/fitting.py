@@ -131,7 +131,7 @@ def fit_to(
     best = result.solution.parameters
     support = recording_support(found.data, training, best.tool_from_camera)
     hand_eye = hand_eye_summary(result, dataset.first.frame_names)
-    noise_mm = 1e3 * inspection.look.sample.noise_rms
+    noise_mm = 1e3 * inspection.look.noise_rms
     report = FitReport(
         model=options.name,
         before=_error(errors, "before", measured),

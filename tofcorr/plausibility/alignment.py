@@ -11,6 +11,8 @@ from typing import Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+TINY = float(np.finfo(np.float64).tiny)
+"""What a divisor is at the least."""
 # Prior standard deviations of a step of the hand-eye in directions that the frames leave open,
 # radians and metres (large), of the constant error, metres (large), and of the error in proportion
 # to the distance (clocks are right to a percent, and no unit may hide in it). Chosen.
@@ -25,16 +27,23 @@ _CAUCHY = 2.385
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a recording claims, reduced to moments: poses, planes and points of F frames.
+    """What a recording claims: poses, planes and the P points of each of F frames.
 
     Attributes:
         poses: world_from_tool, shape (F, 4, 4), metres.
         normal: Of the planes in the world, shape (F, 3).
         offset: Of the planes, shape (F,), metres.
-        moments: Mean of q q^T over a frame's pixels with q = (point, 1, ray) in the camera frame,
-            shape (F, 7, 7).
-        own_normal: Of the plane through the frame's own points, camera frame, shape (F, 3).
-        known: Whether that plane is determined, shape (F,), bool.
+        rays: Unit rays, shape (F, P, 3).
+        distance: Along the rays, shape (F, P), metres; NaN: not usable.
+        own_normal: Of the plane through the frame's own points, on the camera's side, in the camera
+            frame, shape (F, 3).
+        known: Whether a frame's pixels determine that plane, shape (F,), bool.
+        on_plane: Which pixels lie on it, shape (F, P), bool; where it is not known, all that are
+            usable.
+        off_by: Distance along the ray of every pixel to it, shape (F, P), metres; NaN: no pixel.
+        flatness: Root mean square distance of the pixels on it to it, shape (F,), metres.
+        moments: Mean of q q^T over these pixels with q = (point, 1, ray) in the camera frame, shape
+            (F, 7, 7).
         moves: Whether a robot moves the camera; without one the hand-eye is the identity.
         guess: The recorded tool_from_camera, shape (4, 4).
     """
@@ -42,9 +51,14 @@ class Scene:
     poses: np.ndarray
     normal: np.ndarray
     offset: np.ndarray
-    moments: np.ndarray
+    rays: np.ndarray
+    distance: np.ndarray
     own_normal: np.ndarray
     known: np.ndarray
+    on_plane: np.ndarray
+    off_by: np.ndarray
+    flatness: np.ndarray
+    moments: np.ndarray
     moves: bool
     guess: np.ndarray
 
@@ -56,17 +70,9 @@ class Scene:
 
     def some(self, chosen: np.ndarray) -> Self:
         """Return the scene of some frames, by index or by mask."""
-        per_frame = ("poses", "normal", "offset", "moments", "own_normal", "known")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in per_frame})
-
-
-def moments_of(rays: np.ndarray, distance: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the moments of `Scene` from rays (F, P, 3), distances and pixels used (F, P)."""
-    one = used[..., None].astype(np.float64)
-    points = rays * np.where(used, distance, 0.0)[..., None]
-    joined = np.concatenate([points, one, rays * one], axis=-1)
-    total = np.einsum("fpa,fpb->fab", joined, joined, optimize=True)
-    return total / np.maximum(used.sum(1), 1)[:, None, None]
+        whole = ("moves", "guess")
+        parts = {name: all_[chosen] for name, all_ in vars(self).items() if name not in whole}
+        return replace(self, **parts)
 
 
 def distinct(rows: np.ndarray) -> np.ndarray:
@@ -222,7 +228,7 @@ def _single_ray_start(scene: Scene) -> np.ndarray:
     in_tool, offset_tool = scene.planes_in_tool()
     mean = scene.moments[:, 3]
     distance = np.linalg.norm(mean[:, :3], axis=1)
-    ray = mean[0, 4:7] / max(np.linalg.norm(mean[0, 4:7]), 1e-12)
+    ray = mean[0, 4:7] / max(np.linalg.norm(mean[0, 4:7]), TINY)
     matrix = np.concatenate([in_tool * distance[:, None], in_tool], axis=1)
     solved = np.linalg.lstsq(matrix, -offset_tool, rcond=1e-9)[0]
     start = np.eye(4)
@@ -282,11 +288,11 @@ def _directions(scene: Scene, wall: np.ndarray) -> np.ndarray | None:
     for axis in range(3):
         rows[np.arange(frames), axis, 9 + 3 * wall + axis] = -1
     values, vectors = np.linalg.eigh(np.einsum("fai,faj->ij", rows, rows))
-    if values[1] < 4 * max(values[0], 1e-12):
+    if values[1] < 4 * max(values[0], TINY):
         return None
     solution = vectors[:, 0] * np.sign(np.linalg.det(vectors[:9, 0].reshape(3, 3)) or 1)
     normal = solution[9:].reshape(count, 3)
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
 
 
 def _with_walls(scene: Scene, found: Alignment, wall: np.ndarray) -> Scene:

@@ -1,16 +1,48 @@
 """The checks run on a recording; `vet` is what every command calls first."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset, PlaneChoice, Recordings, opened, resolved_planes
-from tofcorr.plausibility.checks import OF_GEOMETRY, OF_VALUES
-from tofcorr.plausibility.checks.geometry import garbage_of, outlying_frames
+from tofcorr.plausibility.checks.geometry import (
+    agreement,
+    drift,
+    garbage,
+    garbage_of,
+    lone_walls,
+    normals,
+    outlying_frames,
+    outlying_poses,
+    shape,
+)
+from tofcorr.plausibility.checks.values import (
+    amplitude,
+    depth_values,
+    duplicates,
+    exposure,
+    lens,
+    stamps,
+    stillness,
+    temperatures,
+    two_cameras,
+    units,
+)
 from tofcorr.plausibility.finding import SEVERITIES, Finding, Inspection
-from tofcorr.plausibility.look import Look, PlaneUse, read_sample
+from tofcorr.plausibility.look import Look, PlaneUse
+from tofcorr.plausibility.mounting import remounting
+
+OF_VALUES = (units, depth_values, stillness, duplicates, stamps, amplitude, temperatures, lens)
+"""Those that look at values alone. What they find impossible makes those below pointless."""
+
+OF_GEOMETRY = (
+    *(lone_walls, garbage, normals, shape, drift, remounting, agreement, outlying_poses),
+    *(two_cameras, exposure),
+)
+"""Those that compare depth, poses, planes and camera."""
 
 
 def inspect(
@@ -72,52 +104,47 @@ def vet(
 
 def examine(data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> Inspection:
     """Run the checks in turn; those of geometry until one finds something impossible."""
-    look = Look(read_sample(data), planes, fits)
-    findings = [one for check in OF_VALUES for one in check(look)]
-    sound = not _impossible(findings)
-    for check in OF_GEOMETRY if sound else ():
-        findings += check(look)
-        if _impossible(findings):
+    look = Look(data, planes, fits=fits)
+    findings: list[Finding] = []
+    aligned = False
+    for check in (*OF_VALUES, *OF_GEOMETRY):
+        if check in OF_GEOMETRY and any(one.severity == "impossible" for one in findings):
             break
-    aligned = sound and not _impossible(findings)
-    share, bent, dominated = garbage_of(look) if aligned else (0.0, False, False)
+        aligned = check in OF_GEOMETRY
+        name = check.__name__.replace("_", " ")
+        findings += [replace(one, check=one.check or name) for one in check(look)]
+    impossible = {one.check for one in findings if one.severity == "impossible"}
+    share, bent, dominated = (0.0, False, False) if impossible else garbage_of(look)
     # Each sentence once. Sorting is stable: within a severity the order of the checks stays.
     once = {one.sentence: one for one in findings}.values()
     return Inspection(
         recordings=tuple(str(one.path) for one in data.recordings),
         findings=tuple(sorted(once, key=lambda one: SEVERITIES.index(one.severity))),
-        numbers=_numbers(look, aligned=sound),
-        outlying=outlying_frames(look) if aligned else {},
+        numbers=_numbers(look, aligned=aligned),
+        outlying={} if impossible else outlying_frames(look),
         garbage_share=share,
         garbage_bends=bent or dominated,
         look=look,
     )
 
 
-def _impossible(findings: list[Finding]) -> bool:
-    return any(one.severity == "impossible" for one in findings)
-
-
 def _numbers(look: Look, *, aligned: bool, unsure: float = 0.03) -> dict[str, float]:
     """Return what was measured; the focal length unless its standard error is above `unsure`."""
-    sample = look.sample
-    values = sample.stored[np.isfinite(sample.stored)]
+    stored = look.stored[np.isfinite(look.stored)]
     found: dict[str, float] = {
-        "frames": float(sample.data.num_frames),
-        "median distance, m": float(np.median(values)) if len(values) else math.nan,
+        "frames": float(look.data.num_frames),
+        "median distance, m": float(np.median(stored)) if len(stored) else math.nan,
         "extent of the poses, m": float(np.linalg.norm(np.ptp(look.poses[:, :3, 3], axis=0))),
-        "pixels on the target, %": 100 * float(sample.masked.mean()),
-        "noise of a pixel, mm": 1e3 * sample.noise,
+        "pixels on the target, %": 100 * float(look.masked.mean()),
+        "noise of a pixel, mm": 1e3 * look.noise,
     }
     if aligned:
         found["flatness of a frame's points, mm"] = 1e3 * look.flatness
-        given = look.as_given
-        if given is not None:
+        if (given := look.as_given) is not None:
             found["distance to the planes after alignment, mm"] = 1e3 * given.misfit
             found["angle to the planes after alignment, deg"] = math.degrees(given.typical_angle)
             found["distances too long by, mm"] = 1e3 * given.constant
-        if look.shape is not None and look.shape["focal"].size_error < unsure:
-            focal = look.shape["focal"]
+        if look.shape is not None and (focal := look.shape["focal"]).size_error < unsure:
             found["focal length should change by, %"] = 100 * float(focal.value[0])
             found["standard error of that change, %"] = 100 * focal.size_error
     return {name: value for name, value in found.items() if math.isfinite(value)}

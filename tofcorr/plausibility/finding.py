@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -20,18 +21,18 @@ class Finding:
     """Something odd about a recording.
 
     Attributes:
-        check: Name of the check that found it.
         severity: How bad it is.
         sentence: What is odd, with a number, its likely cause, and what to do.
         frames: Global numbers of the frames concerned; empty: the recording as a whole.
         spoils: Whether the hand-eye of a fit would be wrong by more than its standard errors say.
+        check: What it is named by; empty: by the check that found it.
     """
 
-    check: str
     severity: Severity
     sentence: str
     frames: tuple[int, ...] = ()
     spoils: bool = False
+    check: str = ""
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -41,6 +42,11 @@ class Finding:
             "sentence": self.sentence,
             "frames": list(self.frames),
         }
+
+
+impossible, doubtful, note = (
+    partial(Finding, severity) for severity in ("impossible", "doubtful", "note")
+)
 
 
 def in_words(frames: tuple[int, ...] | list[int], most: int = 5) -> str:

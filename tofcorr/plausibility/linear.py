@@ -16,7 +16,7 @@ import torch
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS
 from tofcorr.geometry.rays import moved_rays, unambiguous_range
-from tofcorr.plausibility.alignment import Alignment, Scene
+from tofcorr.plausibility.alignment import TINY, Alignment, Scene
 
 # Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
 _KNOTS = 8
@@ -59,14 +59,11 @@ class LinearResiduals:
     """F frames of P pixels, K unknowns.
 
     Args:
-        scene: Poses and planes.
+        scene: Poses, planes and pixels, of which those on their frame's own plane are used.
         found: Their alignment, near which the residuals are linear.
-        rays: Unit rays, shape (F, P, 3).
-        distance: Along them, shape (F, P), metres.
-        used: Which pixels lie on their plane, shape (F, P).
-        bright: What errors by the amplitude follow, shape (F, P, N); None: that of a matt wall,
-            for recordings without. An error by the amplitude changes over a tilted wall as one of
-            focal length or distortion does.
+        amplitude: Which errors follow, shape (F, P); NaN: unknown; None: that of a matt wall, for
+            recordings without. An error by the amplitude changes over a tilted wall as one of focal
+            length or distortion does.
         farthest: Pixels further than this many typical distances from the plane are left out.
         grazing: Cosine of the angle of incidence below which the distance to the plane is not
             computed: a ray along the wall meets it anywhere.
@@ -87,19 +84,17 @@ class LinearResiduals:
         self,
         scene: Scene,
         found: Alignment,
-        rays: np.ndarray,
-        distance: np.ndarray,
-        used: np.ndarray,
-        bright: np.ndarray | None,
+        amplitude: np.ndarray | None,
         *,
         farthest: float = 4.0,
         grazing: float = 0.05,
     ) -> None:
+        rays, used = scene.rays, scene.on_plane
         self.scene, self.rays = scene, rays
         normal_tool, offset_tool = scene.planes_in_tool()
         self.normal = normal_tool @ found.hand_eye[:3, :3]
         offset = normal_tool @ found.hand_eye[:3, 3] + offset_tool
-        d = np.where(used, distance, 1.0)
+        d = np.where(used, scene.distance, 1.0)
         cosine = self.cosine = np.einsum("fpa,fa->fp", rays, self.normal)
         self.residual = cosine * ((1 - found.slope) * d - found.constant) + offset[:, None]
         typical = np.maximum(found.rms, found.misfit)[:, None]
@@ -115,27 +110,19 @@ class LinearResiduals:
         points = rays * d[..., None]
         camera = scene.poses @ found.hand_eye
         self.world = np.einsum("fab,fpb->fpa", camera[:, :3, :3], points) + camera[:, None, :3, 3]
-        if bright is None:
-            amplitude = np.abs(cosine) / d**2
-            median = float(np.median(amplitude[used])) if used.any() else 1.0
-            bright = brightness(np.where(used, amplitude, median), median)
-        x, y, _ = self._on_image
+        if amplitude is None:
+            amplitude = np.where(used, np.abs(cosine) / d**2, np.nan)
+        x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
         turned = np.cross(points, self.normal[:, None])
         shifted = np.broadcast_to(normal_tool[:, None], points.shape)
-        errors = np.stack([*_hats(d, used), x, y, x * x, y * y, x * y], axis=-1)
-        along = cosine[..., None] * np.concatenate([errors, bright], axis=-1)
+        errors = [*_hats(d, used), x, y, x * x, y * y, x * y, *_brightness(amplitude)]
+        along = cosine[..., None] * np.stack(errors, axis=-1)
         self.columns = np.concatenate([turned, shifted, along], axis=-1)
 
     @property
     def rigid(self) -> np.ndarray:
         """The columns of the hand-eye transform: turns and shifts, shape (F, P, 6)."""
         return self.columns[..., :_RIGID]
-
-    @property
-    def _on_image(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """x, y and x^2 + y^2 of the rays (x, y, 1), shape (F, P) each."""
-        x, y = self.rays[..., 0] / self.rays[..., 2], self.rays[..., 1] / self.rays[..., 2]
-        return x, y, x * x + y * y
 
     def with_columns(self, columns: np.ndarray, first: np.ndarray | None = None) -> Self:
         """Return the problem with further unknowns, after all that it has or after `first`."""
@@ -174,7 +161,7 @@ class LinearResiduals:
         columns = np.concatenate([self.columns, *blocks], axis=-1)
         weighted = columns * self.weight[..., None]
         matrix = np.einsum("fpa,fpb->ab", weighted, columns, optimize=True)
-        scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+        scale = 1 / np.sqrt(np.maximum(np.diag(matrix), TINY))
         # The ridge only decides what nothing determines.
         inverse = np.linalg.inv(matrix * scale * scale[:, None] + ridge * np.eye(len(scale)))
         unknowns = -inverse @ (np.einsum("fpa,fp->a", weighted, self.residual) * scale) * scale
@@ -197,18 +184,21 @@ def _hats(d: np.ndarray, used: np.ndarray) -> np.ndarray:
     knots: the knots end at 2 thousandths of the pixels.
     """
     low, high = np.quantile(d[used], [0.002, 0.998]) if used.any() else (0.0, 1.0)
-    place = ((d - low) / max(high - low, 1e-9)).clip(0, 1) * (_KNOTS - 1)
+    place = ((d - low) / max(high - low, TINY)).clip(0, 1) * (_KNOTS - 1)
     return np.maximum(1 - np.abs(place - np.arange(_KNOTS)[:, None, None]), 0.0)
 
 
-def brightness(amplitude: np.ndarray, typical: float, darkest: float = 1e-3) -> np.ndarray:
-    """Return the logarithm of the amplitude and its square, standardised, (F, P, 2).
+def _brightness(amplitude: np.ndarray, darkest: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    """Return the logarithm of the amplitude and its square, standardised, shape (F, P) each.
 
     Amplitudes are cut below at the share `darkest` of the typical one: the logarithm of none is
     infinite.
     """
-    bright = _standardised(np.log(np.maximum(amplitude, darkest * max(typical, 1e-12))))
-    return np.stack([bright, bright**2], axis=-1)
+    known = amplitude[np.isfinite(amplitude)]
+    typical = float(np.median(known)) if len(known) else 1.0
+    filled = np.nan_to_num(amplitude, nan=typical)
+    bright = _standardised(np.log(np.maximum(filled, darkest * max(typical, TINY))))
+    return bright, bright**2
 
 
 def by_conditions(column: Callable[[str], np.ndarray | None], count: int) -> np.ndarray:
@@ -245,7 +235,7 @@ def by_phase(problem: LinearResiduals, frequency: float | None) -> np.ndarray:
 
 
 def _standardised(values: np.ndarray) -> np.ndarray:
-    return (values - values.mean()) / max(float(values.std()), 1e-12)
+    return (values - values.mean()) / max(float(values.std()), TINY)
 
 
 def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] | None:
@@ -278,27 +268,34 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
     scene = problem.scene
     if not scene.moves or len(scene.poses) < _FEWEST_FOR_SHAPE:
         return None
-    x, y, square = problem._on_image
-    # An outward move of the corner by one focal length.
-    outward = square / max(float(square.max()), 1e-12) ** 1.5
-    corner = square / max(float(square.max()), 1e-12)
-    one, zero = np.ones_like(x), np.zeros_like(x)
+    rays, distance = torch.from_numpy(problem.rays), torch.from_numpy(problem.distance)
+    normal = torch.from_numpy(problem.normal)[:, None].expand(rays.shape)
+    x, y = (rays[..., :2] / rays[..., 2:]).unbind(dim=-1)
+    # In units of the corner's.
+    square = (x * x + y * y) / (x * x + y * y).max().clamp(min=TINY)
+    outward = square / (x * x + y * y).max().clamp(min=TINY).sqrt()
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
     # A focal length longer by a share s makes (x, y) shorter by it; the depth stays as it was.
     moves = {
         "focal": [(-x, -y)],
         "aspect": [(-x / 2, y / 2)],
         "centre": [(-one, zero), (zero, -one)],
         "corner": [(-x * outward, -y * outward)],
-        "bend": [(-corner, zero), (zero, -corner)],
+        "bend": [(-square, zero), (zero, -square)],
     }
-    blocks = {name: _moved(problem, own, declared) for name, own in moves.items()}
+    blocks = {
+        name: torch.stack(
+            [moved_rays(rays, normal, distance, move, declared) for move in own], dim=-1
+        ).numpy()
+        for name, own in moves.items()
+    }
     found = {name: problem.added(block)[0] for name, block in blocks.items()}
     other = np.log(problem.rays[..., 2]) * (-1 if declared == "radial" else 1)
     kind = (problem.cosine * problem.distance * other)[..., None]
-    together = [block for name, block in blocks.items() if name != "bend"]
     s, t = places_on_wall(problem)
     bent = np.stack([s * s, t * t, s * t], axis=-1)
-    found["curvature"], *_, found["kind"] = problem.added(bent, *together, kind)
+    del blocks["bend"]
+    found["curvature"], *_, found["kind"] = problem.added(bent, *blocks.values(), kind)
     return found
 
 
@@ -306,22 +303,10 @@ def places_on_wall(problem: LinearResiduals) -> tuple[np.ndarray, np.ndarray]:
     """Return the points' places on the target along two directions, from its middle, metres."""
     along = np.eye(3)[np.abs(problem.scene.normal).mean(0).argmin()]
     first = np.cross(problem.scene.normal, along)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), TINY)
     second = np.cross(problem.scene.normal, first)
     s, t = (np.einsum("fpa,fa->fp", problem.world, one) for one in (first, second))
     return s - np.median(s[problem.used]), t - np.median(t[problem.used])
-
-
-def _moved(
-    problem: LinearResiduals, moves: list[tuple[np.ndarray, np.ndarray]], declared: str
-) -> np.ndarray:
-    """Return what moves of x and y of the rays do to the distances to the planes, (F, P, N)."""
-    rays, distance = torch.from_numpy(problem.rays), torch.from_numpy(problem.distance)
-    normal = torch.from_numpy(problem.normal)[:, None].expand(rays.shape)
-    moved = [(torch.from_numpy(x), torch.from_numpy(y)) for x, y in moves]
-    return np.stack(
-        [moved_rays(rays, normal, distance, one, declared).numpy() for one in moved], axis=-1
-    )
 
 
 def pose_drift(

@@ -260,22 +260,21 @@ def _of_images(
         fewest: Pixels off the mask that most frames must have to say that it is inverted: any
             plane fits the few that a right mask leaves off the target.
     """
-    sample, camera = look.sample, look.sample.recording.camera
+    camera = look.recording.camera
     if camera.height * camera.width < 4:
         return
     number = np.arange(camera.height * camera.width).reshape(camera.height, camera.width)
     for cause, advice, undo in IN_IMAGES.values():
         if (undone := undo(number)).shape == number.shape:
-            pixel = undone.reshape(-1)[sample.pixel]
-            yield cause, advice, look.with_images(sample.stored, pixel)
+            pixel = undone.reshape(-1)[look.pixel]
+            yield cause, advice, look.with_images(look.stored, pixel)
     for cause, advice, undo in IN_DEPTH.values():
-        if np.nanmedian(depth := undo(sample.stored)) >= nearest:
-            yield cause, advice, look.with_images(depth, sample.pixel)
-    off = sample.off_mask
+        if np.nanmedian(depth := undo(look.stored)) >= nearest:
+            yield cause, advice, look.with_images(depth, look.pixel)
+    off = look.off_mask
     if off is not None and (np.isfinite(off).sum(axis=1) >= fewest).mean() > 0.5:
-        assert sample.off_pixel is not None
         yield (
             "the mask is inverted: it is 0 on the target",
             "write 1 where a pixel looks at the target",
-            look.with_images(off, sample.off_pixel),
+            look.with_images(off, look.off_pixel),
         )

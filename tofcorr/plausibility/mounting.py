@@ -8,17 +8,19 @@ no step.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from tofcorr.plausibility.alignment import distinct
+from tofcorr.plausibility.alignment import TINY, distinct
+from tofcorr.plausibility.finding import Finding, doubtful, in_words, note
 from tofcorr.plausibility.linear import LinearResiduals
+from tofcorr.plausibility.look import Look
 
-FEWEST_FOR_STEP = 14
+_FEWEST_FOR_STEP = 14
 """Distinct poses from which offsets and tilts are compared. Chosen: the unknowns of camera and
 error, some twenty, and those of a step leave fourteen of the three numbers of each."""
-FEWEST_FOR_PARTS = 20
+_FEWEST_FOR_PARTS = 20
 """Distinct poses from which two parts are looked for. Chosen: two hand-eye transforms have twelve
 unknowns, and some parts of few frames always differ."""
 
@@ -38,25 +40,46 @@ _LEAST_AT_A_MOMENT = (15.0, 0.7)
 _LEAST_OTHERWISE = (50.0, 0.9)
 
 
-class CameraStep(NamedTuple):
-    """Two parts of the frames, and what a camera elsewhere in one of them explains.
+Parts = tuple[np.ndarray, float, float]
+"""Frames of one part, rising, as indices; how far a camera elsewhere in it moves points off their
+planes, root mean square over the frames of the smaller part, metres; and the share of the sum of
+squares that it explains."""
 
-    Attributes:
-        frames: Indices of the frames of one part, rising.
-        size: How far the step moves points off their planes, root mean square over the frames of
-            the smaller part, metres.
-        ratio: F: what each of its six unknowns takes off, over the variance that is left.
-        share: Share of the sum of squares that it takes off.
-    """
 
-    frames: np.ndarray
-    size: float
-    ratio: float
-    share: float
+def remounting(look: Look) -> Iterator[Finding]:
+    """Does the camera sit at one place on the tool, from some moment on or in any order?"""
+    if look.linear is None or not look.scene.moves:
+        return
+    frames = look.frames[look.scene.known]
+    poses = len(distinct(look.linear.scene.poses))
+    # A drift explains what would be found.
+    drifts = look.drift is not None or poses < _FEWEST_FOR_STEP
+    mounting = None if drifts else Mounting(look.of_camera)
+    if mounting is not None and (found := mounting.moment()):
+        where = f"From frame {frames[found[0][0]]} on, or about there,"
+        cause = "it was knocked or mounted anew, or poses and images are of different times"
+        yield _moved(found, where, cause)
+    elif mounting is not None and (found := mounting.parts()):
+        cause = "some poses are of another frame of the robot, such as its flange"
+        yield _moved(found, f"In {in_words(frames[found[0]].tolist())}", cause)
+    elif (poses := len(distinct(look.scene.poses))) < _FEWEST_FOR_PARTS:
+        unseen = f"some poses are of another frame of the robot ({_FEWEST_FOR_PARTS} are needed)"
+        if poses < _FEWEST_FOR_STEP:
+            unseen = f"the camera moved on the tool ({_FEWEST_FOR_STEP} are needed) or {unseen}"
+        yield note(
+            f"{poses} distinct poses are too few to see whether {unseen}.", check="remounting"
+        )
 
-    def counts(self, least: tuple[float, float]) -> bool:
-        """Whether there surely is one, and whether it matters."""
-        return self.ratio > least[0] and self.share > least[1] and self.size > _LEAST_SIZE
+
+def _moved(found: Parts, where: str, cause: str) -> Finding:
+    _, size, share = found
+    return doubtful(
+        f"{where} the points lie {1e3 * size:.0f} mm elsewhere, as if the camera had moved "
+        f"on the tool (two hand-eye transforms explain {100 * share:.0f} % of what one "
+        f"leaves): {cause}; train the parts apart.",
+        spoils=True,
+        check="remounting",
+    )
 
 
 class Mounting:
@@ -75,7 +98,7 @@ class Mounting:
         chosen = distinct(problem.scene.poses)
         count = np.maximum(problem.used.sum(1), 1)
         weight = np.sqrt(problem.weight.max(1))
-        scale = weight / max(float(np.median(weight)), 1e-12) / np.sqrt(count)
+        scale = weight / max(float(np.median(weight)), TINY) / np.sqrt(count)
         twist = np.concatenate([problem.cosine[..., None], problem.rigid], axis=-1)
         columns, residual, step = (
             np.einsum("f,fpa,fpk->fak", scale, problem.plane_directions, part, optimize=True)[
@@ -95,28 +118,35 @@ class Mounting:
     def _solved(self, columns: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the unknowns of columns under their prior, and its weight."""
         left, count = self._left, columns.shape[1]
-        prior = max(float(left @ left) / len(left), 1e-18) / _PRIOR**2
+        prior = max(float(left @ left) / len(left), TINY) / _PRIOR**2
         held = np.concatenate([columns, math.sqrt(prior) * np.eye(count)])
         return np.linalg.lstsq(held, np.append(left, np.zeros(count)), rcond=None)[0], prior
 
-    def compared(self, chosen: np.ndarray) -> CameraStep:
-        """Compare a step of the distances with one of the camera as well, for chosen frames."""
-        columns = self._beside(_stacked(self.step * chosen[:, None, None]))
-        constant, left = columns[:, :1], self._left
-        before = left - constant @ np.linalg.lstsq(constant, left, rcond=None)[0]
-        square = float(before @ before)
-        unknowns, prior = self._solved(columns)
-        now = left - columns @ unknowns
-        gained = square - float(now @ now) - prior * float(unknowns @ unknowns)
-        freedom = len(left) - self._basis.shape[1] - columns.shape[1]
-        ratio = gained / (columns.shape[1] - 1) / max(float(now @ now) / max(freedom, 1), 1e-18)
-        smaller = max(min(int(chosen.sum()), int((~chosen).sum())), 1)
-        return CameraStep(
-            frames=self.frame[chosen],
-            size=math.sqrt(max(gained, 0.0) / smaller),
-            ratio=ratio if freedom > 0 else 0.0,
-            share=gained / max(square, 1e-18),
-        )
+    def _best(self, choices: Iterable[np.ndarray], least: tuple[float, float]) -> Parts | None:
+        """Compare a step of the distances with one of the camera as well, for chosen frames (N,).
+
+        Returns:
+            The best choice, if it surely is a step of the camera and matters; else None.
+        """
+        best, parts = least[0], None
+        for chosen in choices:
+            columns = self._beside(_stacked(self.step * chosen[:, None, None]))
+            constant, left = columns[:, :1], self._left
+            before = left - constant @ np.linalg.lstsq(constant, left, rcond=None)[0]
+            square = max(float(before @ before), TINY)
+            unknowns, prior = self._solved(columns)
+            now = left - columns @ unknowns
+            gained = square - float(now @ now) - prior * float(unknowns @ unknowns)
+            freedom = len(left) - self._basis.shape[1] - columns.shape[1]
+            variance = max(float(now @ now) / max(freedom, 1), TINY)
+            ratio = gained / (columns.shape[1] - 1) / variance
+            smaller = max(min(int(chosen.sum()), int((~chosen).sum())), 1)
+            size, share = math.sqrt(max(gained, 0.0) / smaller), gained / square
+            if freedom > 0 and ratio > best:
+                best = ratio
+                sure = share > least[1] and size > _LEAST_SIZE
+                parts = (self.frame[chosen], size, share) if sure else None
+        return parts
 
     @property
     def _fewest(self) -> int:
@@ -126,29 +156,26 @@ class Mounting:
         """
         return max(6, len(self.frame) // 6)
 
-    def moment(self, moments: int = 41) -> CameraStep | None:
-        """Return the step at one of some moments that surely is one; None: there is none."""
+    def moment(self, moments: int = 41) -> Parts | None:
+        """Return the parts before and after one of some moments; None: the camera did not move."""
         number, least = len(self.frame), self._fewest
         if number < 2 * least:
             return None
         tried = np.unique(np.linspace(least, number - least, moments).astype(int))
-        found = [self.compared(np.arange(number) >= moment) for moment in tried]
-        best = max(found, key=lambda one: one.ratio)
-        few = number < FEWEST_FOR_PARTS
-        return best if best.counts(_LEAST_OTHERWISE if few else _LEAST_AT_A_MOMENT) else None
+        limits = _LEAST_OTHERWISE if number < _FEWEST_FOR_PARTS else _LEAST_AT_A_MOMENT
+        return self._best((np.arange(number) >= moment for moment in tried), limits)
 
-    def parts(self) -> CameraStep | None:
+    def parts(self) -> Parts | None:
         """Return the two parts of the frames that differ most, in any order; None: none does.
 
         Which frames they are is not known: a few frames drawn at random fix a twist of the camera,
         those that agree best with one of many such twists are one part, and parts and twists are
         then improved in turn.
         """
-        if len(self.frame) < FEWEST_FOR_PARTS:
+        if len(self.frame) < _FEWEST_FOR_PARTS:
             return None
-        found = [one for start in self._starts() if (one := self._improved(start)) is not None]
-        best = max(map(self.compared, found), key=lambda one: one.share, default=None)
-        return best if best is not None and best.counts(_LEAST_OTHERWISE) else None
+        improved = map(self._improved, self._starts())
+        return self._best((one for one in improved if one is not None), _LEAST_OTHERWISE)
 
     def _starts(
         self, twists: int = 100, frames: int = 3, kept: int = 60, ridge: float = 1e-4
@@ -163,7 +190,7 @@ class Mounting:
                 only decides what three frames do not determine.
         """
         number, size = len(self.frame), self.step.shape[-1]
-        step = self.step / np.maximum(np.sqrt(np.square(self.step).mean(axis=(0, 1))), 1e-12)
+        step = self.step / np.maximum(np.sqrt(np.square(self.step).mean(axis=(0, 1))), TINY)
         drawn = np.random.default_rng(number).random((twists, number)).argsort(axis=1)[:, :frames]
         columns = step[drawn].reshape(twists, -1, size)
         matrix = columns.mT @ columns

@@ -79,7 +79,7 @@ def depth_maps(look: Look, across: int = 64, frames: int = 40) -> Figure:
 
     Images of more than so many pixels `across` are thinned.
     """
-    recording = look.sample.recording
+    recording = look.recording
     camera = recording.camera
     step = max(camera.width // across, 1)
     chosen = np.unique(np.linspace(0, recording.num_frames - 1, frames).astype(int))
@@ -98,7 +98,7 @@ def depth_maps(look: Look, across: int = 64, frames: int = 40) -> Figure:
 def poses_from_above(look: Look, found: Inspection) -> Figure:
     """Draw where the tool was and where it looked, along the two widest axes of the world."""
     place = look.poses[:, :3, 3]
-    guess = np.asarray(look.sample.recording.tool_from_camera)
+    guess = np.asarray(look.recording.tool_from_camera)
     axis = (look.poses @ guess)[:, :3, 2]
     first, second = np.sort(np.argsort(-np.ptp(place, axis=0))[:2])
     figure = Figure(figsize=(5.4, 4.2), layout="constrained")
@@ -115,10 +115,10 @@ def poses_from_above(look: Look, found: Inspection) -> Figure:
     )
     axes.update_datalim(place[:, [first, second]] + length * axis[:, [first, second]])
     axes.plot(across, along, "o", color=_BLUE, markersize=4)
-    odd = np.isin(look.sample.frames, list(found.outlying))
+    odd = np.isin(look.sampled, list(found.outlying))
     axes.plot(across[odd], along[odd], "o", color=_RED, markersize=7)
     for k in np.flatnonzero(odd):
-        axes.annotate(str(look.sample.frames[k]), (across[k], along[k]), color=_RED)
+        axes.annotate(str(look.sampled[k]), (across[k], along[k]), color=_RED)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"{'xyz'[first]} of the world, m")
     axes.set_ylabel(f"{'xyz'[second]} of the world, m")

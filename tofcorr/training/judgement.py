@@ -121,8 +121,7 @@ def judge(
         inspection: What was odd about the recordings; its noise of a pixel is the floor.
         limits: What errors are compared with.
     """
-    sample = inspection.look.sample
-    noise, held_out = 1e3 * sample.noise, errors["after"]["test"]["rms"]
+    noise, held_out = 1e3 * inspection.look.noise, errors["after"]["test"]["rms"]
     bare = errors["hand_eye_only"]["test"]["rms"]
     compared = [] if bare is None else [f"{bare:.1f} mm with the hand-eye alone"]
     compared += [f"{noise:.1f} mm noise of a pixel"] if math.isfinite(noise) else []
@@ -134,7 +133,9 @@ def judge(
     if reason is not None:
         return DO_NOT_USE, reason
     reason = next(
-        _reservations(fit, errors, support, inspection, measured, 1e3 * sample.noise_rms, limits),
+        _reservations(
+            fit, errors, support, inspection, measured, 1e3 * inspection.look.noise_rms, limits
+        ),
         None,
     )
     if reason is not None:

@@ -190,7 +190,7 @@ def training_report(
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
     generator = torch.Generator().manual_seed(options.split.seed)
     verdict, reason = judge(fit, errors, support, inspection)
-    noise_mm = 1e3 * inspection.look.sample.noise_rms
+    noise_mm = 1e3 * inspection.look.noise_rms
     found = warnings(fit, errors, support, noise_mm, robot_moves=data.moves)
     rotation = solution.parameters.tool_from_camera[:3, :3]
     used = {*calibration.train.tolist(), *calibration.test.tolist()}

@@ -15,7 +15,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import Alignment, judged
 from tofcorr.plausibility.checks.geometry import agreement
-from tofcorr.plausibility.look import Look, read_sample
+from tofcorr.plausibility.look import Look
 from tofcorr.simulation.options import SimulatorOptions
 
 
@@ -136,7 +136,7 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
     """
     if simulated.moves:
         _refuse_guess(simulated)
-    look = Look(read_sample(Dataset((simulated,))))
+    look = Look(Dataset((simulated,)))
     found = [one.sentence for one in agreement(look) if one.severity == "impossible"]
     if found:
         raise CalibrationDataError(f"{simulated.path}: {' '.join(found)}")

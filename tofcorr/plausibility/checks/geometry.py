@@ -15,12 +15,12 @@ from tofcorr.geometry.rays import (
     unambiguous_range,
     wrapped,
 )
-from tofcorr.plausibility.alignment import distinct, walls_of
-from tofcorr.plausibility.finding import Finding, Severity, in_words
-from tofcorr.plausibility.linear import Estimate, length_scale
+from tofcorr.plausibility.alignment import walls_of
+from tofcorr.plausibility.finding import Finding, doubtful, impossible, in_words, note
+from tofcorr.plausibility.linear import Estimate, length_scale, places_on_wall
 from tofcorr.plausibility.look import Look
 from tofcorr.plausibility.mistakes import WRONG_PLANES, Explanation, best_explanations
-from tofcorr.plausibility.mounting import FEWEST_FOR_PARTS, FEWEST_FOR_STEP, CameraStep
+from tofcorr.plausibility.mounting import remounting
 
 FAR_OFF = 0.1
 """Distance along the ray from its plane from which a pixel is garbage or wrapped, metres. Chosen:
@@ -59,24 +59,22 @@ def lone_walls(look: Look, fewest: int = 3, most: float = 0.5) -> Iterator[Findi
     if few.mean() <= most:
         return
     remedy = "measure the planes, or record the poses of a robot"
-    if look.sample.data.moves:
+    if look.data.moves:
         remedy = "give all frames of one wall the same nx, ny, nz, d and target in frames.csv"
-    yield Finding(
-        "lone_walls",
-        "impossible",
+    yield impossible(
         f"{few.sum()} of {len(wall)} frames have a plane that fewer than {fewest} frames "
         "share, and the planes are to be estimated: a fit could place each wall where its "
         f"frame measured it, and would leave no error at all; {remedy}.",
+        check="lone_walls",
     )
 
 
 def garbage(look: Look, some: float = 0.003) -> Iterator[Finding]:
     """Do the pixels of a frame lie on one plane? A share `some` that does not is worth a note."""
-    if not look.own.known.any():
+    if not look.scene.known.any():
         return
     if look.flatness > _HOPELESS:
         yield Finding(
-            "garbage",
             "impossible" if look.fits else "doubtful",
             f"The points of a frame lie {1e3 * look.flatness:.0f} mm off a plane of their own: the "
             "target is not flat, the mask shows something else, or the depth is decoded "
@@ -87,7 +85,7 @@ def garbage(look: Look, some: float = 0.003) -> Iterator[Finding]:
     if share < some and not bent:
         return
     what = "edges, reflections or other surfaces"
-    frequency, far = look.sample.recording.modulation_frequency, _far_off(look)
+    frequency, far = look.recording.modulation_frequency, _far_off(look)
     if frequency is not None and range_of_wrapped(far[far > 0], frequency) is not None:
         what = f"most by {_range_in_words(frequency)}, so they show a target beyond it"
     advice = "mask them (mask.npy, or `mask: ransac` in the configuration)"
@@ -97,7 +95,6 @@ def garbage(look: Look, some: float = 0.003) -> Iterator[Finding]:
             "says which pixels count; mask.npy does so for every command"
         )
     yield Finding(
-        "garbage",
         "doubtful" if bent else "note",
         f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane "
         f"of their frame: {what}; {advice}.",
@@ -119,20 +116,20 @@ def garbage_of(
     Returns:
         The share, whether they bend a fit, and whether they make most of what a fit minimises.
     """
-    off, known = _far_off(look), look.own.known
+    off = _far_off(look)
     if not len(off):
         return 0.0, False, False
     share = float((off > 0).mean())
-    others = float(np.mean(look.own.flatness[known] ** 2))
+    others = float(np.mean(look.scene.flatness[look.scene.known] ** 2))
     dominated = float(np.mean(off**2)) > of_squares * others
     return share, bool(share >= many or off.mean() >= pull), dominated
 
 
 def _far_off(look: Look, sigmas: float = 8.0) -> np.ndarray:
     """Return how far each usable pixel is off, shape (M,), metres; zero up to the limit."""
-    known = look.own.known
-    off = np.abs(look.own.off_by[known])
-    limit = np.maximum(FAR_OFF, sigmas * look.own.flatness[known])[:, None]
+    known = look.scene.known
+    off = np.abs(look.scene.off_by[known])
+    limit = np.maximum(FAR_OFF, sigmas * look.scene.flatness[known])[:, None]
     return np.where(off > limit, off, 0.0)[np.isfinite(off)]
 
 
@@ -150,26 +147,25 @@ def _wrapping(look: Look, many: float = 0.1) -> Iterator[Finding]:
         many: Share of the pixels that must be whole ranges off the recorded planes to explain why
             frames are: fewer do not put a third of the frames off, and they are garbage.
     """
-    frequency, given, scene = look.sample.recording.modulation_frequency, look.given, look.scene
+    frequency, given, scene = look.recording.modulation_frequency, look.given, look.scene
     if frequency is None or look.planes != "known":
         return
-    cameras = scene.poses @ given.hand_eye
-    rays = np.einsum("fab,fpb->fpa", cameras[:, :3, :3], look.rays[look.usable])
-    height = np.einsum("fa,fa->f", cameras[:, :3, 3], scene.normal) + scene.offset
+    normal, offset = scene.planes_in_tool()
+    height = (normal @ given.hand_eye[:3, 3] + offset)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        true = -height[:, None] / np.einsum("fpa,fa->fp", rays, scene.normal)
-    errors = look.distance[look.usable] - (1 + given.slope) * true - given.constant
+        true = -height / np.einsum("fpa,fa->fp", scene.rays, normal @ given.hand_eye[:3, :3])
+    errors = scene.distance - (1 + given.slope) * true - given.constant
     errors = errors[np.isfinite(errors)]
     share = float(wrapped(errors, frequency).mean()) if len(errors) else 0.0
     if share < many or range_of_wrapped(errors[np.abs(errors) > FAR_OFF], frequency) is None:
         return
     yield Finding(
-        "wrapping",
         "impossible" if look.fits else "doubtful",
         f"{100 * share:.0f} % of the pixels are off the recorded planes by "
         f"{_range_in_words(frequency)}: they show targets beyond it. Mask them, or record nearer "
         "than that.",
         spoils=True,
+        check="wrapping",
     )
 
 
@@ -186,9 +182,7 @@ def normals(look: Look, turned_deg: float = 135.0) -> Iterator[Finding]:
         return
     frames = tuple(look.frames[away].tolist())
     which = "all frames" if len(away) == len(found.angle) else in_words(frames)
-    yield Finding(
-        "normals",
-        "impossible",
+    yield impossible(
         f"The normals of the planes point away from the camera in {which}, by "
         f"{np.degrees(np.median(found.angle[away])):.0f} degrees: write -nx, -ny, -nz, -d.",
         frames,
@@ -209,21 +203,20 @@ def shape(look: Look, far_off: float = 0.03, unsure: float = 0.1) -> Iterator[Fi
         return
     if float(np.median(look.of_camera.frame_rms(look.shape["kind"].left))) > far_off:
         return
-    declared = look.sample.recording.depth_kind
+    declared = look.recording.depth_kind
     other = "z" if declared == "radial" else "radial"
     kind = look.shape["kind"]
     share = float(kind.value[0])
     if kind.size_error < unsure and abs(share - 1) < 0.5:
-        yield Finding(
-            "kind",
-            "impossible",
+        yield impossible(
             f"recording.yaml says depth_kind: {declared}, but walls are bent as if the depth were "
             f"{other} ({100 * share:.0f} % of the difference, standard error "
             f"{100 * kind.size_error:.0f} %); write depth_kind: {other}.",
+            check="kind",
         )
         return
-    camera = list(_wrong_camera(look.shape))
-    yield from camera or _curved(look.shape["curvature"], look.half_width)
+    wrong = _wrong_camera(look.shape)
+    yield from _curved(look, look.shape["curvature"]) if wrong is None else [wrong]
 
 
 _CAMERA: dict[str, tuple[str, float, str]] = {
@@ -259,7 +252,7 @@ border; 2 degrees of the principal point; 0.5 % at the corner bends it by 3 mm p
 
 def _wrong_camera(
     found: dict[str, Estimate], unsure: float = 0.03, other_camera: float = 0.25
-) -> Iterator[Finding]:
+) -> Finding | None:
     """Judge K and distortion, and say what is most surely wrong.
 
     Args:
@@ -267,40 +260,41 @@ def _wrong_camera(
         unsure: Largest standard error at which one is looked at.
         other_camera: Error of the focal length that makes a fit meaningless.
     """
-    wrong = [
-        name
+    surely = {
+        name: one.size / one.size_error
         for name, (_, least, _) in _CAMERA.items()
-        if found[name].size > max(least, _SIGMAS * found[name].size_error)
-        and found[name].size_error < unsure
-    ]
-    if not wrong:
-        return
-    name = max(wrong, key=lambda one: found[one].size / found[one].size_error)
+        if (one := found[name]).size > max(least, _SIGMAS * one.size_error)
+        and one.size_error < unsure
+    }
+    if not surely:
+        return None
+    name = max(surely, key=surely.__getitem__)
     one, (check, _, words) = found[name], _CAMERA[name]
     first, second = 100 * one.value[0], 100 * one.value[-1]
     longer, out = ("longer", "out") if first > 0 else ("shorter", "in")
     better = words.format(size=abs(first), first=first, second=second, longer=longer, out=out)
-    yield Finding(
-        check,
+    return Finding(
         "impossible" if name == "focal" and one.size > other_camera else "doubtful",
         f"Walls fit better if {better} (standard error {100 * one.size_error:.1f} %): are K and "
         "distortion of this camera, of this resolution and crop, and of images as they are here, "
         "rectified or not?",
         spoils=True,
+        check=check,
     )
 
 
-def _curved(found: Estimate, half_width: float, least: float = 0.01) -> Iterator[Finding]:
+def _curved(look: Look, found: Estimate, least: float = 0.01) -> Iterator[Finding]:
     """Judge whether the target itself is bent, by as much as is calibrated (`least`, metres)."""
+    used = look.of_camera.used
+    half_width = float(np.quantile(np.hypot(*places_on_wall(look.of_camera))[used], 0.9))
     curvature = np.abs(found.value)
     sag = curvature * half_width**2
     if ((sag > least) & (curvature > _SIGMAS * found.error)).any():
-        yield Finding(
-            "target",
-            "doubtful",
+        yield doubtful(
             f"The target is bent by {1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of "
             "its middle, from wherever it is seen: use a flat one, or mask what is not.",
             spoils=True,
+            check="target",
         )
 
 
@@ -311,44 +305,11 @@ def drift(look: Look) -> Iterator[Finding]:
         # Frames miss their planes by a quarter of it in the middle of each half.
         meaningless = found.size > 4 * _MEANINGLESS
         yield Finding(
-            "drift",
             "impossible" if meaningless else "doubtful",
             f"From the first frame to the last the points move {1e3 * found.size:.0f} mm off the "
             f"recorded planes (standard error {1e3 * found.size_error:.0f} mm): the poses drift, "
             "or robot, target or camera was moved while recording; record again, or in parts.",
         )
-
-
-def remounting(look: Look) -> Iterator[Finding]:
-    """Does the camera sit at one place on the tool, from some moment on or in any order?"""
-    if look.step is not None:
-        first = look.frames[look.scene.known][look.step.frames[0]]
-        where = f"From frame {first} on, or about there,"
-        cause = "it was knocked or mounted anew, or poses and images are of different times"
-        yield _moved(look.step, where, cause)
-    elif look.parts is not None:
-        frames = look.frames[look.scene.known][look.parts.frames].tolist()
-        cause = "some poses are of another frame of the robot, such as its flange"
-        yield _moved(look.parts, f"In {in_words(frames)}", cause)
-    elif look.linear is not None and look.scene.moves:
-        poses = len(distinct(look.scene.poses))
-        unseen = f"some poses are of another frame of the robot ({FEWEST_FOR_PARTS} are needed)"
-        if poses < FEWEST_FOR_STEP:
-            unseen = f"the camera moved on the tool ({FEWEST_FOR_STEP} are needed) or {unseen}"
-        sentence = f"{poses} distinct poses are too few to see whether {unseen}."
-        if poses < FEWEST_FOR_PARTS:
-            yield Finding("remounting", "note", sentence)
-
-
-def _moved(found: CameraStep, where: str, cause: str) -> Finding:
-    return Finding(
-        "remounting",
-        "doubtful",
-        f"{where} the points lie {1e3 * found.size:.0f} mm elsewhere, as if the camera had moved "
-        f"on the tool (two hand-eye transforms explain {100 * found.share:.0f} % of what one "
-        f"leaves): {cause}; train the parts apart.",
-        spoils=True,
-    )
 
 
 def agreement(
@@ -385,9 +346,7 @@ def agreement(
     else:
         yield from _scale(look)
         if abs(given.constant) > _LARGE_CONSTANT:
-            yield Finding(
-                "agreement",
-                "note",
+            yield note(
                 f"The distances are {1e3 * given.constant:+.0f} mm off on the whole, much for a "
                 "camera: is this the depth of the target, and in metres?",
             )
@@ -421,7 +380,6 @@ def _explained(
     turned = not fatal and math.degrees(given.typical_angle) > turned_deg
     meaningless = given.badness > (_MEANINGLESS if fatal else of_planes) or turned
     return Finding(
-        "agreement",
         "impossible" if meaningless else "doubtful",
         f"{_misfit(look)}, and by {_mm(found.misfit)} if one mistake is undone: {cause}"
         f"{also}; {advice}.",
@@ -434,14 +392,12 @@ def _unexplained(look: Look, excess: float, unusable: float = 0.008) -> Finding:
     known = look.planes == "known"
     unmeasured = "; if nobody measured the planes, use `planes: unknown`" if known else ""
     # Without the frequency, waves of the circular error cannot be told from wrong poses.
-    waves = look.sample.recording.modulation_frequency is None
+    waves = look.recording.modulation_frequency is None
     unstated = "; state `modulation_frequency_hz` if you know it" if waves else ""
     far = int((look.rms > _HOPELESS).sum())
     others = f", {far} of {len(look.rms)} frames more than {_mm(_HOPELESS)}" if far else ""
-    severity: Severity = "impossible" if excess > _HOPELESS else "doubtful"
     return Finding(
-        "agreement",
-        severity,
+        "impossible" if excess > _HOPELESS else "doubtful",
         f"{_misfit(look)}{others}, and no usual mistake explains it: poses, planes or depth are of "
         f"something else, or the poses scatter{unmeasured}{unstated}.",
         spoils=excess > unusable,
@@ -479,12 +435,11 @@ def _scale(
     """
     given = look.given
     if abs(given.slope) > other_unit:
-        yield Finding(
-            "scale",
-            "impossible",
+        yield impossible(
             f"All distances are {100 * given.slope:+.0f} % off against the poses: depth or "
             "poses are in another unit, or scaled.",
             spoils=True,
+            check="scale",
         )
         return
     share, error = given.slope, math.inf
@@ -498,30 +453,25 @@ def _scale(
         return
     uncertain = f" (standard error {100 * error:.2g} %)" if error <= unsure else ""
     yield Finding(
-        "scale",
         "ambiguous" if heads else "note",
         f"The camera's distances are {100 * abs(share):.1f} %{uncertain} "
         f"{'longer' if share > 0 else 'shorter'} than the robot's lengths, and this "
         "recording cannot tell which of them is right; if the camera's are, a fit makes the "
         f"hand-eye translation {1e3 * length:.1f} mm too {'short' if share > 0 else 'long'}.",
+        check="scale",
     )
 
 
 def outlying_poses(look: Look) -> Iterator[Finding]:
     """Does the pose or the plane of single frames disagree with all others?"""
-    off = outlying_frames(look)
-    if not off:
-        return
-    frames = tuple(off)
-    amounts = ", ".join(f"{1e3 * value:.0f}" for value in list(off.values())[:5])
-    yield Finding(
-        "outlying poses",
-        "doubtful",
-        f"{in_words(frames).capitalize()} {'disagrees' if len(frames) == 1 else 'disagree'} with "
-        f"all others by {amounts} mm (median {1e3 * float(np.median(look.rms)):.0f} mm): wrong "
-        "poses, planes or images; train, evaluate and select leave them out.",
-        frames,
-    )
+    if off := outlying_frames(look):
+        amounts = ", ".join(f"{1e3 * value:.0f}" for value in list(off.values())[:5])
+        yield doubtful(
+            f"{in_words(tuple(off)).capitalize()} {'disagrees' if len(off) == 1 else 'disagree'} "
+            f"with all others by {amounts} mm (median {1e3 * float(np.median(look.rms)):.0f} mm): "
+            "wrong poses, planes or images; train, evaluate and select leave them out.",
+            tuple(off),
+        )
 
 
 def outlying_frames(

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from tofcorr.geometry.rays import lens_misses
-from tofcorr.plausibility.alignment import distinct
-from tofcorr.plausibility.finding import Finding, in_words
+from tofcorr.plausibility.alignment import TINY, distinct
+from tofcorr.plausibility.finding import Finding, doubtful, impossible, in_words, note
 from tofcorr.plausibility.look import Look
 from tofcorr.spread import sigma_from_mad
 
@@ -36,37 +36,29 @@ def units(
         too_near: Median distance below which it is impossible: the shortest of any camera.
         too_wide: Largest distance of a pose from the middle of the poses: no arm reaches so far.
     """
-    values = look.sample.stored[np.isfinite(look.sample.stored)]
+    values = look.stored[np.isfinite(look.stored)]
     median = float(np.median(values)) if len(values) else 1.0
     if median > too_far:
         unit = "millimetres" if median > millimetres else "centimetres"
-        yield Finding(
-            "units",
-            "impossible",
+        yield impossible(
             f"The median distance is {median:.4g} m: depth.npy seems to be in {unit}, or to "
-            "hold amplitudes; write metres.",
+            "hold amplitudes; write metres."
         )
     elif median < too_near:
-        yield Finding(
-            "units",
-            "impossible",
+        yield impossible(
             f"The median distance is {1e3 * median:.3g} mm: depth.npy seems to be in "
-            "kilometres, or scaled twice; write metres.",
+            "kilometres, or scaled twice; write metres."
         )
     elif median > far:
-        yield Finding(
-            "units",
-            "doubtful",
+        yield doubtful(
             f"The median distance is {median:.3g} m, far for a wall: is depth.npy in metres?",
         )
     place = look.poses[:, :3, 3]
     extent = float(np.linalg.norm(place - np.median(place, axis=0), axis=1).max())
     if extent > too_wide and look.planes != "ignored":
-        yield Finding(
-            "units",
-            "impossible",
+        yield impossible(
             f"The poses extend over {extent:.4g} m: tx, ty, tz in frames.csv seem to be in "
-            "millimetres; write metres.",
+            "millimetres; write metres."
         )
 
 
@@ -78,21 +70,18 @@ def depth_values(look: Look, empty: float = 0.95, many: float = 0.5) -> Iterator
         empty: Share of an image's pixels without a return from which it counts as empty.
         many: Share of empty frames above which the recording is doubtful.
     """
-    valid = np.isfinite(look.sample.stored)
-    values = look.sample.stored[valid]
+    valid = np.isfinite(look.stored)
+    values = look.stored[valid]
     if not len(values):
-        yield Finding(
-            "depth values",
-            "impossible",
+        yield impossible(
             "No pixel looked at holds a usable distance: depth.npy is NaN or zero there, "
-            "saturated, or the mask is empty.",
+            "saturated, or the mask is empty."
         )
         return
     missing = np.flatnonzero(valid.mean(1) < 1 - empty)
     if len(missing):
-        frames = tuple(look.sample.frames[missing].tolist())
+        frames = tuple(look.sampled[missing].tolist())
         yield Finding(
-            "depth values",
             "doubtful" if len(missing) > many * len(valid) else "note",
             f"Hardly any usable pixel is left in {in_words(frames)}: no return, saturated, or "
             "masked out.",
@@ -125,26 +114,21 @@ def _repeated_or_rounded(
     order = np.argsort(-count)
     share, value = count[order[0]] / len(values), distinct[order[0]]
     if share >= stuck:
-        yield Finding(
-            "depth values",
-            "impossible",
+        yield impossible(
             f"{100 * share:.0f} % of the pixels hold exactly {value:.4g} m: the depth is stuck "
-            "at one value; record again.",
+            "at one value; record again."
         )
         return
     common = count[order[min(20, len(order) - 1)]] / len(values)
     if share >= _COMMON and share >= commoner * common:
-        yield Finding(
-            "depth values",
-            "doubtful",
+        yield doubtful(
             f"{100 * share:.1f} % of the pixels hold exactly {value:.4g} m: the depth is "
-            "clipped, or the value stands for no return; write NaN there.",
+            "clipped, or the value stands for no return; write NaN there."
         )
         return
     step = float(np.diff(distinct).min()) if len(distinct) > 2 else 0.0
     if step >= coarse and np.abs(distinct / step - np.round(distinct / step)).max() <= off_step:
         yield Finding(
-            "depth values",
             "doubtful" if step >= too_coarse else "note",
             f"The depth comes in steps of {1e3 * step:.3g} mm: it was rounded; errors below that "
             "cannot be calibrated pixel by pixel.",
@@ -170,48 +154,38 @@ def stillness(
     poses = look.poses
     number = len(distinct(poses))
     if len(poses) < 2:
-        yield Finding(
-            "stillness", "impossible", "The recording holds one frame; record more poses."
-        )
+        yield impossible("The recording holds one frame; record more poses.")
     elif number == 1:
-        planes = (np.asarray(look.sample.column(name)) for name in ("normal_world", "offset"))
+        planes = (np.asarray(look.column(name)) for name in ("normal_world", "offset"))
         if len(distinct(np.column_stack([*planes]))) == 1:
             yield _still(look, change, relative)
     elif number < fewest:
-        yield Finding(
-            "stillness",
-            "impossible",
+        yield impossible(
             f"The frames have {number} distinct poses; {fewest} at least are needed for a "
-            "hand-eye transform.",
+            "hand-eye transform."
         )
     elif number < few:
-        yield Finding(
-            "stillness",
-            "doubtful",
+        yield doubtful(
             f"Only {number} distinct poses: hand-eye and errors can hardly be told apart; "
-            f"record {few} or more, tilted and at several distances.",
+            f"record {few} or more, tilted and at several distances."
         )
 
 
 def _still(look: Look, change: float, relative: float) -> Finding:
     """Judge a recording in which neither pose nor plane changes."""
-    distance = look.distance[look.usable]
+    distance = look.scene.distance
     distance = np.nanmedian(distance, axis=1) if len(distance) else np.zeros(1)
     moved = float(np.ptp(distance))
-    kind = "same" if look.sample.data.moves else "identity"
+    kind = "same" if look.data.moves else "identity"
     if moved > max(change, relative * float(np.median(distance))):
-        return Finding(
-            "stillness",
-            "impossible",
+        return impossible(
             f"All poses are the {kind} and all frames have one plane, yet the wall's distance "
             f"changes by {1e3 * moved:.0f} mm: the robot's poses were not recorded; write "
-            "world_from_tool of each frame, or the plane of each in the camera's frame.",
+            "world_from_tool of each frame, or the plane of each in the camera's frame."
         )
-    return Finding(
-        "stillness",
-        "impossible",
-        f"All poses are the {kind} and the wall stays where it is: one view determines "
-        "neither distance errors nor a hand-eye transform; record other poses.",
+    return impossible(
+        f"All poses are the {kind} and the wall stays where it is: one view determines neither "
+        "distance errors nor a hand-eye transform; record other poses."
     )
 
 
@@ -227,7 +201,7 @@ def duplicates(
         many: Share of the frames that are copies from which a fit is meaningless.
         same: How far the entries of equal poses may differ.
     """
-    grid, poses = look.sample.grid, look.poses
+    grid, poses = look.grid, look.poses
     first: dict[bytes, int] = {}
     copies = [
         (k, earlier)
@@ -237,15 +211,14 @@ def duplicates(
     ]
     if not copies:
         return
-    frames = tuple(look.sample.frames[[k for k, _ in copies]].tolist())
+    frames = tuple(look.sampled[[k for k, _ in copies]].tolist())
     moved = any(np.abs(poses[k] - poses[earlier]).max() > same for k, earlier in copies)
-    impossible = moved and look.fits and len(copies) > many * len(grid)
+    meaningless = moved and look.fits and len(copies) > many * len(grid)
     cause = ": the frames were written twice"
     if moved:
         cause = ", with another pose: the camera hung or images were paired wrongly"
     yield Finding(
-        "duplicates",
-        "impossible" if impossible else "doubtful",
+        "impossible" if meaningless else "doubtful",
         f"The depth of {in_words(frames)} repeats an earlier frame bit by bit{cause}; remove them.",
         frames,
     )
@@ -254,23 +227,17 @@ def duplicates(
 def stamps(look: Look) -> Iterator[Finding]:
     """Do the timestamps count up, in each recording?"""
     start = 0
-    for recording in look.sample.data.recordings:
+    for recording in look.data.recordings:
         steps = np.diff(recording.frames.timestamp)
         back = start + 1 + np.flatnonzero(steps < 0)
         if len(back):
-            yield Finding(
-                "stamps",
-                "doubtful",
+            yield doubtful(
                 f"timestamp_s goes back {len(back)} times, first at frame {back[0]}: the rows are "
                 "not in the order of time; check that images and poses are paired, and sort them.",
                 tuple(back.tolist()),
             )
         elif len(steps) > 1 and not steps.any():
-            yield Finding(
-                "stamps",
-                "note",
-                "timestamp_s is the same in all frames: nothing can be said of warm-up.",
-            )
+            yield note("timestamp_s is the same in all frames: nothing can be said of warm-up.")
         start += recording.num_frames
 
 
@@ -283,15 +250,15 @@ def amplitude(look: Look, constant: float = 1e-3, same: float = 0.999) -> Iterat
             square of the distance, and by a few percent over any image.
         same: Correlation of amplitude and distance above which one is taken for the other.
     """
-    if look.sample.amplitude is None:
+    if look.amplitude is None:
         return
-    usable = np.isfinite(look.sample.amplitude) & np.isfinite(look.sample.stored)
-    values, depth = look.sample.amplitude[usable], look.sample.stored[usable]
+    usable = np.isfinite(look.amplitude) & np.isfinite(look.stored)
+    values, depth = look.amplitude[usable], look.stored[usable]
     if len(values) < _FEWEST_VALUES:
         return
     low, median, high = np.quantile(values, [0.05, 0.5, 0.95])
     share = float((values >= values.max()).mean())
-    if high - low <= constant * max(median, 1e-12):
+    if high - low <= constant * max(median, TINY):
         sentence = (
             f"The amplitude is {median:.4g} nearly everywhere: it was not measured; remove "
             "amplitude.npy, and use a model without an intensity term."
@@ -308,19 +275,17 @@ def amplitude(look: Look, constant: float = 1e-3, same: float = 0.999) -> Iterat
         )
     else:
         return
-    yield Finding("amplitude", "doubtful", sentence)
+    yield doubtful(sentence)
 
 
 def temperatures(look: Look, fewest: int = 10) -> Iterator[Finding]:
     """Does the camera's temperature change, where at least some frames state it?"""
-    values = look.sample.column("body_temperature")
+    values = look.column("body_temperature")
     known = np.zeros(0) if values is None else values[np.isfinite(values)]
     if len(known) >= fewest and np.ptp(known) == 0:
-        yield Finding(
-            "temperatures",
-            "note",
+        yield note(
             f"body_temperature_c is {known[0]:g} in all frames: the sensor was not read, or the "
-            "camera was warm; temperature terms cannot be estimated.",
+            "camera was warm; temperature terms cannot be estimated."
         )
 
 
@@ -332,17 +297,15 @@ def lens(look: Look, no_ray: float = 0.5) -> Iterator[Finding]:
         no_ray: Distance from a pixel to the image of its own ray from which it has none, pixels:
             where there is one, it is found to 1e-6, and where there is none, it is many pixels off.
     """
-    used = np.isfinite(look.sample.stored)
-    missed = lens_misses(look.sample.recording.camera).reshape(-1).numpy() > no_ray
-    share = float(missed[look.sample.pixel][used].mean()) if used.any() else 0.0
+    used = np.isfinite(look.stored)
+    missed = lens_misses(look.recording.camera).reshape(-1).numpy() > no_ray
+    share = float(missed[look.pixel][used].mean()) if used.any() else 0.0
     if share > 0:
-        yield Finding(
-            "lens",
-            "doubtful",
+        yield doubtful(
             f"About {100 * share:.2g} % of the pixels have no viewing ray: `distortion` in "
             "recording.yaml turns back before it reaches them, so their points are wrong whatever "
             "their depth. Mask them (mask.npy), or calibrate the lens with views of a board that "
-            "reach the corners; the order is k1 k2 p1 p2 k3 k4 k5 k6.",
+            "reach the corners; the order is k1 k2 p1 p2 k3 k4 k5 k6."
         )
 
 
@@ -367,29 +330,22 @@ def exposure(
         changes: Least share of the frames at which the exposure is another one than before: of
             independent exposures half are; targets that only share a name come one after another.
     """
-    times = look.sample.column("integration_time")
+    times = look.column("integration_time")
     recorded = times is not None and np.isfinite(times).all() and np.ptp(times) > 0
-    if look.sample.amplitude is None or recorded:
+    if look.amplitude is None or recorded:
         return
-    level = _brightness(look, look.sample.amplitude)
-    targets = look.sample.data.targets[look.sample.frames]
+    level, targets = _brightness(look, look.amplitude), look.data.targets[look.frames]
     for name in np.unique(targets):
         own = np.flatnonzero((targets == name) & np.isfinite(level))
-        if len(own) < fewest:
+        groups = _two_groups(level[own]) if len(own) >= fewest else None
+        if groups is None:
             continue
-        rising = np.sort(level[own])
-        gap = int(np.argmax(np.diff(rising)))
-        brighter = level[own] > (rising[gap] + rising[gap + 1]) / 2
-        if min(brighter.sum(), (~brighter).sum()) < fewest_of_one:
-            continue
-        high, low = level[own][brighter], level[own][~brighter]
-        apart, spread = high.mean() - low.mean(), np.sqrt((high.var() + low.var()) / 2)
+        brighter, apart, spread = groups
         in_any_order = (brighter[1:] != brighter[:-1]).mean() >= changes
-        if apart >= max(np.log(ratio), clear * spread) and in_any_order:
-            frames = tuple(look.sample.frames[own[brighter]].tolist())
-            yield Finding(
-                "exposure",
-                "doubtful",
+        enough = min(brighter.sum(), (~brighter).sum()) >= fewest_of_one
+        if enough and apart >= max(np.log(ratio), clear * spread) and in_any_order:
+            frames = tuple(look.frames[own[brighter]].tolist())
+            yield doubtful(
                 f"{in_words(frames).capitalize()} see {name} {np.exp(apart):.1f} times as bright "
                 "as the others do: frames of two exposures, whose distances may differ; record "
                 "integration_time_us, or train them apart.",
@@ -399,21 +355,40 @@ def exposure(
 
 
 def _brightness(look: Look, amplitude: np.ndarray, brightest: float = 0.1) -> np.ndarray:
-    """Return the logarithm of how bright each frame is at 1 m and head on, shape (F,).
+    """Return the logarithm of how bright each frame is at 1 m and head on, shape (N,).
 
     That of its brightest tenth: nearly every view of a board shows a bright square.
     """
-    own = look.own
-    cosine = np.abs(np.einsum("fpa,fa->fp", look.rays, np.nan_to_num(own.normal)))
-    used = own.on_plane & np.isfinite(look.distance) & np.isfinite(amplitude) & (cosine > 0)
-    seen = np.where(used, amplitude * look.distance**2 / np.maximum(cosine, 1e-12), 0.0)
+    scene, amplitude = look.scene, amplitude[look.usable]
+    cosine = np.abs(np.einsum("fpa,fa->fp", scene.rays, np.nan_to_num(scene.own_normal)))
+    used = scene.on_plane & np.isfinite(amplitude) & (cosine > 0)
+    seen = np.where(used, amplitude * scene.distance**2 / np.maximum(cosine, TINY), 0.0)
     tenth = (brightest * used.sum(1)).astype(int)
     level = np.sort(seen, axis=1)[:, ::-1][np.arange(len(seen)), tenth]
-    return np.where(own.known & (tenth > 0), np.log(np.maximum(level, 1e-300)), np.nan)
+    return np.where(scene.known & (tenth > 0), np.log(np.maximum(level, TINY)), np.nan)
+
+
+def _two_groups(score: np.ndarray) -> tuple[np.ndarray, float, float] | None:
+    """Part numbers (F,) where they are farthest apart; None: there is one group.
+
+    Returns:
+        Which are high, (F,) bool; the distance of the groups' means; the standard deviation within.
+    """
+    high = score > np.median(score)
+    for _ in range(20):
+        if high.all() or not high.any():
+            return None
+        high = score > (score[high].mean() + score[~high].mean()) / 2
+    spread = np.sqrt((score[high].var() + score[~high].var()) / 2)
+    return high, float(score[high].mean() - score[~high].mean()), float(spread)
 
 
 def two_cameras(
-    look: Look, fewest: int = 16, smaller: float = 0.25, agree: float = 0.95
+    look: Look,
+    fewest: int = 16,
+    smaller: float = 0.25,
+    agree: float = 0.95,
+    apart: float = 2.5,
 ) -> Iterator[Finding]:
     """Is the pattern of the pixels the same in all frames?
 
@@ -424,28 +399,33 @@ def two_cameras(
         fewest: Frames from which two patterns are told apart.
         smaller: Least share of frames that may come from another camera.
         agree: Share of frames on which both halves of the pixels must agree.
+        apart: Least distance of two patterns over their full width: one normal cloud cut in two
+            has 1.3.
     """
-    chosen = np.flatnonzero(look.usable)
-    if look.sample.data.moves:  # Repeats of a pose show the same, whatever it is.
-        first = distinct(look.poses)
-        chosen = first[look.usable[first]]
+    # Repeats of a pose show the same, whatever it is.
+    moves = look.data.moves
+    chosen = distinct(look.scene.poses) if moves else np.arange(len(look.frames))
     pattern = _patterns(look, chosen)
     if pattern is None or len(pattern) < fewest:
         return
     moment = _moment(pattern, max(fewest // 2, math.ceil(smaller * len(pattern))))
-    if moment is not None:
-        group = chosen[moment:]
-    else:
-        one, other = (_groups(pattern[:, half::2]) for half in (0, 1))
-        if one is None or other is None or not smaller <= one.mean() <= 1 - smaller:
-            return
-        if abs((one == other).mean() - 0.5) < agree - 0.5:
+    group = chosen[moment:]
+    if moment is None:
+        halves = []
+        for half in (0, 1):
+            centred = pattern[:, half::2] - pattern[:, half::2].mean(0)
+            groups = _two_groups(centred @ np.linalg.svd(centred, full_matrices=False)[2][0])
+            if groups is None or groups[1] <= 2 * apart * groups[2]:
+                return
+            halves.append(groups[0])
+        one, other = halves
+        if not smaller <= one.mean() <= 1 - smaller or agree > max(
+            (one == other).mean(), (one != other).mean()
+        ):
             return
         group = chosen[one == one[-1]]
-    frames = look.sample.frames[group]
-    yield Finding(
-        "two cameras",
-        "doubtful",
+    frames = look.frames[group]
+    yield doubtful(
         f"The pattern of the pixels' errors is another one in {len(frames)} of {len(chosen)} "
         f"frames, from frame {int(frames.min())} on: frames of two cameras, or of two settings of "
         "one; train them apart.",
@@ -461,7 +441,7 @@ def _patterns(
     None where the frames do not share enough pixels. Residuals are cut at `cut` robust standard
     deviations.
     """
-    pixel, residual = look.sample.pixel[chosen], look.own.off_by[chosen]
+    pixel, residual = look.pixel[look.usable][chosen], look.scene.off_by[chosen]
     if not len(pixel) or not (pixel == pixel[:1]).all():
         return None
     complete = np.isfinite(residual).mean(0) > 0.9
@@ -469,7 +449,7 @@ def _patterns(
         return None
     residual = residual[:, complete]
     residual[np.isnan(residual).all(1)] = 0.0  # A frame without a plane says nothing.
-    rays = look.rays[chosen[0], complete]
+    rays = look.scene.rays[chosen[0], complete]
     x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
     smooth = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
     spread = sigma_from_mad(np.nanmedian(np.abs(residual), axis=1, keepdims=True))
@@ -509,26 +489,7 @@ def _moment(
             pattern[moment:][half::2].mean(0) - pattern[:moment][half::2].mean(0) for half in (0, 1)
         )
         both = float(one @ other)
-        correlation = both / max(math.sqrt(float((one @ one) * (other @ other))), 1e-300)
+        correlation = both / max(math.sqrt(float((one @ one) * (other @ other))), TINY)
         if correlation > best and both > pixels * least**2:
             best, found = correlation, int(moment)
     return found
-
-
-def _groups(pattern: np.ndarray, apart: float = 2.5) -> np.ndarray | None:
-    """Return which of two groups each frame is in, shape (F,), bool; None if there is one.
-
-    `apart` is their least distance over their spread: one normal cloud cut in two has 1.3.
-    """
-    centred = pattern - pattern.mean(0)
-    score = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
-    high = score > np.median(score)
-    for _ in range(20):
-        if high.all() or not high.any():
-            return None
-        high = score > (score[high].mean() + score[~high].mean()) / 2
-    if high.all() or not high.any():
-        return None
-    spread = np.sqrt((score[high].var() + score[~high].var()) / 2)
-    distance = score[high].mean() - score[~high].mean()
-    return high if distance > apart * max(2 * spread, 1e-12) else None
