@@ -1,4 +1,4 @@
-"""The examples of the pages on adding a term, an effect, an importer and a format.
+"""The examples of the pages on adding a term, an effect, an importer, a format and a check.
 
 Each page shows a file, a line of a registry, and Python that uses them.
 """
@@ -15,6 +15,7 @@ END_OF_LIST = {
     "simulation": ")\n\n\ndef _effect",
     "importing": '}\n"""The line of each',
     "correction": ")\n\nFORMATS",
+    "plausibility": ')\n"""Checks that look at values',
 }
 
 # The folder of the package that was imported.

@@ -2,47 +2,43 @@
 
 import math
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset, PlaneChoice, Recordings, opened, resolved_planes
-from tofcorr.plausibility.checks.geometry import (
-    agreement,
-    drift,
-    garbage,
-    garbage_of,
-    lone_walls,
-    normals,
-    outlying_frames,
-    outlying_poses,
-    shape,
-)
-from tofcorr.plausibility.checks.values import (
-    amplitude,
-    depth_values,
-    duplicates,
-    exposure,
-    lens,
-    stamps,
-    stillness,
-    temperatures,
-    two_cameras,
-    units,
-)
+from tofcorr.plausibility.checks.geometry import garbage_of, outlying_frames
 from tofcorr.plausibility.finding import SEVERITIES, Finding, Inspection
 from tofcorr.plausibility.look import Look, PlaneUse
-from tofcorr.plausibility.mounting import remounting
 
-OF_VALUES = (units, depth_values, stillness, duplicates, stamps, amplitude, temperatures, lens)
-"""Those that look at values alone. What they find impossible makes those below pointless."""
+OF_VALUES = (
+    "checks.values:units",
+    "checks.values:depth_values",
+    "checks.values:stillness",
+    "checks.values:duplicates",
+    "checks.values:stamps",
+    "checks.values:amplitude",
+    "checks.values:temperatures",
+    "checks.values:lens",
+)
+"""Checks that look at values alone, `module:function`, in the order in which they are made. What
+they find impossible makes those below pointless."""
 
 OF_GEOMETRY = (
-    *(lone_walls, garbage, normals, shape, drift, remounting, agreement, outlying_poses),
-    *(two_cameras, exposure),
+    "checks.geometry:lone_walls",
+    "checks.geometry:garbage",
+    "checks.geometry:normals",
+    "checks.geometry:shape",
+    "checks.geometry:drift",
+    "mounting:remounting",
+    "checks.geometry:agreement",
+    "checks.geometry:outlying_poses",
+    "checks.values:two_cameras",
+    "checks.values:exposure",
 )
-"""Those that compare depth, poses, planes and camera."""
+"""Checks that compare depth, poses, planes and camera."""
 
 
 def inspect(
@@ -107,12 +103,14 @@ def examine(data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> 
     look = Look(data, planes, fits=fits)
     findings: list[Finding] = []
     aligned = False
-    for check in (*OF_VALUES, *OF_GEOMETRY):
-        if check in OF_GEOMETRY and any(one.severity == "impossible" for one in findings):
+    for place in (*OF_VALUES, *OF_GEOMETRY):
+        if place in OF_GEOMETRY and any(one.severity == "impossible" for one in findings):
             break
-        aligned = check in OF_GEOMETRY
-        name = check.__name__.replace("_", " ")
-        findings += [replace(one, check=one.check or name) for one in check(look)]
+        aligned = place in OF_GEOMETRY
+        module, _, name = place.partition(":")
+        check = getattr(import_module(f"tofcorr.plausibility.{module}"), name)
+        called = name.replace("_", " ")
+        findings += [replace(one, check=one.check or called) for one in check(look)]
     impossible = {one.check for one in findings if one.severity == "impossible"}
     share, bent, dominated = (0.0, False, False) if impossible else garbage_of(look)
     # Each sentence once. Sorting is stable: within a severity the order of the checks stays.
