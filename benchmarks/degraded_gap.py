@@ -33,8 +33,8 @@ from tofcorr.diagnosis.rerun.sensor import expected_images, light_images, sensor
 from tofcorr.diagnosis.rerun.simulator import solution_of
 from tofcorr.diagnosis.sums.noise import (
     FLOOR_ERROR,
-    Neighbours,
     brightness_of,
+    common_of_neighbours,
     estimate_noise,
     gap_weight,
     robust_weights,
@@ -145,7 +145,7 @@ class FramesGap:
         simulated = radial_at(observations, depth)
         known = simulated.isfinite() & (simulated > 0) & self._counted
         residual = torch.where(known, observations.measured - simulated, 0.0)
-        trust = robust_weights(residual, sigma, Neighbours(observations).common(residual))
+        trust = robust_weights(residual, sigma, common_of_neighbours(observations, residual))
         share = trust * gap_weight(sigma) * known
         return Excess.of(observations, residual, share, self._floor_factor * sigma)
 

@@ -11,7 +11,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     left_out_residual,
 )
 from tofcorr.diagnosis.sums.gains import HeldOutSquares
-from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.map_gain import FittedMap
 from tofcorr.diagnosis.sums.study import (
     Study,
     with_poses_reestimated,
@@ -32,9 +32,9 @@ def test_poses_that_scatter_leave_no_pattern_in_the_image(nothing_study: Study) 
     residual = study.system.residual_of((), gls=True)
     left_out = left_out_residual(study, (), study.sums.gls)
     for name, effect in study.candidates.maps.items():
-        found = map_gain(study, effect, residual, left_out)
-        gain = float(found.gain.sum())
-        test = EffectTest(name=name, closed=found.gain, gain=gain, null=found.null, size=1)
+        found = FittedMap(study, effect, residual)
+        gain, null = found.gain(), found.null(left_out)
+        test = EffectTest(name=name, closed=gain, gain=float(gain.sum()), null=null, size=1)
         assert test.p_value > 0.05, name
 
 
@@ -51,7 +51,7 @@ def test_a_map_holds_a_smooth_pattern_whatever_its_size(nothing_study: Study, si
     """The larger it was, the more it once looked like noise that neighbours share."""
     study = with_poses_reestimated(_with_ring(nothing_study, size), ())
     residual = study.system.residual_of((), gls=True)
-    values = map_gain(study, study.candidates.maps["fixed_pattern"], residual).values
+    values = FittedMap(study, study.candidates.maps["fixed_pattern"], residual).values
     assert float(residual @ values / (values @ values)) == pytest.approx(1, abs=0.1)
     noise = float(study.fit.sigma.square().mean())
     left = float((residual - values).square().mean())
@@ -64,7 +64,7 @@ def test_the_values_of_a_map_do_not_depend_on_what_neighbours_share(nothing_stud
     sums = replace(study.sums, dispersion=40.0)
     other = replace(study, system=replace(study.system, sums=sums))
     effect = study.candidates.maps["fixed_pattern"]
-    one, two = (map_gain(each, effect, residual).values for each in (study, other))
+    one, two = (FittedMap(each, effect, residual).values for each in (study, other))
     # The poses' offsets are a little less certain.
     assert float((one - two).norm() / one.norm()) < 0.05
 
@@ -75,7 +75,7 @@ def test_a_map_closes_what_the_model_leaves_when_fitted_again_without_it(
     study = _with_ring(nothing_study, 0.005)
     found = compare_effects(study, ("wiggling",), flips=False)
     residual = study.system.residual_of(("wiggling",), gls=True)
-    values = map_gain(study, study.candidates.maps["fixed_pattern"], residual).values
+    values = FittedMap(study, study.candidates.maps["fixed_pattern"], residual).values
     without = without_map(study, values, {"fixed_pattern"}).system.sums
     left = HeldOutSquares(without.ols, ("wiggling",), study.folds).squares
     torch.testing.assert_close(found.tests["fixed_pattern"].closed, found.squares - left)

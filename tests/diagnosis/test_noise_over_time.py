@@ -13,7 +13,7 @@ from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.structure import noise_floor
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.noise import PixelNoise, RepeatedNoise
+from tofcorr.diagnosis.sums.noise import PixelNoise
 from tofcorr.diagnosis.sums.study import Study
 
 SIGMA = 0.002  # metres
@@ -46,8 +46,8 @@ def _recorded(folder: Path, frames: int) -> Study:
 
 def test_a_filter_over_time_is_seen_in_five_frames_of_a_pose(tmp_path: Path) -> None:
     study = _recorded(tmp_path / "five", 5)
-    repeated = study.fit.noise.repeated
-    assert repeated.least < repeated.ratio < repeated.most
+    least, ratio, most = study.fit.noise.ratios
+    assert least < ratio < most
     # By hand: the mean of 0.7^|i - j| over the pairs of five frames is 0.4855, so that differences
     # alone would say sqrt(1 - 0.4855) = 0.72 of it.
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.05)
@@ -68,8 +68,15 @@ def test_two_frames_of_a_pose_leave_the_noise_open_and_the_residual_decides(
 
 def test_where_repeats_say_more_than_neighbours_allow_either_may_be_right() -> None:
     one = np.ones(1)
-    repeated = RepeatedNoise(frames=6, least=1.2, ratio=1.4, most=1.6, error=0.1)
-    noise = PixelNoise(knots=one, sigma=one, factor=one, repeated=repeated, error=0.05)
+    noise = PixelNoise(
+        knots=one,
+        sigma=one,
+        factor=one,
+        error=0.05,
+        repeats=6,
+        ratios=(1.2, 1.4, 1.6),
+        spread=0.1,
+    )
     # By hand: neighbours allow 1.3 x 1.05, and poses differ by 10 % in what repeats say.
     assert noise.limits(1.3) == pytest.approx((1.08, 1.365, 1.4))
     assert noise.limits(2.0) == pytest.approx((1.08, 1.4, 1.76))

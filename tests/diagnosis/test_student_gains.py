@@ -123,7 +123,7 @@ def test_drawn_scores_have_the_covariance_of_the_generalised_sums() -> None:
     sums = _pose_sums(weighted, layout, plain=plain, pose_sd=pose_sd, dispersion=1.7, scale=0.4)
     expected = sums.gls.gram
     null = NullScores(sums, torch.eye(2, dtype=torch.float64), 4000, 7)
-    drawn = torch.cat(list(null.blocks())).double()
+    drawn = null.scores.double()
     size = drawn.std(2)
     # A covariance of 4000 draws is known to 2 % of the standard deviations' product.
     error = (drawn @ drawn.mT / drawn.shape[2] - expected) / (size[:, :, None] * size[:, None])
@@ -146,15 +146,3 @@ def test_what_an_effect_closes_by_chance_is_what_it_would_close_of_these_scores(
     for own, closed in zip(sums, found, strict=True):
         squares = HeldOutSquares(own, (), folds)
         torch.testing.assert_close(squares.closed("effect").sum(), closed)
-
-
-def test_scores_of_folds_are_added_up_from_blocks(
-    folds: Tensor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(NullScores, "at_once", 3 * (5 + NUM_POSE) * DRAWS)
-    sums = _sums(_columns(torch.Generator().manual_seed(8)), torch.zeros(POSES, VALUES).double())
-    null = _drawn(sums, folds, 8)
-    blocks = list(null.blocks())
-    assert [len(block) for block in blocks] == [3, 3, 3, 1]
-    of_folds = torch.tensordot(folds.float(), torch.cat(blocks), dims=1)
-    torch.testing.assert_close(null.of_folds(), of_folds)

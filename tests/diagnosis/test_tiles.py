@@ -2,7 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import diagnosed_recordings
 import pytest
@@ -14,10 +15,9 @@ from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.linear_system import tile_sums
-from tofcorr.diagnosis.sums.observations import observe
+from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.diagnosis.sums.resampling import cut_into_tiles
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.simulation.effects.saturation import light_of
 
 DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}
@@ -130,8 +130,6 @@ def test_the_light_of_clipped_pixels_is_told_from_dim_ones(
 
 def test_tiles_of_filtered_noise_are_nearly_independent() -> None:
     """Their squares add up to most of the variance of the whole; those of small tiles do not."""
-    matrix = ((40.0, 0.0, 23.5), (0.0, 40.0, 17.5), (0.0, 0.0, 1.0))
-    camera = CameraIntrinsics(width=48, height=36, matrix=matrix)
     generator = torch.Generator().manual_seed(5)
     noise = torch.randn(1, 1000, 36, 48, generator=generator, dtype=torch.float64)
     taps = torch.exp(-0.5 * (torch.arange(-3.0, 4.0).double() / 1.2) ** 2)
@@ -139,10 +137,22 @@ def test_tiles_of_filtered_noise_are_nearly_independent() -> None:
         own = kernel.expand(1000, 1, *kernel.shape)
         noise = torch.nn.functional.conv2d(noise, own, padding="same", groups=1000)
     pixel = torch.arange(36 * 48)
-    one = torch.zeros_like(pixel), pixel, camera, 10, 19, generator
+    camera = SimpleNamespace(width=48, height=36)
+    observations = SimpleNamespace(
+        recording=SimpleNamespace(camera=camera),
+        unit=torch.zeros(1, dtype=torch.int64),
+        frame=torch.zeros_like(pixel),
+        pixel=pixel,
+    )
+    one = (
+        cast("Observations", observations),
+        torch.ones(1).double(),
+        DiagnosisOptions().tests,
+        generator,
+    )
     shares = []
     for filtered in (False, True):
-        tiles = cut_into_tiles(torch.ones(1, dtype=torch.float64), *one, filtered=filtered)
+        tiles = cut_into_tiles(*one, filtered)
         of_tiles = noise.flatten(2)[0][:, tiles.pixels].split(tiles.counts, dim=1)
         sums = torch.stack([values.sum(1) for values in of_tiles])
         shares.append(float(sums.square().sum() / sums.sum(0).square().sum()))

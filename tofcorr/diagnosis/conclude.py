@@ -13,7 +13,6 @@ from tofcorr.diagnosis.findings.gap import (
     resampled,
     stages_of,
 )
-from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import attribute, explained_squares, parts_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.next.advice import minimum_detectable, next_recording
@@ -23,8 +22,6 @@ from tofcorr.diagnosis.report.words import list_causes, list_remarks, write_verd
 from tofcorr.diagnosis.rerun.checks import check_in_simulator, measure_transfer, observables_of
 from tofcorr.diagnosis.rerun.sensor import degraded_stage, fitted_values
 from tofcorr.diagnosis.rerun.simulator import simulator_of, tables_of, whole_patterns
-from tofcorr.diagnosis.sums.study import Study
-from tofcorr.simulation.options import SimulatorOptions
 
 
 def conclude(
@@ -60,6 +57,13 @@ def conclude(
 
     patterns = whole_patterns(study, named, given)
     with_effects = None if rendered else simulator_of(study, named, given)
+    beyond = () if rendered else tables_of(study, named, given).beyond
+    warnings = list(prepared.warnings)
+    if beyond:
+        warnings.append(
+            "simulator_with_effects.yaml lacks these terms of the base model: "
+            f"{', '.join(beyond)}. The simulator has no table for them; the findings include them."
+        )
     closure = transfer = degraded = None
     if options.simulate_anew:
         transfer = measure_transfer(study, named, given, generator, resamples)
@@ -81,7 +85,7 @@ def conclude(
         simulator_kind="fitted" if simulator is None else simulator.kind,
         stages=stages,
         shares=shares,
-        warnings=(*prepared.warnings, *([] if rendered else _warnings(study, named, given))),
+        warnings=tuple(warnings),
         detected=named.tested and (bool(named.names) or remainder.unknown),
         p_value=least_p_value(study, named.first),
         effects=named.names,
@@ -106,14 +110,3 @@ def conclude(
         options=options,
         evidence=Evidence(study=study, named=named, patterns=patterns),
     )
-
-
-def _warnings(study: Study, named: NamedEffects, given: SimulatorOptions | None) -> list[str]:
-    """Name the base terms that simulator_with_effects.yaml cannot hold."""
-    beyond = tables_of(study, named, given).beyond
-    if not beyond:
-        return []
-    return [
-        f"simulator_with_effects.yaml lacks these terms of the base model: {', '.join(beyond)}. "
-        "The simulator has no table for them; the findings include them."
-    ]

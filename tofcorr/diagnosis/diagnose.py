@@ -24,9 +24,6 @@ from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
 
-# Stages that the progress bar counts; writing the report is one more.
-_STAGES = 5
-
 
 def diagnose(
     recording: Recording | Path | str,
@@ -68,10 +65,9 @@ def diagnose(
         options = (
             DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
         )
-        total = _STAGES if stage is None else _STAGES + 1
         with (
             thread_number(options.threads),
-            stages("diagnosing", total) as begin,
+            stages("diagnosing", 5 if stage is None else 6) as begin,
             solvable(recording.path, "diagnosis"),
         ):
             begin("fitting the base model")

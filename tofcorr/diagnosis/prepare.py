@@ -8,29 +8,16 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorption import without_absorbed
 from tofcorr.diagnosis.findings.outliers import Outliers, mask_warning, outliers_of
-from tofcorr.diagnosis.findings.structure import coherence
-from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
+from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import SimulatorError, filtered_inputs, fit_base
-from tofcorr.diagnosis.sums.base_model import (
-    BaseModel,
-    definite_base,
-    map_term,
-    with_numbered_walls,
-)
-from tofcorr.diagnosis.sums.map_gain import map_gain, whole_map
+from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, with_numbered_walls
+from tofcorr.diagnosis.sums.map_gain import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, observe
 from tofcorr.diagnosis.sums.study import Study, build_study, without_map
+from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
-
-# Least prior standard deviation of a fixed pattern, metres, so that its inverse is finite.
-_LEAST_SPREAD = 1e-6
-# Least share of the pixels that a simulator must know to be compared with them. Chosen: with fewer,
-# the comparison would be about another recording.
-_LEAST_KNOWN = 0.1
-# Shares of pixels without a simulated distance above this are worth a warning. Chosen.
-_WORTH_A_WARNING = 0.001
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,16 +53,24 @@ def prepare(
             planes are estimated and cannot be estimated anew; or the simulator's frames cannot be
             compared with it.
     """
-    _check_names(options)
-    _refuse_single_rows(recording)
+    for name in (*(options.catalogue or ()), *options.leave_out):
+        if name not in CATALOGUE:
+            known = ", ".join(sorted(CATALOGUE))
+            raise ConfigError(f"There is no effect '{name}' to consider. Known: {known}.")
+    camera = recording.camera
+    if min(camera.width, camera.height) < 2:
+        raise CalibrationDataError(
+            f"{recording.path}: a diagnosis compares neighbouring pixels, and images of "
+            f"{camera.width}x{camera.height} pixels have none; 2x2 at least are needed."
+        )
     base, warnings = definite_base(recording, options.base)
     observations = with_numbered_walls(observe(recording, options.most_pixels))
     known = None
     if simulator is not None:
-        simulated = simulator.simulate(observations, options)
-        observations, known, left_out = _both_known(observations, simulated)
-        warnings = [*warnings, *simulated.warnings, *left_out]
-    model = BaseModel(observations, base, hand_eye_free=_hand_eye_free(recording, options))
+        observations, known, limits = _both_known(observations, simulator, options)
+        warnings = [*warnings, *limits]
+    free = recording.moves if options.hand_eye == "auto" else options.hand_eye == "estimate"
+    model = BaseModel(observations, base, hand_eye_free=free)
     fit = fit_base(model, observations, known)
     observations = fit.model.observations
     as_given = None if known is None else known.residual(observations)
@@ -86,44 +81,47 @@ def prepare(
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
     outliers = outliers_of(study)
-    found = outliers.warning, mask_warning(observations)
-    warnings = [*warnings, *filter(None, found)]
+    warnings += filter(None, (outliers.warning, mask_warning(observations)))
     return Prepared(
         study=study, warnings=(*warnings, *absorbed), as_given=as_given, outliers=outliers
     )
 
 
-def _refuse_single_rows(recording: Recording) -> None:
-    """Refuse images without neighbours in both directions: most effects differ between pixels."""
-    camera = recording.camera
-    if min(camera.width, camera.height) < 2:
-        raise CalibrationDataError(
-            f"{recording.path}: a diagnosis compares neighbouring pixels, and images of "
-            f"{camera.width}x{camera.height} pixels have none; 2x2 at least are needed."
-        )
-
-
 def _both_known(
-    observations: Observations, simulated: Simulated
+    observations: Observations,
+    simulator: GivenSimulator,
+    options: DiagnosisOptions,
+    *,
+    least_known: float = 0.1,
+    worth_saying: float = 0.001,
 ) -> tuple[Observations, SimulatorError, list[str]]:
-    """Leave out the pixels for which the simulator has no distance; return a warning if many."""
-    known = simulated.error.error.isfinite()
+    """Return the pixels for which a simulator has a distance, its error there, and warnings.
+
+    Args:
+        observations: The pixels of the recording.
+        simulator: The simulator under diagnosis.
+        options: Of the diagnosis.
+        least_known: Least share of the pixels that a simulator must know. Chosen: with fewer, the
+            comparison would be about another recording.
+        worth_saying: Shares of pixels without a simulated distance above this are worth a warning.
+            Chosen.
+    """
+    error, warnings = simulator.simulate(observations, options)
+    known = error.error.isfinite()
     share = float(known.double().mean())
     frames = len(torch.unique(observations.frame[known]))
-    if share < _LEAST_KNOWN or frames < 2:
+    if share < least_known or frames < 2:
         raise CalibrationDataError(
             f"{observations.recording.path}: the simulator has a distance for {100 * share:.1f} % "
             f"of the recording's pixels, in {frames} frames; simulate its poses and targets, or "
             "a range of distances and amplitudes that covers it."
         )
-    if share > 1 - _WORTH_A_WARNING:
-        warnings = []
-    else:
-        warnings = [
+    if share <= 1 - worth_saying:
+        warnings.append(
             f"The simulator has no distance for {100 * (1 - share):.1f} % of the recording's "
             "pixels; they are left out."
-        ]
-    return observations.at(known), simulated.error.at(known), warnings
+        )
+    return observations.at(known), error.at(known), warnings
 
 
 def _with_base_pattern(study: Study) -> Study:
@@ -132,32 +130,16 @@ def _with_base_pattern(study: Study) -> Study:
     Each pixel's value is estimated from the poses of other folds, as with a map that is named. The
     spread `auto` is what the residual has in common in all images.
     """
-    term = map_term(study.fit.model.options)
+    term = study.fit.model.options.pixel_map
     if term is None:
         return study
+    assert isinstance(term, FixedPatternOptions)
     kind = CATALOGUE[term.kind]
     pattern = kind.for_recording(study.inputs)
     assert isinstance(pattern, MapEffect)
     residual = study.system.residual_of(())
-    if term.spread_mm == "auto":
-        spread = max(coherence(study, residual).fixed, 0.0) ** 0.5
-    else:
-        spread = term.spread_mm * 1e-3
-    spread = max(spread, _LEAST_SPREAD)
-    values = map_gain(study, pattern, residual, prior_sd=spread).values
-    whole = whole_map(study, pattern, residual, prior_sd=spread)
-    study = without_map(study, values, {kind.name, *kind.contains})
-    return replace(study, pattern=pattern.with_coefficients(whole))
-
-
-def _hand_eye_free(recording: Recording, options: DiagnosisOptions) -> bool:
-    if options.hand_eye == "auto":
-        return recording.moves
-    return options.hand_eye == "estimate"
-
-
-def _check_names(options: DiagnosisOptions) -> None:
-    for name in (*(options.catalogue or ()), *options.leave_out):
-        if name not in CATALOGUE:
-            known = ", ".join(sorted(CATALOGUE))
-            raise ConfigError(f"There is no effect '{name}' to consider. Known: {known}.")
+    spread = None if term.spread_mm == "auto" else term.spread_mm / 1000
+    # A micrometre at least, so that the inverse of the spread is finite.
+    fitted = FittedMap(study, pattern, residual, prior_sd=spread, least_sd=1e-6)
+    study = without_map(study, fitted.values, {kind.name, *kind.contains})
+    return replace(study, pattern=pattern.with_coefficients(fitted.whole()))

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.gains import HeldOutSquares, NullScores, flipped_gains, student_gains
 from tofcorr.diagnosis.sums.linear_system import NUM_POSE, Sums, tile_sums
-from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.map_gain import FittedMap
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
@@ -268,9 +268,10 @@ def compare_effects(
         residual = study.system.residual_of(chosen, gls=True)
         left_out = left_out_residual(study, chosen, sums.gls) if flips else None
         for name, effect in candidates.maps.items():
-            gain = map_gain(study, effect, residual, left_out)
-            closed[name] = squares.squares - _squares_without(study, chosen, gain.values)
-            gains[name] = torch.cat([gain.gain.sum()[None], gain.null])
+            fitted = FittedMap(study, effect, residual)
+            closed[name] = squares.squares - _squares_without(study, chosen, fitted.values)
+            null = [] if left_out is None else [fitted.null(left_out)]
+            gains[name] = torch.cat([fitted.gain().sum()[None], *null])
             sizes[name] = effect.num_cells(effect.shape)
     tests = {
         name: EffectTest(

@@ -2,11 +2,11 @@
 
 import math
 
-from tofcorr.diagnosis.sums.noise import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
 from tofcorr.plausibility.finding import Inspection, in_words
+from tofcorr.spread import sigma_from_mad
 
 LARGEST_GAP = 0.2
 """Gap, metres, above which no cause is named. Every effect of the catalogue together makes less at
@@ -55,7 +55,7 @@ def _missed(study: Study) -> float:
     square = float(errors.sum() / study.sums.count.sum())
     observations = study.observations
     off = observations.measured - predicted_distance(observations, study.fit.tool_from_camera)
-    spread = float(MAD_TO_SIGMA * (off - off.median()).abs().median())
+    spread = float(sigma_from_mad((off - off.median()).abs().median()))
     if not (math.isfinite(square) and math.isfinite(spread)):
         return math.inf
     return max(math.sqrt(max(square - study.fit.floor**2, 0.0)), spread)

@@ -21,7 +21,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     vary_alike,
 )
 from tofcorr.diagnosis.sums.gains import HeldOutSquares
-from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.map_gain import FittedMap
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import (
     Study,
@@ -185,12 +185,12 @@ def _with_next(
         if name in study.candidates.maps:
             tests, effect = study.options.tests, study.candidates.maps[name]
             members = cause_set(model.last, name, tests.level, tests.set_share)
-            values = map_gain(study, effect, study.system.residual_of(model.with_probes, gls=True))
+            fitted = FittedMap(study, effect, study.system.residual_of(model.with_probes, gls=True))
             larger = replace(
                 larger,
                 map_sets={**model.map_sets, name: members},
-                maps={**model.maps, name: values.values},
-                study=without_map(study, values.values, {name, *effect.contains}),
+                maps={**model.maps, name: fitted.values},
+                study=without_map(study, fitted.values, {name, *effect.contains}),
             )
     larger = _reestimated(larger)
     return name, refined(larger, gap) if len(larger.with_probes) > 1 else larger

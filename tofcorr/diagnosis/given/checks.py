@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.sums.observations import TINY, Observations, predicted_distance
@@ -78,12 +77,15 @@ def refuse_without_truth(
             "a simulator knows its walls: write them to frames.csv."
         )
     pose = torch.from_numpy(simulated.tool_from_camera)
-    truth = predicted_distance(observations, pose)
-    off = _typical(observations.measured - truth)
+    difference = observations.measured - predicted_distance(observations, pose)
+    off = float(difference.abs().nan_to_num(torch.inf).median())
     other = "z" if simulated.depth_kind == "radial" else "radial"
-    rays = ray_directions(simulated.camera).reshape(-1, 3)[observations.pixel]
-    factor = 1 / rays[:, 2] if other == "z" else rays[:, 2]
-    slope = _slope(observations.measured - truth, observations.measured * (factor - 1))
+    cosine = ray_directions(simulated.camera).reshape(-1, 3)[observations.pixel, 2]
+    factor = 1 / cosine if other == "z" else cosine
+    # The slope of a line through the differences of pixels whose plane is known.
+    between = (observations.measured * (factor - 1))[difference.isfinite()]
+    between = between - between.mean()
+    slope = float(between @ difference[difference.isfinite()] / (between @ between).clamp(min=TINY))
     if abs(slope + 1) < slope_tolerance:
         raise CalibrationDataError(
             f"{simulated.path}: its depth differs from its own planes as depth_kind {other} "
@@ -98,30 +100,8 @@ def refuse_without_truth(
         )
 
 
-def _slope(difference: Tensor, between_kinds: Tensor) -> float:
-    """Return the slope of a line through the differences of pixels whose plane is known."""
-    use = difference.isfinite()
-    x, y = between_kinds[use], difference[use]
-    x = x - x.mean()
-    return float((x * y).sum() / x.square().sum().clamp(min=TINY))
-
-
-def _typical(difference: Tensor) -> float:
-    return float(difference.abs().nan_to_num(torch.inf).median())
-
-
-# A tool_from_camera farther than this from where the frames agree with their planes, metres and
-# radians, is not the one that they were rendered with. Chosen: errors of a depth camera move it by
-# millimetres and tenths of a degree.
-_SAME_PLACE, _SAME_ANGLE = 0.05, math.radians(2.0)
-# A transform this far from the true one, metres and radians, is it. Chosen: a tenth of the least
-# gap that matters.
-_EXACT = 1e-4
 # Where `simulation.simulator` keeps its options in a recording.
 _OPTIONS_OF_SIMULATE = "truth/options.yaml"
-# The stated transform counts as wrong only if it leaves this many times the misfit of the best one,
-# and more than this many metres. Chosen: directions that the frames do not determine leave no more.
-_TIMES_WORSE, _LEAST_MISFIT = 4.0, 0.02
 
 
 def refuse_mistaken_geometry(simulated: Recording) -> None:
@@ -140,13 +120,18 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
     found = [one.sentence for one in agreement(look) if one.severity == "impossible"]
     if found:
         raise CalibrationDataError(f"{simulated.path}: {' '.join(found)}")
-    best = look.as_given
-    if best is not None and simulated.moves:
-        _refuse_other_mounting(simulated, look, best)
+    if look.as_given is not None and simulated.moves:
+        _refuse_other_mounting(simulated, look, look.as_given)
 
 
-def _refuse_guess(simulated: Recording) -> None:
-    """Refuse a transform that `tofcorr simulate` wrote as a guess, however close it is."""
+def _refuse_guess(simulated: Recording, *, exact: float = 1e-4) -> None:
+    """Refuse a transform that `tofcorr simulate` wrote as a guess, however close it is.
+
+    Args:
+        simulated: The rendered frames.
+        exact: A transform this far from the true one, metres and radians, is it. Chosen: a tenth of
+            the least gap that matters.
+    """
     path = simulated.path / _OPTIONS_OF_SIMULATE
     if not path.exists():
         return
@@ -155,7 +140,7 @@ def _refuse_guess(simulated: Recording) -> None:
     except ConfigError:  # Not a file of this program: the frames themselves tell.
         return
     shift, turn = se3.apart(true, torch.as_tensor(simulated.tool_from_camera))
-    if max(shift, turn) <= _EXACT:
+    if max(shift, turn) <= exact:
         return
     raise CalibrationDataError(
         f"{simulated.path}: its tool_from_camera is a guess, as a robot's user would make it: "
@@ -165,13 +150,35 @@ def _refuse_guess(simulated: Recording) -> None:
     )
 
 
-def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) -> None:
+def _refuse_other_mounting(
+    simulated: Recording,
+    look: Look,
+    best: Alignment,
+    *,
+    same_m: float = 0.05,
+    same_deg: float = 2.0,
+    least_misfit: float = 0.02,
+    times_worse: float = 4.0,
+) -> None:
+    """Refuse a transform far from where the frames agree with their planes.
+
+    Args:
+        simulated: The rendered frames.
+        look: At them.
+        best: Where they agree.
+        same_m: A transform within this of there, metres, is the one that they were rendered with.
+            Chosen: errors of a depth camera move it by millimetres.
+        same_deg: The same of its rotation, degrees.
+        least_misfit: It is wrong only if it leaves more than this, metres,
+        times_worse: and this many times the misfit of the best one. Chosen: directions that the
+            frames do not determine leave no more.
+    """
     stated = np.asarray(simulated.tool_from_camera)
     shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
-    if shift <= _SAME_PLACE and turn <= _SAME_ANGLE:
+    if shift <= same_m and math.degrees(turn) <= same_deg:
         return
     misfit = judged(look.scene, stated, best.constant, best.slope).misfit
-    if misfit > max(_LEAST_MISFIT, _TIMES_WORSE * best.misfit):
+    if misfit > max(least_misfit, times_worse * best.misfit):
         raise CalibrationDataError(
             f"{simulated.path}: its frames agree with its planes if the camera sits "
             f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "

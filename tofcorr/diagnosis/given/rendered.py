@@ -12,6 +12,7 @@ from weakref import finalize
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
@@ -22,15 +23,14 @@ from tofcorr.diagnosis.given.checks import (
     refuse_other_camera,
     refuse_without_truth,
 )
-from tofcorr.diagnosis.given.elsewhere import has_true_depth, simulated_elsewhere
-from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
+from tofcorr.diagnosis.given.elsewhere import simulated_elsewhere
+from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import SimulatorError
-from tofcorr.diagnosis.sums.noise import PixelNoise, estimate_noise, inverse_square
-from tofcorr.diagnosis.sums.observations import Observations, observe
+from tofcorr.diagnosis.sums.noise import PixelNoise, brightness_of, estimate_noise
+from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import scratch_folder
-from tofcorr.geometry.rays import distance_along_rays, ray_directions
 
 # A frame was rendered at the pose of a recorded one if tool and target differ by no more than this:
 # metres for the position of the tool and the distance of the target's plane, radians for the turn
@@ -41,9 +41,6 @@ _TOLERANCE = 1e-3
 _SAME_POSE = 0.01
 # Relative difference of two equal values of a condition. Chosen: the rounding of a text file.
 _SAME_CONDITION = 1e-5
-# Poses are matched if this share of the recorded frames has a render; otherwise the simulator is
-# taken to have seen other poses. Chosen: with fewer, a render of other poses says more.
-_LEAST_MATCHED = 0.5
 
 
 def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
@@ -56,58 +53,36 @@ def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
         real: The recording.
         simulated: The rendered frames, in any order.
     """
-    here, there = _places(real), _places(simulated)
-    renders = []
-    for frame, place in enumerate(here):
-        away = _difference(place, there)
-        near = np.flatnonzero(away <= min(away.min() + _SAME_POSE, 1.0))
-        renders.append(torch.from_numpy(_alike(real, simulated, frame, near)))
-    return renders
+    away = np.max([cdist(*pair) for pair in zip(_places(real), _places(simulated), strict=True)], 0)
+    found = away <= np.minimum(away.min(1, keepdims=True) + _SAME_POSE, 1.0)
+    alike = [real.frames.target[:, None] == simulated.frames.target]
+    for name in CONDITIONS:
+        own, others = (getattr(recording.frames, name) for recording in (real, simulated))
+        if own is not None and others is not None:
+            limit = _SAME_CONDITION * np.abs(own[:, None])
+            alike.append(np.abs(others - own[:, None]) <= limit)
+    for same in alike:
+        found = np.where((found & same).any(1, keepdims=True), found & same, found)
+    return [torch.from_numpy(np.flatnonzero(row)) for row in found]
 
 
-def _places(recording: Recording) -> np.ndarray:
-    """Return position and rotation of the tool, normal and distance of the plane there, (F, 16)."""
+def _places(recording: Recording) -> list[np.ndarray]:
+    """Return position and turn of the tool, and normal and distance of the plane there, (F, ...).
+
+    Unit: the tolerance.
+    """
     pose = recording.frames.world_from_tool
     normal, offset = (values.numpy() for values in planes_in_tool(recording))
-    return np.concatenate(
-        [pose[:, :3, 3], offset[:, None], pose[:, :3, :3].reshape(-1, 9), normal], axis=1
-    )
-
-
-def _difference(place: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the largest difference in units of the tolerance, shape (S,)."""
-    apart = others - place
     # A turn by a small angle changes a rotation matrix by sqrt(2) times the angle.
-    sizes = [
-        np.linalg.norm(apart[:, :3], axis=1),
-        np.abs(apart[:, 3]),
-        np.linalg.norm(apart[:, 4:13], axis=1) / np.sqrt(2),
-        np.linalg.norm(apart[:, 13:], axis=1),
-    ]
-    return np.max(sizes, axis=0) / _TOLERANCE
-
-
-def _alike(real: Recording, simulated: Recording, frame: int, near: np.ndarray) -> np.ndarray:
-    """Keep the renders whose target, and then each condition, agree; all where none agrees."""
-    tables = real.frames, simulated.frames
-    agree = [tables[1].target[near] == tables[0].target[frame]]
-    for name in CONDITIONS:
-        own, others = (getattr(table, name) for table in tables)
-        if own is not None and others is not None:
-            apart = np.abs(others[near] - own[frame])
-            agree.append(apart <= _SAME_CONDITION * abs(float(own[frame])))
-    kept = np.ones(len(near), dtype=bool)
-    for same in agree:
-        if (kept & same).any():
-            kept &= same
-    return near[kept]
+    turn = pose[:, :3, :3].reshape(-1, 9) / np.sqrt(2)
+    return [part / _TOLERANCE for part in (pose[:, :3, 3], offset[:, None], turn, normal)]
 
 
 def repeats_of(recording: Recording) -> np.ndarray:
     """Return a number for each frame without a pose_id; renders of one pose share it, (F,)."""
     table = recording.frames
     _, target = np.unique(table.target, return_inverse=True)
-    rows = [np.round(_places(recording) / (_SAME_POSE * _TOLERANCE)), target[:, None]]
+    rows = [np.round(np.concatenate(_places(recording), axis=1) / _SAME_POSE), target[:, None]]
     if table.integration_time is not None:
         rows.append(np.round(np.log(table.integration_time) / _SAME_CONDITION)[:, None])
     keys = np.nan_to_num(np.concatenate(rows, axis=1), nan=-1.0)
@@ -131,20 +106,23 @@ class RenderedSimulator(GivenSimulator):
         del recording
         return self.recording
 
-    def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
+    def simulate(
+        self, observations: Observations, options: DiagnosisOptions
+    ) -> tuple[SimulatorError, list[str]]:
         """Compare pixel by pixel at the same poses; at others, through the covariates."""
         refuse_other_camera(observations.recording, self.recording)
         frames = observe(self.recording, options.most_pixels)
         if self.recording.frames.pose_id is None:
             frames = replace(frames, unit=torch.from_numpy(repeats_of(self.recording)))
-        if not has_true_depth(self.recording):
+        if self.recording.true_depth is None:
             refuse_without_truth(self.recording, frames)
             refuse_mistaken_geometry(self.recording)
         pose = torch.from_numpy(self.recording.tool_from_camera)
         noise = estimate_noise(frames, pose)
         matches = match_frames(observations.recording, self.recording)
+        # Where half of the recorded frames have no render, renders of other poses say more.
         missing = sum(len(found) == 0 for found in matches)
-        if 1 - missing / len(matches) < _LEAST_MATCHED:
+        if missing > len(matches) / 2:
             return simulated_elsewhere(frames, observations, options)
         error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
         warning = (
@@ -152,7 +130,7 @@ class RenderedSimulator(GivenSimulator):
             "rendered (no pose within 1 mm and 1 mrad); they are left out."
         )
         known = SimulatorError.exact(error, pose, sigma)
-        return Simulated(known, (warning,) if missing else ())
+        return known, [warning] if missing else []
 
 
 def _pixel_by_pixel(
@@ -164,36 +142,24 @@ def _pixel_by_pixel(
     differently changes nothing.
     """
     pose = torch.from_numpy(frames.recording.tool_from_camera)
-    world_from_camera = frames.facts.world_from_tool @ pose
-    rays = ray_directions(frames.recording.camera).reshape(-1, 3)
-    usable, images = frames.usable, frames.amplitude_images
-    full = frames.recording.saturation_amplitude
-    if full is not None and images is not None:
-        usable &= images < full
-    error = torch.full_like(real.measured, torch.nan)
-    sigma = torch.zeros_like(real.measured)
-    for frame, (start, end) in enumerate(real.frame_ends):
-        renders = matches[frame]
-        if end == start or len(renders) == 0:
-            continue
-        pixel = real.pixel[start:end].repeat(len(renders))
-        source = renders.repeat_interleave(end - start)
-        truth = distance_along_rays(
-            rays[pixel], source, world_from_camera, frames.facts.normal_world, frames.facts.offset
-        )
-        simulated = frames.distance_images.flatten(1)[source, pixel].double()
-        use = usable.flatten(1)[source, pixel] & (truth > 0)
-        bright = inverse_square(simulated)
-        if images is not None:
-            bright = images.flatten(1)[source, pixel].double()
-        spread = noise.at(bright, source)
-        shape = (len(renders), end - start)
-        count = use.reshape(shape).sum(0)
-        total = torch.where(use, simulated - truth, 0.0).reshape(shape).sum(0)
-        squares = torch.where(use, spread**2, 0.0).reshape(shape).sum(0)
-        error[start:end] = total / count  # 0 / 0: no render shows this pixel.
-        sigma[start:end] = (squares.sqrt() / count).nan_to_num(0.0)
-    return error, sigma
+    row, source = [], []
+    for renders, (start, end) in zip(matches, real.frame_ends, strict=True):
+        row.append(torch.arange(start, end).repeat(len(renders)))
+        source.append(renders.repeat_interleave(end - start))
+    row = torch.cat(row)
+    seen = frames.choosing(torch.cat(source), real.pixel[row])
+    truth, spread = predicted_distance(seen, pose), noise.at(brightness_of(seen), seen.frame)
+    usable, full = frames.usable, frames.recording.saturation_amplitude
+    if full is not None and frames.amplitude_images is not None:
+        usable &= frames.amplitude_images < full
+    use = usable.flatten(1)[seen.frame, seen.pixel] & (truth > 0)
+
+    def total(values: Tensor) -> Tensor:
+        return torch.zeros_like(real.measured).index_add(0, row, torch.where(use, values, 0.0))
+
+    count = total(torch.ones_like(truth))
+    error = total(seen.measured - truth) / count  # 0 / 0: no render shows this pixel.
+    return error, (total(spread**2).sqrt() / count).nan_to_num(0.0)
 
 
 _KEYS = ("depth", "amplitude", "tool_from_camera")
@@ -221,7 +187,9 @@ class PythonSimulator(GivenSimulator):
             self._rendered = self.rendered(recording)
         return self._rendered.recording
 
-    def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
+    def simulate(
+        self, observations: Observations, options: DiagnosisOptions
+    ) -> tuple[SimulatorError, list[str]]:
         """Call the function, and compare its frames pixel by pixel."""
         self._rendered = self.rendered(observations.recording)
         with _refused_by_name(self._rendered.recording.path):

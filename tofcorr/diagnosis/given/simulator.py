@@ -1,7 +1,6 @@
 """The interface of a simulator under diagnosis."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from tofcorr.data.recording import Recording
@@ -13,19 +12,6 @@ from tofcorr.simulation.options import SimulatorOptions
 SimulatorKind = Literal["given", "rendered", "fitted"]
 """`given`: options of the built-in simulator; `rendered`: frames of any other; `fitted`: none was
 named, so that a simulator is fitted to the recording."""
-
-
-@dataclass(frozen=True)
-class Simulated:
-    """What a simulator says of the chosen pixels.
-
-    Attributes:
-        error: The error it makes there.
-        warnings: What limits the comparison, a sentence each.
-    """
-
-    error: SimulatorError
-    warnings: tuple[str, ...] = ()
 
 
 class GivenSimulator(ABC):
@@ -52,8 +38,13 @@ class GivenSimulator(ABC):
         return None
 
     @abstractmethod
-    def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
+    def simulate(
+        self, observations: Observations, options: DiagnosisOptions
+    ) -> tuple[SimulatorError, list[str]]:
         """Return the error that the simulator makes in the chosen pixels of a recording.
+
+        Returns:
+            The error, and what limits the comparison, a sentence each.
 
         Raises:
             CalibrationDataError: The simulator cannot be compared with the recording.

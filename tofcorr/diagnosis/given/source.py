@@ -6,7 +6,7 @@ from typing import Any
 
 from tofcorr.data.recording import HEADER_FILE, Recording
 from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
-from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
+from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.rerun.simulator import twin_distance
 from tofcorr.diagnosis.sums.base_fit import SimulatorError
@@ -34,13 +34,15 @@ class BuiltInSimulator(GivenSimulator):
         """What is run."""
         return self._options
 
-    def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
+    def simulate(
+        self, observations: Observations, options: DiagnosisOptions
+    ) -> tuple[SimulatorError, list[str]]:
         """Run the simulator at the recording's poses."""
         del options
         pose = default_hand_eye(self._options, observations.recording)
         distance = twin_distance(observations, self._options, pose)
-        error = SimulatorError.exact(distance - predicted_distance(observations, pose), pose)
-        return Simulated(error=error)
+        error = distance - predicted_distance(observations, pose)
+        return SimulatorError.exact(error, pose), []
 
 
 Simulator = (

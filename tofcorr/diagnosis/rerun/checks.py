@@ -375,7 +375,7 @@ def _error(study: Study, trained: CalibrationModel) -> Tensor:
     """Return the error that a correction predicts for the measured pixels, shape (M,), metres."""
     observations = study.observations
     shape = observations.distance_images.shape[1:]
-    conditions = observations.conditions()
+    conditions = observations.conditions
     error = torch.full_like(observations.measured, torch.nan)
     for frame, (start, end) in enumerate(observations.frame_ends):
         measured = torch.full((shape[0] * shape[1],), torch.nan, dtype=torch.float64)

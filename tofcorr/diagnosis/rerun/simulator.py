@@ -14,7 +14,7 @@ from tofcorr.diagnosis.findings.absorption import fitted_coefficients
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.base_model import BaseModel
-from tofcorr.diagnosis.sums.map_gain import map_spread, pixel_weight, whole_map
+from tofcorr.diagnosis.sums.map_gain import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.base import SignalTerm
@@ -86,10 +86,11 @@ def error_tables(study: Study, coefficients: Tensor, already: MeasuredErrorOptio
     """
     model, start = study.fit.model, 1
     numbered: list[Numbered] = []
-    for term in (*model.signal_terms, *model.pixel_terms, *model.condition_terms):
+    for term in model.terms:
         numbered.append((term, torch.arange(start, start + len(term.symbols))))
         start += len(term.symbols)
-    count, pixels = len(model.signal_terms), len(model.pixel_terms)
+    count = len(model.error_model.signal_terms)
+    pixels = len(model.error_model.pixel_terms)
     by_distance, by_amplitude, variable, beyond = _sorted(study, numbered[:count], already)
     beyond = [*numbered[count + pixels :], *beyond]
 
@@ -242,7 +243,8 @@ def fitted_effects(
             values = patterns.get(name)
             if values is None:
                 # Estimated from all poses; cross-fitted values were subtracted.
-                values = whole_map(study, effect, study.system.residual_of(named.columns))
+                residual = study.system.residual_of(named.columns)
+                values = FittedMap(study, effect, residual).whole()
             effects.append(effect.with_coefficients(values))
     return effects
 
@@ -445,10 +447,10 @@ def _of_all_pixels(
     observations = study.observations
     camera = observations.recording.camera
     others = replace(named, names=tuple(name for name in named.names if name != effect.name))
-    spread = map_spread(study, effect, study.system.residual_of(named.columns))
+    spread = FittedMap(study, effect, study.system.residual_of(named.columns)).prior_sd
     frames, usable = simulated_frames(observations.recording), observations.usable
     weights = torch.zeros(observations.num_frames, dtype=torch.float64)
-    weights = weights.index_add(0, observations.frame, pixel_weight(study))
+    weights = weights.index_add(0, observations.frame, study.fit.weight)
     weights = weights / torch.bincount(observations.frame, minlength=len(weights)).clamp(min=1)
     states = twin_frames(
         simulator_of(study, others, given),

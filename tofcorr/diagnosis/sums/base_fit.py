@@ -8,17 +8,15 @@ they look at images without it.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.base_model import BaseModel
+from tofcorr.diagnosis.sums.base_model import BaseModel, with_planes
 from tofcorr.diagnosis.sums.noise import (
-    MAD_TO_SIGMA,
-    Neighbours,
     PixelNoise,
     brightness_of,
+    common_of_neighbours,
     estimate_noise,
     gap_weight,
     robust_weights,
@@ -34,6 +32,7 @@ from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, with_
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.spread import sigma_from_mad
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,15 +79,6 @@ class SimulatorError:
         return observations.measured - predicted - self.error
 
 
-def first_guesses(observations: Observations, simulator: SimulatorError | None) -> list[Tensor]:
-    """Return hand-eye transforms to start from; the first is the one to hold where none is free."""
-    recording = observations.recording
-    own = torch.eye(4, dtype=torch.float64)
-    if recording.moves:
-        own = torch.from_numpy(recording.tool_from_camera)
-    return [own] if simulator is None else [simulator.tool_from_camera, own]
-
-
 def closed_form(observations: Observations, *, least_singular_value: float = 0.2) -> list[Tensor]:
     """Solve n . (R D v + t) + d = 0 for the entries of R and t, then make R a rotation.
 
@@ -114,31 +104,12 @@ def closed_form(observations: Observations, *, least_singular_value: float = 0.2
     return [se3.assemble(rotation, shift)]
 
 
-def quarter_turns(guess: Tensor) -> list[Tensor]:
-    """Return a hand-eye transform turned about the optical axis by one, two and three quarters."""
-    turn = torch.tensor([0, 0, 0, 0, 0, torch.pi / 2], dtype=torch.float64)
-    return [guess @ se3.exp(quarter * turn) for quarter in (1, 2, 3)]
-
-
-# Pixels of all but the last steps, and Gauss-Newton steps of the search for a start. Chosen for
-# speed: so many determine a model of tens of columns far better than its robust weights need.
-_COARSE_PIXELS, _COARSE_STEPS = 20_000, 12
-# A start whose mean absolute residual is below this, metres, is accepted without trying others.
-# Chosen: above what depth errors leave, below what a wrong hand-eye transform leaves.
-_GOOD_START = 0.015
-# Another start replaces the best one if its loss is below this share of the best. Chosen.
-_BETTER_START = 0.9
-# Most Gauss-Newton steps from the best start with few pixels, and from there with all. Chosen; both
-# starts are already close.
-_FINE_STEPS, _LAST_STEPS = 6, 2
+# Pixels of all but the last steps. Chosen for speed: so many determine a model of tens of columns
+# far better than its robust weights need.
+_COARSE_PIXELS = 20_000
 # Prior standard deviation around the start, metres and radians, in undetermined directions. Chosen:
 # what a ruler and a protractor give.
 _START_SD = 0.05
-# Iterations end when a step moves no pixel by more than this, metres. Chosen, far below any noise;
-# and for a start, which the next steps improve, far below what they move.
-_SMALL_STEP, _SMALL_COARSE_STEP = 1e-7, 1e-4
-# Longest step of the hand-eye transform, metres and radians. Chosen.
-_LONGEST_STEP = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,6 +139,11 @@ class BaseFit:
     known: SimulatorError | None = None
 
     @cached_property
+    def weight(self) -> Tensor:
+        """Inverse variance of each pixel's own noise, with its robust weight, (M,), 1 / m^2."""
+        return self.trust / self.sigma**2
+
+    @cached_property
     def share(self) -> Tensor:
         """Weight of each pixel in a gap in millimetres, 0 to 1, shape (M,).
 
@@ -194,93 +170,88 @@ def fit_base(
     """
     known = torch.zeros_like(observations.measured) if simulator is None else simulator.error
     few = slice(None, None, max(1, len(known) // _COARSE_PIXELS))
-    model, start = _best_start(
-        model.on(observations), known, first_guesses(observations, simulator), few
-    )
-    coarse = model.on(model.observations.at(few))
+    recording, own = observations.recording, torch.eye(4, dtype=torch.float64)
+    if recording.moves:
+        own = torch.from_numpy(recording.tool_from_camera)
+    guesses = [own] if simulator is None else [simulator.tool_from_camera, own]
+    coarse, start = _best_start(model.on(observations.at(few)), known[few], guesses)
+    model = model.on(with_planes(observations, coarse.observations.facts))
     brightness = brightness_of(observations)
     noise = estimate_noise(model.observations, start)
-    own = noise.at(brightness, observations.frame)
-    sigma = own if simulator is None else (own**2 + simulator.sigma**2).sqrt()
-    coefficients = _descend(coarse, known[few], start, 1, sigma[few] ** -2).coefficients
-    first = _Found(model, start, coefficients).residual(known)
-    groups = Neighbours(observations)
-    common = groups.common(first)
-    noise = with_residuals(noise, brightness, observations.frame, (first - common) * own / sigma)
+    alone = noise.at(brightness, observations.frame)
+    sigma = alone if simulator is None else (alone**2 + simulator.sigma**2).sqrt()
+    *_, coefficients = _descend(coarse, known[few], start, 1, sigma[few] ** -2)
+    first = model.residual(start, coefficients) - known
+    common = common_of_neighbours(observations, first)
+    deviation = (first - common) * alone / sigma
+    noise = with_residuals(noise, brightness, observations.frame, deviation)
     # Residuals hold both noises; the simulator's was extrapolated to the dark as the camera's was.
-    sigma = sigma * noise.at(brightness, observations.frame) / own
-    trust = robust_weights(first, sigma, common)
-    found = _descend(coarse, known[few], start, _FINE_STEPS, (trust / sigma**2)[few])
-    found = found._replace(model=model.with_walls_of(found.model))
-    residual = found.residual(known)
-    trust = robust_weights(residual, sigma, groups.common(residual))
-    found = _descend(found.model, known, found.pose, _LAST_STEPS, trust / sigma**2)
-    residual = found.residual(known)
+    sigma = sigma * noise.at(brightness, observations.frame) / alone
+    weight = robust_weights(first, sigma, common) / sigma**2
+    coarse, pose, coefficients = _descend(coarse, known[few], start, 6, weight[few])
+    model = model.on(with_planes(observations, coarse.observations.facts))
+    # Both starts are already close: six steps with few pixels, and two with all.
+    residual = model.residual(pose, coefficients) - known
+    trust = robust_weights(residual, sigma, common_of_neighbours(observations, residual))
+    model, pose, coefficients = _descend(model, known, pose, 2, trust / sigma**2)
+    residual = model.residual(pose, coefficients) - known
     shared = shared_noise(observations, residual, sigma, trust)
     if simulator is None:
-        shared = with_level_of_images(shared, found.model.observations, noise, found.residual_on)
+        shared = with_level_of_images(
+            shared,
+            model.observations,
+            noise,
+            lambda others: model.on(others).residual(pose, coefficients),
+        )
     held = noise.held_to_neighbours(shared.level, shared.striped and shared.from_repeats)
-    sigma = sigma * float(held.sigma[0] / noise.sigma[0])
     return BaseFit(
-        model=found.model,
-        tool_from_camera=found.pose,
-        coefficients=found.coefficients,
+        model=model,
+        tool_from_camera=pose,
+        coefficients=coefficients,
         residual=residual,
         noise=held,
-        sigma=sigma,
+        sigma=sigma * float(held.sigma[0] / noise.sigma[0]),
         trust=trust,
         shared=shared,
         known=simulator,
     )
 
 
-class _Found(NamedTuple):
-    """Where a descent ended: the model with its walls moved, hand-eye transform, coefficients."""
-
-    model: BaseModel
-    pose: Tensor
-    coefficients: Tensor
-
-    def residual(self, known: Tensor) -> Tensor:
-        """Return measured less fitted, shape (M,), metres."""
-        observations = self.model.observations
-        distance = predicted_distance(observations, self.pose)
-        error = self.model.error_columns(distance) @ self.coefficients
-        return observations.measured - known - distance - error
-
-    def residual_on(self, observations: Observations) -> Tensor:
-        """Return measured less fitted of other pixels of these frames, metres."""
-        other = self._replace(model=self.model.on(observations))
-        return other.residual(torch.zeros_like(observations.measured))
-
-
 def _best_start(
-    model: BaseModel, known: Tensor, guesses: list[Tensor], few: slice
+    model: BaseModel, known: Tensor, guesses: list[Tensor], *, good: float = 0.015
 ) -> tuple[BaseModel, Tensor]:
-    """Descend from several starts, with few pixels; return the end of the lowest loss."""
-    observations = model.observations
-    if not model.num_geometry:
-        return model, guesses[0]
-    thin, known = observations.at(few), known[few]
-    coarse = model.on(thin)
+    """Descend from several starts; return the end of the lowest loss, the model with its walls.
+
+    Args:
+        model: What to fit, on some pixels.
+        known: Error that is known already, shape (M,), metres.
+        guesses: Hand-eye transforms to start from; the first is the one to hold where none is free.
+        good: A start whose mean absolute residual is below this, metres, is accepted without trying
+            others. Chosen: above what depth errors leave, below what a wrong hand-eye transform
+            leaves.
+    """
     starts = guesses[:1]
     if model.hand_eye_free:
-        starts = [*guesses, *closed_form(thin), *quarter_turns(guesses[-1])]
-    best, best_loss = _Found(coarse, guesses[0], torch.zeros(0)), float("inf")
-    for start in starts:
-        found = _descend(coarse, known, start, _COARSE_STEPS, None)
-        residual = found.residual(known)
-        loss = float(residual.abs().nan_to_num(1e3).clamp(max=1.0).mean())
-        if loss < _BETTER_START * best_loss:
-            best, best_loss = found, loss
-        if best_loss < _GOOD_START:
+        # The last guess may be turned about the optical axis by one, two or three quarters.
+        quarter = torch.tensor([0, 0, 0, 0, 0, torch.pi / 2], dtype=torch.float64)
+        turned = [guesses[-1] @ se3.exp(number * quarter) for number in (1, 2, 3)]
+        starts = [*guesses, *closed_form(model.observations), *turned]
+    best, best_loss = (model, guesses[0]), float("inf")
+    for start in starts if model.num_geometry else []:
+        found, pose, coefficients = _descend(model, known, start, 12, None)
+        residual = found.residual(pose, coefficients) - known
+        loss = float(residual.abs().nan_to_num(1000.0).clamp(max=1.0).mean())
+        # Another start must be better by a tenth.
+        if loss < 0.9 * best_loss:
+            best, best_loss = (found, pose), loss
+        if best_loss < good:
             break
-    return model.with_walls_of(best.model), best.pose
+    return best
 
 
 def _descend(
     model: BaseModel, known: Tensor, pose: Tensor, steps: int, weight: Tensor | None
-) -> _Found:
+) -> tuple[BaseModel, Tensor, Tensor]:
     """Take Gauss-Newton steps; return hand-eye transform, walls and coefficients.
 
     A prior around the start holds the directions of the geometry that the poses do not determine.
@@ -303,7 +274,9 @@ def _descend(
     tie[:count] = _START_SD**-2 * len(observations.measured) / observations.num_units
     target = observations.measured - known
     coefficients = torch.zeros(model.num_columns - count, dtype=torch.float64)
-    small = _SMALL_COARSE_STEP if weight is None else _SMALL_STEP
+    # Steps end when one moves no pixel by more than this, metres: far below any noise; and for a
+    # start, which the next steps improve, far below what they move.
+    small = 1e-4 if weight is None else 1e-7
     for _ in range(steps):
         distance, columns = model.linearised(pose)
         usable = (distance > 0) & distance.isfinite()
@@ -326,18 +299,12 @@ def _descend(
         away[model.num_hand_eye : count] += step[model.num_hand_eye : count]
         model = model.moved(step)
         if model.hand_eye_free:
-            size = torch.maximum(step[:3].norm(), step[3:6].norm()) / _LONGEST_STEP
-            pose = pose @ se3.exp(step[:6] / size.clamp(min=1.0))
+            size = torch.maximum(step[:3].norm(), step[3:6].norm())
+            # No step is longer than half a metre or a radian.
+            pose = pose @ se3.exp(step[:6] / (2 * size).clamp(min=1.0))
         if count and float((columns[:, :count] @ step[:count]).abs().max()) < small:
             break
-    return _Found(model, pose, coefficients)
-
-
-# Beside the mask a pixel shows the target's plane if it is off by less than this many robust
-# standard deviations. Chosen, as in the noise estimate.
-_CLIP = 6.0
-# Pixels of a frame that its offset and spread are taken from, at most. Chosen to bound the time.
-_MOST_OF_FRAME = 20_000
+    return model, pose, coefficients
 
 
 def filtered_inputs(inputs: EffectInputs, observations: Observations, fit: BaseFit) -> EffectInputs:
@@ -348,7 +315,7 @@ def filtered_inputs(inputs: EffectInputs, observations: Observations, fit: BaseF
     """
     if max(fit.shared.share.values()) == 0 or inputs.distance_images is None:
         return inputs
-    images = _with_plane(inputs.distance_images, observations, fit.tool_from_camera)
+    images = torch.cat([_with_plane(inputs, observations, p) for p in frame_chunks(observations)])
     inputs = replace(inputs, distance_images=images)
     if inputs.amplitude is None or inputs.modulation_frequency is None:
         return inputs
@@ -356,23 +323,24 @@ def filtered_inputs(inputs: EffectInputs, observations: Observations, fit: BaseF
     return replace(inputs, amplitude_noise=noise)
 
 
-def _with_plane(images: Tensor, observations: Observations, tool_from_camera: Tensor) -> Tensor:
-    """Return distances (F, H, W) with the plane's where measured ones are off it by noise alone."""
-    found = []
-    for part in frame_chunks(observations):
-        plane = predicted_images(observations, tool_from_camera, part)
-        measured = observations.distance_images[part]
-        off = measured.double() - plane
-        use = observations.on_target[part] & (measured > 0)
-        middle = _median(off, use)
-        away = (off - middle).abs()
-        beside = (measured > 0) & (away < _CLIP * MAD_TO_SIGMA * _median(away, use))
-        found.append(torch.where(beside, plane.float(), images[part]))
-    return torch.cat(found)
+def _with_plane(inputs: EffectInputs, observations: Observations, part: slice) -> Tensor:
+    """Return distances (F, H, W) of some frames, the plane's where they are off it by noise alone.
 
+    Beside the mask a pixel shows the target's plane if it is off by less than six robust standard
+    deviations, as in the noise estimate; some pixels of each frame say its offset and spread.
+    """
+    assert inputs.distance_images is not None
+    plane = predicted_images(observations, inputs.tool_from_camera, part)
+    measured = observations.distance_images[part]
+    off = measured.double() - plane
+    use = observations.on_target[part] & (measured > 0)
+    step = max(1, off[0].numel() // _COARSE_PIXELS)
 
-def _median(images: Tensor, use: Tensor) -> Tensor:
-    """Return the median of used pixels of each image, (F, 1, 1); NaN where there are none."""
-    step = max(1, images[0].numel() // _MOST_OF_FRAME)
-    chosen = torch.where(use, images, torch.nan).flatten(1)[:, ::step]
-    return chosen.nanmedian(1).values[:, None, None]
+    def median(values: Tensor) -> Tensor:
+        """Return the median of the used pixels of each image, (F, 1, 1); NaN without any."""
+        some = torch.where(use, values, torch.nan).flatten(1)[:, ::step]
+        return some.nanmedian(1).values[:, None, None]
+
+    away = (off - median(off)).abs()
+    beside = (measured > 0) & (away < 6 * sigma_from_mad(median(away)))
+    return torch.where(beside, plane.float(), inputs.distance_images[part])

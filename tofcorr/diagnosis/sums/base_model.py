@@ -39,16 +39,15 @@ from tofcorr.diagnosis.sums.observations import (
     predicted_distance,
     seen_points,
 )
-from tofcorr.error_terms.base import ConditionTerm, Domain, PixelTerm, SignalTerm, Term
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.error_terms.pixel_terms import FixedPatternOptions
+from tofcorr.error_terms.base import Domain, Term
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.fit.walls import name_walls
 from tofcorr.geometry.rays import tangents
 from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 from tofcorr.simulation.effects.numerics import by_frame
 
 PER_WALL = 3
@@ -100,36 +99,32 @@ def wall_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor
     assert wall is not None
     _, slope, points = seen_points(observations, tool_from_camera)
     across = by_frame(points, tangents(observations.facts.normal_world).mT, frame)
-    own = -torch.cat([across, torch.ones_like(slope)[:, None]], dim=1) / slope[:, None]
-    columns = torch.zeros(len(frame), observations.num_walls, PER_WALL, dtype=torch.float64)
-    columns[torch.arange(len(frame)), wall[frame]] = own
-    return columns.flatten(1)
+    own = -torch.cat([across, torch.ones_like(across[:, :1])], dim=1) / slope[:, None]
+    shown = torch.nn.functional.one_hot(wall[frame], observations.num_walls)
+    return (shown[:, :, None] * own[:, None]).flatten(1)
 
 
 def with_walls_moved(observations: Observations, step: Tensor) -> Observations:
     """Return the observations after a step (3G,) of the walls; recording and facts both follow."""
-    wall = observations.wall
+    wall, facts = observations.wall, observations.facts
     if wall is None:
         return observations
     change = step.reshape(-1, PER_WALL)[wall]
-    facts = observations.facts
     turned = facts.normal_world + (change[:, :2, None] * tangents(facts.normal_world)).sum(1)
+    normal = torch.nn.functional.normalize(turned, dim=1)
     return with_planes(
-        observations, torch.nn.functional.normalize(turned, dim=1), facts.offset + change[:, 2]
+        observations, replace(facts, normal_world=normal, offset=facts.offset + change[:, 2])
     )
 
 
-def with_planes(observations: Observations, normal_world: Tensor, offset: Tensor) -> Observations:
-    """Return the observations with other planes of the frames, (F, 3) and (F,) metres."""
-    facts = replace(observations.facts, normal_world=normal_world, offset=offset)
-    frames = observations.recording.frames
-    table = replace(frames, normal_world=normal_world.numpy(), offset=offset.numpy())
+def with_planes(observations: Observations, facts: FrameFacts) -> Observations:
+    """Return the observations with the planes of other facts about the same frames."""
+    if observations.wall is None:
+        return observations
+    planes = {"normal_world": facts.normal_world, "offset": facts.offset}
+    table = replace(observations.recording.frames, **{k: v.numpy() for k, v in planes.items()})
     recording = replace(observations.recording, frames=table)
-    return replace(observations, facts=facts, recording=recording)
-
-
-# Most targets that get columns of their own; all frames of others share columns. Chosen.
-_MOST_TARGETS = 4
+    return replace(observations, facts=replace(observations.facts, **planes), recording=recording)
 
 
 def unknown_amplitude_columns(
@@ -155,16 +150,11 @@ def unknown_amplitude_columns(
     bright = bright / bright.square().mean().sqrt()
     forms = torch.stack([bright, bright**2, bright * (inputs.rows**2 + inputs.columns**2)], dim=1)
     forms = amplitude_error * forms / forms.square().mean(0).sqrt()
-    target = inputs.of_frame(_numbered_targets(observations))
-    return torch.cat([forms * (target == k)[:, None] for k in target.unique()], dim=1)
-
-
-def _numbered_targets(observations: Observations) -> Tensor:
-    """Return the number of each frame's target, shape (F,); those seen rarely share the last."""
+    # Four targets at most get columns of their own; all frames of rarer ones share the last.
     names = list(observations.recording.frames.target)
     common = sorted(set(names), key=lambda name: (-names.count(name), name))
-    last = _MOST_TARGETS - 1
-    return torch.tensor([min(common.index(name), last) for name in names])
+    target = inputs.of_frame(torch.tensor([min(common.index(name), 3) for name in names]))
+    return torch.cat([forms * (target == k)[:, None] for k in target.unique()], dim=1)
 
 
 def definite_base(
@@ -183,35 +173,26 @@ def definite_base(
     Raises:
         CalibrationDataError: The recording lacks what another term needs; names the term.
     """
-    base, warnings = _without_amplitude_terms(recording, base)
-    dataset = Dataset((recording,))
+    warnings, kept = [], base.without("amplitude")
+    if recording.amplitude is None and kept != base:
+        dropped = ", ".join(term.kind for term in base.terms if term not in kept.terms)
+        warnings = [
+            f"{recording.path}: amplitude.npy is missing; the base model has no amplitude term "
+            f"({dropped} left out). An error that depends on the amplitude cannot be named. What "
+            "could be one, by distance, incidence, exposure and place in the image, is not counted "
+            "for other effects; on a patterned target it also raises the noise floor, an upper "
+            "bound therefore."
+        ]
+        base = kept
+    dataset, columns = Dataset((recording,)), base.with_columns()
     refuse_missing_inputs(dataset, base)
-    columns = base.model_copy(update={"terms": tuple(t for t in base.terms if t.has_columns)})
     if not any(term.is_open(option) for term in columns.terms for option in term.found_in_data):
         return base, warnings
     frames = np.arange(dataset.num_frames)
     found = fit(dataset, frames, FitOptions(model=columns), covered_domain(dataset, frames))
     definite = iter(found.options.terms)
     terms = tuple(next(definite) if term.has_columns else term for term in base.terms)
-    return base.model_copy(update={"terms": terms}), warnings
-
-
-def _without_amplitude_terms(
-    recording: Recording, base: ErrorModelOptions
-) -> tuple[ErrorModelOptions, list[str]]:
-    if recording.amplitude is not None:
-        return base, []
-    kept = tuple(term for term in base.terms if not term.needs_amplitude)
-    if len(kept) == len(base.terms):
-        return base, []
-    dropped = ", ".join(term.kind for term in base.terms if term.needs_amplitude)
-    warning = (
-        f"{recording.path}: amplitude.npy is missing; the base model has no amplitude term "
-        f"({dropped} left out). An error that depends on the amplitude cannot be named. What could "
-        "be one, by distance, incidence, exposure and place in the image, is not counted for other "
-        "effects; on a patterned target it also raises the noise floor, an upper bound therefore."
-    )
-    return base.model_copy(update={"terms": kept}), [warning]
+    return ErrorModelOptions(terms=terms), warnings
 
 
 def supported_base(
@@ -221,17 +202,12 @@ def supported_base(
     dataset, kept, lacking = Dataset((recording,)), [], []
     for term in base.terms:
         try:
-            refuse_missing_inputs(dataset, base.model_copy(update={"terms": (term,)}))
+            refuse_missing_inputs(dataset, ErrorModelOptions(terms=(term,)))
         except CalibrationDataError:
             lacking.append(term.kind)
         else:
             kept.append(term)
-    return base.model_copy(update={"terms": tuple(kept)}), lacking
-
-
-def map_term(base: ErrorModelOptions) -> FixedPatternOptions | None:
-    """Return the term with one value a pixel instead of columns; None: there is none."""
-    return next((term for term in base.terms if isinstance(term, FixedPatternOptions)), None)
+    return ErrorModelOptions(terms=tuple(kept)), lacking
 
 
 class BaseModel:
@@ -264,49 +240,21 @@ class BaseModel:
     def __init__(
         self, observations: Observations, options: ErrorModelOptions, *, hand_eye_free: bool
     ) -> None:
+        self.observations, self.options = observations, options
         self.hand_eye_free = hand_eye_free
-        self.options = options
         self.domain = domain_of(observations)
         self.error_model = ErrorModel(options, self.domain)
-        self._look_at(observations)
 
     def on(self, observations: Observations) -> "BaseModel":
-        """Return the same model, scaled alike, on other pixels."""
+        """Return the same model, scaled alike, on other pixels or walls."""
         other = copy(self)
-        other._look_at(observations)
+        other.observations = observations
         return other
-
-    def _look_at(self, observations: Observations) -> None:
-        self.observations = observations
-        width = observations.recording.camera.width
-        rows = torch.div(observations.pixel, width, rounding_mode="floor").double()
-        columns = torch.remainder(observations.pixel, width).double()
-        parts = [term.basis(rows, columns) for term in self.pixel_terms]
-        if self.condition_terms:
-            conditions = observations.conditions()
-            of_frames = torch.cat([term.basis(conditions) for term in self.condition_terms])
-            parts.append(of_frames[:, observations.frame])
-        self._by_place = [part.detach() for part in parts]
-
-    @property
-    def signal_terms(self) -> list[SignalTerm]:
-        """Terms of distance and amplitude, in the order of their columns."""
-        return [t for t in self.error_model.signal_terms if isinstance(t, SignalTerm)]
-
-    @property
-    def pixel_terms(self) -> list[PixelTerm]:
-        """Terms of the position in the image, in the order of their columns."""
-        return [t for t in self.error_model.pixel_terms if isinstance(t, PixelTerm)]
-
-    @property
-    def condition_terms(self) -> list[ConditionTerm]:
-        """Terms of the conditions of a frame, in the order of their columns."""
-        return [t for t in self.error_model.condition_terms if isinstance(t, ConditionTerm)]
 
     @property
     def terms(self) -> list[Term]:
         """All terms with columns, in their order."""
-        return [*self.signal_terms, *self.pixel_terms, *self.condition_terms]
+        return self.error_model.terms()
 
     @property
     def groups(self) -> set[str]:
@@ -330,20 +278,8 @@ class BaseModel:
 
     def moved(self, step: Tensor) -> "BaseModel":
         """Return the model after a step of the geometry columns, with its walls moved."""
-        if self.num_geometry == self.num_hand_eye:
-            return self
-        other = copy(self)
         walls = step[self.num_hand_eye : self.num_geometry]
-        other.observations = with_walls_moved(self.observations, walls)
-        return other
-
-    def with_walls_of(self, other: "BaseModel") -> "BaseModel":
-        """Return the model with its estimated walls where another has them."""
-        if self.num_geometry == self.num_hand_eye:
-            return self
-        model, facts = copy(self), other.observations.facts
-        model.observations = with_planes(self.observations, facts.normal_world, facts.offset)
-        return model
+        return self.on(with_walls_moved(self.observations, walls))
 
     def prior_precision(self) -> Tensor:
         """Return the precision of the coefficients' priors, diagonal, shape (K, K)."""
@@ -367,11 +303,22 @@ class BaseModel:
 
     def error_columns(self, distance: Tensor) -> Tensor:
         """Return constant and terms at predicted distances (M,), metres, shape (M, K)."""
-        amplitude = self.observations.amplitude
-        amplitude = torch.zeros_like(distance) if amplitude is None else amplitude
-        by_signal = [term.basis(distance, amplitude).detach() for term in self.signal_terms]
-        # Rows (K, M) are filled several times faster than columns.
-        return torch.cat([torch.ones_like(distance)[None], *by_signal, *self._by_place]).T
+        observations = self.observations
+        amplitude, width = observations.amplitude, observations.recording.camera.width
+        pixels = Pixels(
+            distance,
+            torch.zeros_like(distance) if amplitude is None else amplitude,
+            (observations.pixel // width).double(),
+            (observations.pixel % width).double(),
+            observations.conditions[observations.frame],
+        )
+        return self.error_model.columns_at(pixels).detach().T
+
+    def residual(self, tool_from_camera: Tensor, coefficients: Tensor) -> Tensor:
+        """Return measured less fitted distance with coefficients of the terms, (M,), metres."""
+        distance = predicted_distance(self.observations, tool_from_camera)
+        error = self.error_columns(distance) @ coefficients
+        return self.observations.measured - distance - error
 
     def columns(self, tool_from_camera: Tensor) -> Tensor:
         """Return all columns around a hand-eye transform (4, 4), shape (M, K)."""
@@ -379,16 +326,14 @@ class BaseModel:
 
     def linearised(self, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
         """Return the predicted distance, (M,), metres, and all columns, (M, K)."""
-        parts = []
+        observations, parts = self.observations, []
+        distance, columns = hand_eye_columns(observations, tool_from_camera)
         if self.hand_eye_free:
-            distance, columns = hand_eye_columns(self.observations, tool_from_camera)
             parts.append(columns)
-        else:
-            distance = predicted_distance(self.observations, tool_from_camera)
-        if self.observations.num_walls:
-            parts.append(wall_columns(self.observations, tool_from_camera))
-        parts.append(self.error_columns(distance))
-        return distance, torch.cat([part.T for part in parts]).T
+        if observations.num_walls:
+            parts.append(wall_columns(observations, tool_from_camera))
+        # Rows (K, M) are filled several times faster than columns.
+        return distance, torch.cat([part.T for part in (*parts, self.error_columns(distance))]).T
 
 
 def domain_of(observations: Observations, outside_share: float = 0.0005) -> Domain:
@@ -405,7 +350,7 @@ def domain_of(observations: Observations, outside_share: float = 0.0005) -> Doma
         observations.measured,
         observations.amplitude,
         recording.modulation_frequency,
-        observations.conditions(),
+        observations.conditions,
         outside_share=outside_share,
         method="nearest",
     )

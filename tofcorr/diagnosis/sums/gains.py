@@ -6,7 +6,12 @@ distribution). The fall by an effect, summed over the folds, is therefore
 
 .. math:: \sum_f \left( s^T S^{-1} s - s_{-f}^T S_{-f}^{-1} s_{-f} \right)
 
-with the reduced equations of all units and of those without the fold (see `Elimination`). The
+with the equations of the effect, reduced by the model's, of all units and of those without the
+fold: for columns m of the model and e of the effect, and the equations N theta = b, they are
+
+.. math:: S = N_{ee} - N_{em} N_{mm}^{-1} N_{me}, \quad s = b_e - N_{em} N_{mm}^{-1} b_m .
+
+The
 others cannot predict a pose that alone determines a coefficient, such as the first one of a
 warm-up. Without the uncertainty, its error would outweigh the gain of all other poses. The
 log-determinant is omitted, because flips do not change it.
@@ -27,29 +32,19 @@ shape matters, as in a t-test, because the quotient has no scale (Bell and McCaf
 and Miller 2015, "A practitioner's guide to cluster-robust inference", on few clusters).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.elimination import (
-    Elimination,
-    Reduced,
-    sums_over,
-    without_shares_of_each,
-)
-from tofcorr.diagnosis.sums.linear_system import (
-    LEFT_OUT,
-    NUM_POSE,
-    PoseSums,
-    Sums,
-    solver,
-)
+from tofcorr.diagnosis.sums.linear_system import LEFT_OUT, NUM_POSE, PoseSums, Sums
 from tofcorr.diagnosis.sums.observations import TINY
 
-# Least Q, in units of chi-squared. Chosen: an effect that the model absorbs entirely has none.
-_LEAST_SCALE = 1e-9
+# Added to a matrix before it is factored, as a share of its diagonal: rounding of sums of products
+# leaves less. And to the covariance of a pose's scores, which columns that one pose cannot
+# distinguish leave singular: far above rounding, far below what a prior adds.
+_ROUNDING, _RIDGE = 1e-12, 1e-11
 
 
 class HeldOutSquares:
@@ -65,20 +60,23 @@ class HeldOutSquares:
     """
 
     def __init__(self, sums: Sums, chosen: Sequence[str], folds: Tensor) -> None:
-        self._sums, self._folds, self._fold = sums, folds, folds.argmax(0)
-        self._fits = Elimination(sums, chosen, sums_over(1 - folds))
-        theta = self._fits.solution[self._fold]
-        self._left = sums.score - (self._fits.rows.mT @ theta[:, :, None])[..., 0]
-        twice = (sums.score + self._left)[:, self._fits.members]
-        self.squares = sums.square - (theta * twice).sum(1) / sums.scale
+        self._sums, self._chosen, self._folds = sums, chosen, folds
+        self.squares = self._squares(chosen)
+
+    def _squares(self, names: Sequence[str]) -> Tensor:
+        """Return the squares of each held-out unit, by the model of some effects, (U,)."""
+        theta = self._fitted(names, self._folds @ self._sums.of(names)[1])[1]
+        return self._sums.squares_at(names, theta[self._folds.argmax(0)])
+
+    def _fitted(self, names: Sequence[str], right: Tensor) -> tuple[Tensor, Tensor]:
+        """Return A over each fold (folds, K, K), and the others' fit to scores (folds, K, ...)."""
+        gram, _, prior = self._sums.of(names)
+        own = torch.tensordot(self._folds, gram, dims=1)
+        return own, torch.linalg.solve(own.sum(0) + prior - own, right.sum(0) - right)
 
     def closed(self, name: str) -> Tensor:
         """Return the fall of the sum of squares of each unit by one more effect, (U,)."""
-        step = [each[self._fold] for each in self._fits.beside(name).solution()]
-        curved = torch.cat(self._fits.products(name, *step), dim=1)
-        own = torch.arange(*self._sums.layout.effects[name])
-        slopes = self._left[:, torch.cat([self._fits.members, own])]
-        return (torch.cat(step, dim=1) * (2 * slopes - curved)).sum(1) / self._sums.scale
+        return self.squares - self._squares([*self._chosen, name])
 
     def closed_by_chance(self, names: Sequence[str], drawn: Tensor) -> dict[str, Tensor]:
         """Return what each of some effects closes of drawn scores, over all units, (B,) each.
@@ -87,22 +85,15 @@ class HeldOutSquares:
             names: The effects.
             drawn: Scores, added up over the units of each fold, shape (folds, P, B).
         """
-        sums, members = self._sums, self._fits.members
-        drawn = drawn.double()
-        others = drawn.sum(0) - drawn
-        model = torch.linalg.solve(self._fits.normal, others[:, members])
-        grams = torch.tensordot(self._folds, sums.gram, dims=1)
-        left = drawn - grams[:, :, members] @ model
-        closed = {}
-        for name in names:
-            own = torch.arange(*sums.layout.effects[name])
-            reduced, both = self._fits.beside(name), torch.cat([members, own])
-            right = others[:, own] - reduced.across.mT @ others[:, members]
-            theta = torch.linalg.solve(reduced.normal, right)
-            step = torch.cat([-reduced.across @ theta, theta], dim=1)
-            slopes = 2 * left[:, both] - grams[:, both][:, :, both] @ step
-            closed[name] = (step * slopes).sum((0, 1)) / sums.scale
-        return closed
+
+        def explained(names: Sequence[str]) -> Tensor:
+            """Return the fall of the sum of squares by a whole model, (B,)."""
+            right = drawn[:, self._sums.layout.of(names)].double()
+            own, theta = self._fitted(names, right)
+            return (theta * (2 * right - own @ theta)).sum((0, 1)) / self._sums.scale
+
+        model = explained(self._chosen)
+        return {name: explained([*self._chosen, name]) - model for name in names}
 
 
 def flipped_gains(
@@ -121,22 +112,15 @@ def flipped_gains(
         folds: Which units each fold holds out, shape (folds, U).
         signs: Sign flips of the units, shape (B, U).
     """
-    kept = _kept(folds)
-    fits = Elimination(sums, chosen, sums_over(kept))
-    each = Elimination(sums, chosen, without_shares_of_each)
     gains = {}
     for name in names:
-        effect, own = _added(name, sums, fits), slice(*sums.layout.effects[name])
-        change, theta = each.beside(name).solution()
-        solved = [
-            x.unflatten(0, (len(LEFT_OUT), -1)).mean(0) for x in (each.solution + change, theta)
-        ]
-        of_model, of_own = each.products(name, *solved)
-        model, score = sums.score[:, each.members] - of_model, sums.score[:, own] - of_own
-        # Of every unit and fit, (S, U, E); a flip and a fit are both sums over units.
-        left = (score - model @ effect.across) * kept[:, :, None]
-        right = effect.reduced.right[:, :, None]
-        gains[name] = _fall(effect.root @ torch.cat([right, left.mT @ signs.T], dim=2))
+        larger = [*chosen, name]
+        gram, score, _ = sums.of(larger)
+        left = score - (gram @ sums.left_out_solutions(larger)[:, :, None])[..., 0]
+        # A flip and a fold are both sums over units.
+        flipped = (left * folds[:, :, None]).mT @ signs.T
+        right = torch.cat([(folds @ score)[:, :, None], flipped], dim=2)
+        gains[name] = _fall(sums, larger, folds, right)
     return gains
 
 
@@ -158,157 +142,64 @@ def student_gains(
         folds: Which poses each fold holds out, shape (folds, U).
         null: Scores under the null hypothesis; without them only the fall itself is returned.
     """
-    fits = Elimination(sums, chosen, sums_over(_kept(folds)))
-    effects = {name: _added(name, sums, fits) for name in names}
-    observed = torch.tensordot(folds, sums.score, dims=1)[:, :, None]
-    gains = _falls(effects, fits.members, observed)
-    if null is None:
-        return gains
-    of_folds = null.of_folds()
-    drawn = _falls(effects, fits.members, of_folds)
-    noise = _gain_noise(effects, sums, fits, null, of_folds.sum(0))
-    return {
-        name: torch.cat([gains[name], drawn[name] / noise[name][1:] * noise[name][0]])
-        for name in names
-    }
+    gains = {}
+    for name in names:
+        larger = [*chosen, name]
+        scores = sums.of(larger)[1][:, :, None]
+        if null is not None:
+            drawn = null.scores[:, sums.layout.of(larger)].double()
+            scores = torch.cat([scores, drawn], dim=2)
+        fall = _fall(sums, larger, folds, torch.tensordot(folds, scores, dims=1))
+        noise = _gain_noise(sums, larger, scores)
+        gains[name] = fall / noise * noise[0]
+    return gains
 
 
-class _Added(NamedTuple):
-    """An effect beside the model, in every fit; the last fit leaves out nothing.
+def _fall(sums: Sums, larger: Sequence[str], folds: Tensor, right: Tensor) -> Tensor:
+    """Return the held-out falls of chi-squared by the last effect of a model, (R,).
 
-    Attributes:
-        own: The effect's columns.
-        reduced: Its equations.
-        root: R with R' R = S^-1, shape (S, E, E).
+    Args:
+        sums: Generalised sums of every unit.
+        larger: Effects of the model, the added one last.
+        folds: Which units each fold holds out, shape (folds, U).
+        right: Scores of the model's columns over each fold, shape (folds, K, R).
     """
-
-    own: slice
-    reduced: Reduced
-    root: Tensor
-
-    @property
-    def across(self) -> Tensor:
-        """Z, shape (S, K, E)."""
-        return self.reduced.across
-
-
-def _added(name: str, sums: Sums, fits: Elimination) -> _Added:
-    reduced = fits.beside(name)
-    return _Added(slice(*sums.layout.effects[name]), reduced, _inverse_root(reduced.normal))
-
-
-def _kept(folds: Tensor) -> Tensor:
-    """Return which units each fit keeps, all in the last one, shape (folds + 1, U)."""
-    return 1 - torch.cat([folds, torch.zeros_like(folds[:1])])
-
-
-def _inverse_root(matrices: Tensor) -> Tensor:
-    """Return R with R' R = S^-1; where rounding leaves some S singular, of the positive parts."""
-    factor, failed = torch.linalg.cholesky_ex(matrices)
-    if not bool(failed.any()):
-        one = torch.eye(matrices.shape[-1], dtype=matrices.dtype)
-        return torch.linalg.solve_triangular(factor, one, upper=False)
-    values, vectors = torch.linalg.eigh(matrices)
-    return torch.where(values > 0, values, torch.inf).rsqrt()[..., None] * vectors.mT
-
-
-def _fall(scores: Tensor) -> Tensor:
-    """Return the held-out falls of chi-squared, (R,), from reduced scores times R, (S, E, R)."""
-    squares = scores.square_().sum(1).double()
+    gram, _, prior = sums.of(larger)
+    own, whole = torch.tensordot(folds, gram, dims=1), gram.sum(0)
+    normal = torch.cat([whole - own, whole[None]]) + prior
+    total = right.sum(0, keepdim=True)
+    inner = _reduced(sums, larger, normal, torch.cat([total - right, total]))
+    squares = inner.square().sum(1)
     return (squares[-1] - squares[:-1]).sum(0)
 
 
-def _falls(effects: Mapping[str, _Added], members: Tensor, of_folds: Tensor) -> dict[str, Tensor]:
-    """Return the held-out falls of chi-squared by each effect, shape (R,), float64.
+def _reduced(sums: Sums, larger: Sequence[str], normal: Tensor, right: Tensor) -> Tensor:
+    """Return R s, with R' R = S^-1, from equations N (..., K, K) and right sides (..., K, B).
 
-    Args:
-        effects: The effects.
-        members: Numbers of the model's columns.
-        of_folds: Scores, added up over the poses of each fold, shape (folds, P, R).
+    With the factor N = L L', they are the last rows of L^-1 b.
     """
-    total = of_folds.sum(0, keepdim=True)
-    of_fits = torch.cat([total - of_folds, total])
-    model = of_fits[:, members]
-    falls = {}
-    for name, effect in effects.items():
-        across, root = effect.across.to(total.dtype), effect.root.to(total.dtype)
-        right = torch.baddbmm(of_fits[:, effect.own], across.mT, model, alpha=-1)
-        falls[name] = _fall(root @ right)
-    return falls
+    low, high = sums.layout.effects[larger[-1]]
+    ridge = _ROUNDING * normal.diagonal(dim1=-2, dim2=-1) + TINY
+    factor = torch.linalg.cholesky(normal + ridge.diag_embed())
+    return torch.linalg.solve_triangular(factor, right, upper=False)[..., low - high :, :]
 
 
-def _gain_noise(
-    effects: Mapping[str, _Added],
-    sums: Sums,
-    fits: Elimination,
-    null: "NullScores",
-    total: Tensor,
-) -> dict[str, Tensor]:
-    """Return Q of each effect, of the observed and of the drawn scores, shape (1 + B,).
+def _gain_noise(sums: Sums, larger: Sequence[str], scores: Tensor) -> Tensor:
+    """Return Q of the last effect of a model, for scores of every pose (U, K, R), shape (R,).
 
-    The coefficients of the larger model are those of `Sums.left_out_solutions`. The equations of
-    the model are eliminated from them, so that each effect needs small systems.
-
-    Args:
-        effects: Those of which one is added.
-        sums: Generalised sums of every pose.
-        fits: Of the model without them.
-        null: Drawn scores.
-        total: The same, added up over all poses, shape (P, B).
+    The coefficients of the larger model are those of `Sums.left_out_solutions`.
     """
-    members, gram = fits.members, sums.gram
-    shares = gram.new_tensor(LEFT_OUT)[:, None, None, None]
-    whole = sums.total + sums.layout.prior
-    noise = {name: [] for name in effects}
-    for span, drawn in zip(null.spans, null.blocks(), strict=True):
-        rows = fits.rows[span]
-        # N_mm^-1, N_me and Z of the fits without the shares; the last two of all columns.
-        known = whole[members] - shares * rows
-        inverse = torch.linalg.inv(known[..., members])
-        all_across = inverse @ known
-        for name, effect in effects.items():
-            own, root = effect.own, effect.root[-1]
-            # Beside the model, in units of S: R (own - Z' model).
-            beside = -root @ effect.across[-1].mT
-            of_model = root @ rows[:, :, own].mT + beside @ rows[:, :, members]
-            of_own = root @ gram[span, own, own] + beside @ rows[:, :, own]
-            # Z and S of the fits without the shares, (3, U', K, E) and (3, U', E, E).
-            across = all_across[..., own]
-            normal = whole[own, own] - shares * gram[span, own, own] - known[..., own].mT @ across
-            solved = solver(normal)((of_own - of_model @ across).mT).mT
-            through = of_model @ inverse - solved @ across.mT
-            # What multiplies the scores of the model and of the effect to give R l, of the pose
-            # itself and of all poses together.
-            maps = (
-                beside + (shares * through).mean(0),
-                root + (shares * solved).mean(0),
-                -through.mean(0).flatten(0, 1),
-                -solved.mean(0).flatten(0, 1),
-            )
-            pairs = (sums.score[span, :, None], sums.score.sum(0)[:, None]), (drawn, total)
-            noise[name].append(torch.cat([_squares(maps, *pair, members, own) for pair in pairs]))
-    return {
-        name: torch.stack(parts).sum(0).clamp(min=_LEAST_SCALE) for name, parts in noise.items()
-    }
-
-
-def _squares(
-    maps: tuple[Tensor, ...], scores: Tensor, total: Tensor, members: Tensor, own: slice
-) -> Tensor:
-    """Return the sum of squares of R l over some poses, shape (R,), float64.
-
-    Args:
-        maps: What multiplies scores of model and effect, of the poses (U', E, K) and (U', E, E),
-            then of all poses, flattened.
-        scores: Of the poses, shape (U', P, R).
-        total: Of all poses, shape (P, R).
-        members: Numbers of the model's columns.
-        own: The effect's columns.
-    """
-    by_model, by_own, all_model, all_own = (part.to(scores.dtype) for part in maps)
-    left = torch.baddbmm(by_model @ scores[:, members], by_own, scores[:, own]).flatten(0, 1)
-    left.addmm_(all_model, total[members]).addmm_(all_own, total[own])
-    return left.square_().sum(0).double()
+    gram, _, prior = sums.of(larger)
+    whole = gram.sum(0) + prior
+    beside = _reduced(sums, larger, whole, torch.eye(len(whole), dtype=whole.dtype))
+    lever = (beside @ gram).mT
+    # What gives R l from the scores of the pose itself, and from those of all poses together.
+    without = [torch.linalg.solve(whole - t * gram, lever).mT for t in LEFT_OUT]
+    of_pose = beside + sum(t * part for t, part in zip(LEFT_OUT, without, strict=True)) / 3
+    of_all = torch.stack(without).mean(0)
+    left = of_pose @ scores - of_all @ scores.sum(0)
+    # An effect that the model absorbs entirely has none, in units of chi-squared.
+    return left.square().sum((0, 1)).clamp(min=1e-9)
 
 
 class NullScores:
@@ -327,95 +218,55 @@ class NullScores:
     .. math:: y = x / \sqrt f - H (z / \sqrt f + e), \quad e \sim N(0, S^{-1}) .
 
     The same seed gives the same (x, z, e) for every estimate of f and S. Draws have single
-    precision: its rounding is far below the `ridge`.
+    precision: its rounding is far below the ridge.
 
     Args:
         sums: Of the poses.
         folds: Which poses each fold holds out, shape (folds, U).
         count: Number of draws B.
         seed: Of the draws.
-
-    Attributes:
-        spans: The poses that each of the `blocks` holds.
-
-    Class attributes:
-        at_once: Numbers that are drawn at once. Chosen: 16 MB.
-        ridge: Added to the covariance of a pose's scores, as a share of each variance: columns that
-            one pose cannot distinguish leave it singular. Far above rounding, far below what a
-            prior adds.
     """
-
-    at_once: ClassVar[int] = 4_000_000
-    ridge: ClassVar[float] = 1e-11
 
     def __init__(self, sums: PoseSums, folds: Tensor, count: int, seed: int) -> None:
         products = sums.weighted[:, :-1, :-1]
-        units, size = products.shape[:2]
-        step = max(1, self.at_once // (size * count))
-        self.spans = [slice(low, min(low + step, units)) for low in range(0, units, step)]
         generator = torch.Generator().manual_seed(seed)
-        self._errors = torch.randn(units, NUM_POSE, count, generator=generator)
-        self._drawn = []
-        for span in self.spans:
-            factor = _factor(products[span], self.ridge)
-            random = torch.randn(len(factor), size, count, generator=generator)
-            self._drawn.append(factor @ random)
-        cross = products[:, -NUM_POSE:] / sums.dispersion
-        inner = cross[:, :, -NUM_POSE:] + torch.diag(sums.pose_sd**-2)
-        self._sums, self._inside = sums, folds.float()
-        self._scale, self._pose_sd = sums.dispersion**-0.5, sums.pose_sd.float()[:, None]
-        self._lift = -torch.linalg.solve(inner, cross[:, :, :-NUM_POSE]).mT.float()
-        pose = torch.cat([drawn[:, -NUM_POSE:] for drawn in self._drawn])
-        self._pose = pose * self._scale + self._errors / self._pose_sd
+        self._errors = torch.randn(len(products), NUM_POSE, count, generator=generator)
+        random = torch.randn(*products.shape[:2], count, generator=generator)
+        self._sums, self._folds, self._drawn = sums, folds.float(), _factor(products) @ random
 
-    def of_folds(self) -> Tensor:
-        """Return the sums of scores over the poses of each fold, shape (folds, P, B), float32."""
-        return self._over_folds(self._scale * torch.ones(len(self._lift)), self._lift, self._pose)
+    @cached_property
+    def scores(self) -> Tensor:
+        """The scores y of each pose, shape (U, P, B), float32."""
+        sums, scale = self._sums, self._sums.dispersion**-0.5
+        cross = sums.weighted[:, -NUM_POSE - 1 : -1, :-1] / sums.dispersion
+        inner = cross[:, :, -NUM_POSE:] + torch.diag(sums.pose_sd**-2)
+        lift = -torch.linalg.solve(inner, cross[:, :, :-NUM_POSE]).mT.float()
+        own, pose = self._drawn[:, :-NUM_POSE], self._drawn[:, -NUM_POSE:]
+        pose = pose * scale + self._errors / sums.pose_sd.float()[:, None]
+        return torch.baddbmm(own, lift, pose, beta=scale)
 
     def even_of_folds(self) -> Tensor:
-        """Return the same draws as scores of ordinary weights, shape (folds, P, B), float32.
+        """Return the same draws with ordinary weights, over each fold, (folds, P, B), float32.
 
         The errors of the poses are -S e. Within a pose, ordinary weights are taken for those of the
         generalised sums times a constant.
         """
         sums, first = self._sums, self._sums.num_columns
         ratio = sums.plain[:, first, first] / sums.weighted[:, first, first].clamp(min=TINY)
+        factors = (sums.scale * sums.dispersion**0.5 * ratio).float()[:, None, None]
         across = sums.scale * sums.plain[:, :first, first:-1].float()
-        factors = (sums.scale / self._scale * ratio).float()
-        return self._over_folds(factors, across, -self._errors * self._pose_sd)
-
-    def _over_folds(self, factors: Tensor, lift: Tensor, pose: Tensor) -> Tensor:
-        """Return sums over each fold's poses of x times factors (U,), and of `lift` times `pose`.
-
-        Args:
-            factors: Of each pose.
-            lift: Shape (U, P, 3).
-            pose: Shape (U, 3, B).
-        """
-        inside, parts = self._inside * factors, []
-        for span, drawn in zip(self.spans, self._drawn, strict=True):
-            parts.append(torch.tensordot(inside[:, span], drawn[:, :-NUM_POSE], dims=1))
-        total = torch.stack(parts).sum(0)
-        for fold, members in zip(total, self._inside, strict=True):
-            own = members.nonzero()[:, 0]
-            fold.addmm_(lift[own].transpose(0, 1).flatten(1), pose[own].flatten(0, 1))
-        return total
-
-    def blocks(self) -> Iterator[Tensor]:
-        """Yield the scores of the poses of each span, shape (U', P, B), float32."""
-        for span, drawn in zip(self.spans, self._drawn, strict=True):
-            own = drawn[:, :-NUM_POSE]
-            yield torch.baddbmm(own, self._lift[span], self._pose[span], beta=self._scale)
+        errors = -self._errors * sums.pose_sd.float()[:, None]
+        even = torch.baddbmm(self._drawn[:, :-NUM_POSE] * factors, across, errors)
+        return torch.tensordot(self._folds, even, dims=1)
 
 
-def _factor(covariance: Tensor, ridge: float) -> Tensor:
+def _factor(covariance: Tensor) -> Tensor:
     """Return F with F F' the covariance of each pose, shape (U, N, N), float32."""
-    tiny = torch.finfo(torch.float64).tiny
-    size = covariance.diagonal(dim1=1, dim2=2).clamp(min=tiny).sqrt()
-    correlation = (covariance / size[:, :, None]).div_(size[:, None, :])
-    correlation.diagonal(dim1=1, dim2=2).add_(ridge)
+    size = covariance.diagonal(dim1=1, dim2=2).clamp(min=torch.finfo(torch.float64).tiny).sqrt()
+    correlation = covariance / (size[:, :, None] * size[:, None, :])
+    correlation.diagonal(dim1=1, dim2=2).add_(_RIDGE)
     factor, failed = torch.linalg.cholesky_ex(correlation)
     if bool(failed.any()):
         values, vectors = torch.linalg.eigh(correlation)
         factor = vectors * values.clamp(min=0).sqrt()[:, None, :]
-    return factor.float().mul_(size.float()[:, :, None])
+    return factor.float() * size.float()[:, :, None]

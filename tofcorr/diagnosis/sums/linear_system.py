@@ -21,7 +21,7 @@ is complete. Every fold, subset of columns, bootstrap and sign flip is a sum of 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 
 import torch
@@ -29,11 +29,11 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.base_model import unknown_amplitude_columns
-from tofcorr.diagnosis.sums.noise import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.resampling import Tiles
 from tofcorr.pixels.dataset import in_threads
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.spread import sigma_from_mad
 
 BASE = "base"
 """The name of the base model among the columns."""
@@ -42,16 +42,6 @@ NUM_POSE = 3
 OLS_SD = 1e-3
 """Ordinary sums weigh a mean pose as one value with this standard deviation, metres; the same holds
 for offset and tilts in the fit that their uncertainty is estimated from. Chosen: 1 mm."""
-# Added to the diagonal of a pose's products, as a share of its mean, so that they are regular where
-# few of its pixels count. Chosen, far above the rounding of float64.
-_RIDGE = 1e-9
-# Least standard deviation of a pose's offset and tilts, metres. Chosen: far below what robots
-# repeat, and enough to keep systems regular.
-_LEAST_POSE_SD = 2e-5
-# Least share of degrees of freedom in a pose that the fit has not used, and the most coefficients
-# of the model that count as determined by the poses' own offsets. They bound the correction of the
-# pose variance for recordings of few poses; chosen.
-_LEAST_FREEDOM, _MOST_COUNTED = 0.3, 12
 LEFT_OUT = tuple((1 + math.cos((2 * k + 1) * math.pi / 6)) / 2 for k in range(3))
 """Shares of a unit that are left out of the fits whose mean predicts it: the three nodes of the
 Gauss-Chebyshev quadrature on [0, 1]. Derived in `left_out_solutions`."""
@@ -134,10 +124,6 @@ class Sums:
         score = torch.cat([self.score[:, slice(*span)] for span in spans], dim=1)
         return _between(self.gram, spans), score, self.layout.prior_of(self.layout.of(names))
 
-    def rows(self, names: Sequence[str]) -> Tensor:
-        """Return the rows of A_u that belong to base model and some effects, shape (U, K, P)."""
-        return torch.cat([self.gram[:, slice(*span)] for span in self.layout.spans(names)], dim=1)
-
     def normal(self, names: Sequence[str]) -> Tensor:
         """Return the normal matrix of base model and some effects over all units, (K, K)."""
         members = self.layout.of(names)
@@ -157,10 +143,11 @@ class Sums:
         """Return the sum of squares of each unit, predicted by all others, shape (U,), m^2."""
         return self.squares_at(names, self.left_out_coefficients(names))
 
-    def left_out_coefficients(self, names: Sequence[str]) -> Tensor:
-        """Return for every unit the coefficients that all others give, shape (U, K)."""
+    def left_out_coefficients(self, names: Sequence[str], share: float = 1.0) -> Tensor:
+        """Return for every unit the coefficients of all without it, or a share of it, (U, K)."""
         gram, score, prior = self.of(names)
-        return solver(gram.sum(0) + prior - gram)((score.sum(0) - score)[:, :, None])[..., 0]
+        normal, right = gram.sum(0) + prior - share * gram, score.sum(0) - share * score
+        return torch.linalg.solve(normal, right)
 
     def left_out_solutions(self, names: Sequence[str]) -> Tensor:
         r"""Return for every unit the coefficients that give its residual the variance of its error.
@@ -179,10 +166,7 @@ class Sums:
         Returns:
             Shape (U, K).
         """
-        gram, score, prior = self.of(names)
-        whole, right = gram.sum(0) + prior, score.sum(0)
-        solved = [solver(whole - t * gram)((right - t * score)[:, :, None]) for t in LEFT_OUT]
-        return torch.stack(solved).mean(0)[..., 0]
+        return torch.stack([self.left_out_coefficients(names, t) for t in LEFT_OUT]).mean(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,21 +218,16 @@ class PoseSums:
     @cached_property
     def gls(self) -> Sums:
         """Generalised least squares: weighted by likelihood, with the uncertainty of the poses."""
-        own, pose = slice(self.num_columns), slice(self.num_columns, -1)
+        count, pose = self.num_columns, slice(self.num_columns, -1)
         cross = self.weighted[:, pose] / self.dispersion
         solved = torch.linalg.solve(cross[:, :, pose] + torch.diag(self.pose_sd**-2), cross)
-
-        def reduced(rows: slice, to: slice) -> Tensor:
-            whole, by_pose = self.weighted[:, rows, to], cross[:, :, rows].mT
-            return torch.baddbmm(
-                whole, by_pose, solved[:, :, to], beta=1 / self.dispersion, alpha=-1
-            )
-
-        last = slice(-1, None)
+        products = torch.baddbmm(
+            self.weighted, cross.mT, solved, beta=1 / self.dispersion, alpha=-1
+        )
         return Sums(
-            gram=reduced(own, own),
-            score=reduced(own, last)[..., 0],
-            square=reduced(last, last)[:, 0, 0],
+            gram=products[:, :count, :count],
+            score=products[:, :count, -1],
+            square=products[:, -1, -1],
             scale=1.0,
             layout=self.layout,
         )
@@ -274,16 +253,19 @@ def _dispersion(gls: Sums, chosen: Sequence[str]) -> float:
     Every column outside the model gives one ratio. Their median is insensitive to the few columns
     in which a missing effect shows.
     """
-    left = gls.score - gls.solve(chosen) @ gls.rows(chosen)
+    members = gls.layout.of(chosen)
+    left = gls.score - gls.solve(chosen) @ gls.gram[:, members]
     total = gls.gram.diagonal(dim1=1, dim2=2).sum(0)
     outside = total > 0
-    outside[gls.layout.of(chosen)] = False
+    outside[members] = False
     if not bool(outside.any()):
         return 1.0
     return max(float(((left**2).sum(0)[outside] / total[outside]).median()), 1.0)
 
 
-def _pose_sd(sums: PoseSums, chosen: Sequence[str]) -> Tensor:
+def _pose_sd(
+    sums: PoseSums, chosen: Sequence[str], *, least: float = 2e-5, least_freedom: float = 0.3
+) -> Tensor:
     """Estimate the standard deviations robustly from the poses' own offsets and tilts.
 
     The fit assumes poses known to a millimetre. Estimating fit and uncertainty in turn can diverge:
@@ -292,6 +274,11 @@ def _pose_sd(sums: PoseSums, chosen: Sequence[str]) -> Tensor:
     Args:
         sums: Of the model alone, with the poses' assumed uncertainty.
         chosen: Effects of the model.
+        least: Least standard deviation, metres. Chosen: far below what robots repeat, and enough to
+            keep systems regular.
+        least_freedom: Least share of degrees of freedom in a pose that the fit has not used. At
+            most twelve coefficients of the model count as determined by the poses' own offsets.
+            Both bound the correction for recordings of few poses; chosen.
     """
     count, pose = sums.num_columns, slice(sums.num_columns, -1)
     cross = sums.weighted[:, pose] / sums.dispersion
@@ -302,9 +289,9 @@ def _pose_sd(sums: PoseSums, chosen: Sequence[str]) -> Tensor:
         return sums.pose_sd
     own = torch.linalg.solve(inner[enough], score[enough])
     noise = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
-    freedom = max(_LEAST_FREEDOM, 1.0 - min(count, _MOST_COUNTED) / max(sums.num_units, 1))
-    spread = (MAD_TO_SIGMA * own.abs().median(dim=0).values) ** 2 / freedom
-    return (spread - noise.median(dim=0).values).clamp(min=_LEAST_POSE_SD**2).sqrt()
+    freedom = max(least_freedom, 1.0 - min(count, 12) / sums.num_units)
+    spread = sigma_from_mad(own.abs().median(dim=0).values) ** 2 / freedom
+    return (spread - noise.median(dim=0).values).clamp(min=least**2).sqrt()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -333,10 +320,10 @@ class LinearSystem:
         """Return what base model and some effects predict with coefficients (K,), (M,), metres."""
         parts = self.of(names)
         own = coefficients.split([part.shape[1] for part in parts])
-        total = parts[0] @ own[0]
-        for part, theta in zip(parts[1:], own[1:], strict=True):
-            total.addmv_(part, theta)
-        return total
+        return sum(
+            (part @ theta for part, theta in zip(parts, own, strict=True)),
+            torch.zeros_like(self.residual),
+        )
 
     def residual_of(self, names: Sequence[str], *, gls: bool = False) -> Tensor:
         """Return the residual of base model and effects fitted to all poses, shape (M,), metres.
@@ -431,26 +418,9 @@ def pose_sums(
     ones = torch.eye(ends[-1] - len(prior), dtype=torch.float64)
     layout = Layout(base=len(prior), effects=spans, prior=torch.block_diag(prior, ones))
     parts = [*columns.values(), pose, residual[:, None]]
-    weights = fit.trust / fit.sigma**2, fit.share
-    size, units = sum(part.shape[1] for part in parts), observations.num_units
-    weighted, plain = (torch.zeros(units, size, size, dtype=torch.float64) for _ in weights)
-    frames_of: list[list[tuple[int, int]]] = [[] for _ in range(units)]
-    for unit, own in zip(observations.unit.tolist(), observations.frame_ends, strict=True):
-        frames_of[unit].append(own)
-
-    def sum_pose(unit: int) -> None:
-        for start, end in frames_of[unit]:
-            everything = torch.cat([part[start:end] for part in parts], dim=1)
-            for sums, weight in zip((weighted, plain), weights, strict=True):
-                root = (everything * weight[start:end, None].sqrt()).numpy()
-                # NumPy sees a matrix times itself, and computes half of the products: that takes
-                # half of the time of torch's.
-                sums[unit] += torch.from_numpy(root.T @ root)
-
-    for _ in in_threads(sum_pose, range(units)):
-        pass
-    frame_unit = observations.unit[observations.frame]
-    count = torch.zeros(units, dtype=torch.float64).index_add(0, frame_unit, fit.share)
+    unit = observations.unit[observations.frame]
+    pixels = unit.argsort(stable=True).split(torch.bincount(unit).tolist())
+    weighted, plain, count = _products(parts, fit, pixels)
     return PoseSums(
         weighted=weighted,
         plain=plain,
@@ -460,6 +430,27 @@ def pose_sums(
         dispersion=1.0,
         pose_sd=torch.full((NUM_POSE,), OLS_SD, dtype=torch.float64),
     )
+
+
+def _products(
+    parts: Sequence[Tensor], fit: BaseFit, pixels: Sequence[Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the products of columns (M, K) over the pixels of each unit, with both weights.
+
+    Returns:
+        Weighted and plain sums, shape (U, S, S), and the sums of the plain weights, shape (U,).
+    """
+
+    def of_unit(own: Tensor) -> tuple[Tensor, ...]:
+        everything = torch.cat([part[own] for part in parts], dim=1)
+        weights = fit.weight[own], fit.share[own]
+        # NumPy sees a matrix times itself, and computes half of the products: that takes half of
+        # the time of torch's.
+        roots = [(everything * weight[:, None].sqrt()).numpy() for weight in weights]
+        return *(torch.from_numpy(root.T @ root) for root in roots), weights[1].sum()
+
+    weighted, plain, count = zip(*in_threads(of_unit, pixels), strict=True)
+    return torch.stack(weighted), torch.stack(plain), torch.stack(count)
 
 
 def changed_system(
@@ -486,7 +477,7 @@ def changed_system(
     spans = [*(before.layout.effects[name] for name in changed), (last, last + 1)]
     places = torch.cat([torch.arange(*span) for span in spans])
     new = torch.cat([*changed.values(), residual[:, None]], dim=1)
-    weights = fit.trust / fit.sigma**2, fit.share
+    weights = fit.weight, fit.share
     # One pass over the columns gives both sums.
     right = torch.cat([own[:, None] * new for own in weights], dim=1)
     parts = [*columns.values(), system.pose, residual[:, None]]
@@ -511,15 +502,10 @@ def tile_sums(system: LinearSystem, names: Sequence[str], tiles: Tiles, fit: Bas
         tiles: The units.
         fit: Its noise and robust weights.
     """
-    whole, cut = system.sums.of(names), tiles.pixels
+    whole = system.sums.of(names)
     parts = [*system.of(names), system.pose, system.residual[:, None]]
-    everything = torch.cat([part[cut] for part in parts], dim=1)
-    weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
-    right = torch.cat([everything * own[:, None] for own in weights], dim=1)
-    pairs = zip(everything.split(tiles.counts), right.split(tiles.counts), strict=True)
-    weighted, plain = torch.stack([x.T @ y for x, y in pairs]).chunk(2, dim=2)
+    weighted, plain, count = _products(parts, fit, tiles.pixels.split(tiles.counts))
     weighted = _without_pose(weighted, tiles.pose[len(tiles.whole) :])
-    count = torch.stack([own.sum() for own in weights[1].split(tiles.counts)])
     return replace(
         whole,
         weighted=torch.cat([whole.weighted[tiles.whole], weighted]),
@@ -540,26 +526,12 @@ def _without_pose(sums: Tensor, pose: Tensor) -> Tensor:
     poses, number = pose.unique(return_inverse=True)
     whole = sums.new_zeros(len(poses), *sums.shape[1:]).index_add(0, number, sums)
     normal = whole[:, own, own]
-    ridge = _RIDGE * normal.diagonal(dim1=1, dim2=2).mean(1)
+    # Regular where few of its pixels count; far above the rounding of float64.
+    ridge = 1e-9 * normal.diagonal(dim1=1, dim2=2).mean(1)
     normal = normal + ridge[:, None, None] * torch.eye(NUM_POSE, dtype=torch.float64)
     fitted = torch.linalg.solve(normal, whole[:, own])
     fitted[:, :, own] = 0.0
     # With the columns X, those of the pose Z and the fit F: sums of products of X - Z F.
-    fitted, cross = fitted[number], sums[:, own]
-    change = fitted.mT @ (cross - cross[:, :, own] @ fitted / 2)
-    return sums - change - change.mT
-
-
-def solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
-    """Return what solves positive definite systems (..., K, K) for any right sides (..., K, R).
-
-    Cholesky's factors take half the time of Gauss's. Where rounding leaves a matrix that is not
-    positive, as in recordings without noise, the general solution is used.
-
-    Raises:
-        torch.linalg.LinAlgError: A matrix is singular; when it is solved.
-    """
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    if bool(failed.any()):
-        return partial(torch.linalg.solve, matrix)
-    return lambda right: torch.cholesky_solve(right, factor)
+    turn = torch.eye(sums.shape[-1], dtype=torch.float64).repeat(len(poses), 1, 1)
+    turn[:, own] -= fitted
+    return turn[number].mT @ sums @ turn[number]

@@ -11,8 +11,8 @@ independent noise would make them, where neighbours share noise or show a smooth
 no such sum.
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from functools import cached_property
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -20,114 +20,123 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import MapEffect
 
-MAP_SD = 0.003
-"""Least prior standard deviation of a cell's value, metres. Chosen: the size of fixed patterns."""
 
-
-class MapGain(NamedTuple):
-    """The effect of subtracting a map.
-
-    Attributes:
-        gain: Fall of chi-squared of each held-out pose, shape (U,).
-        values: The map's value in every pixel, estimated without the pixel's fold, shape (M,),
-            metres.
-        null: Total gain under every sign flip, shape (B,); empty if none was asked for.
-    """
-
-    gain: Tensor
-    values: Tensor
-    null: Tensor
-
-
-def map_gain(
-    study: Study,
-    effect: MapEffect,
-    residual: Tensor,
-    left_out: Tensor | None = None,
-    prior_sd: float | None = None,
-) -> MapGain:
-    """Estimate the map from the poses outside each fold, and judge it on those inside.
+class FittedMap:
+    """A map fitted to what a model leaves.
 
     Args:
         study: The recording.
         effect: Which map.
         residual: Of the model so far, shape (M,), metres.
-        left_out: The residual with every pose left out of its own fit, shape (M,); its signs are
-            flipped. None: no null distribution is drawn.
-        prior_sd: Prior standard deviation of the values, metres; None: what poses agree in, and
-            `MAP_SD` at least.
+        prior_sd: Prior standard deviation of the values, metres; None: what poses agree in.
+        least_sd: What is taken at least then, metres: the size of fixed patterns.
+
+    Attributes:
+        prior_sd: The one that was taken, metres.
     """
-    # Of large images few cells hold a chosen pixel.
-    used, cells = effect.cells_of(study.inputs).unique(return_inverse=True)
-    count = len(used)
-    unit, weight, folds = study.unit_of_pixel, pixel_weight(study), study.folds
-    fold = folds.argmax(0)[unit]
-    systems = _systems(cells, weight, fold, len(folds), count)
-    observed = _without_pose(study, residual)
-    prior_sd = _spread(study, cells, observed, count) if prior_sd is None else prior_sd
-    sums = _sums(cells, weight * observed, unit, count, study)
-    values = torch.stack([own.sum(1) for own in _solved(systems, sums, study, prior_sd)])
-    of_pixel = values[fold[:, None], cells].sum(-1)
-    gain = study.weight * (2 * observed * of_pixel - of_pixel**2)
-    zeros = torch.zeros(study.sums.num_units, dtype=torch.float64)
-    null = torch.zeros(0, dtype=torch.float64)
-    if left_out is not None:
+
+    def __init__(
+        self,
+        study: Study,
+        effect: MapEffect,
+        residual: Tensor,
+        prior_sd: float | None = None,
+        least_sd: float = 0.003,
+    ) -> None:
+        self._study, self._effect = study, effect
+        # Of large images few cells hold a chosen pixel.
+        self._used, self._cells = effect.cells_of(study.inputs).unique(return_inverse=True)
+        self._observed = _without_pose(study, residual)
+        self._sums = self._per_pose(self._cells, study.fit.weight * self._observed)
+        self.prior_sd = max(self._agreed(), least_sd) if prior_sd is None else prior_sd
+
+    def _per_pose(self, cells: Tensor, values: Tensor) -> Tensor:
+        """Return the sum of values (M,) in each of some cells (M, C) and pose, (U, cells)."""
+        sums = torch.zeros(self._study.sums.num_units, len(self._used), dtype=torch.float64)
+        for group in cells.unbind(1):
+            sums.index_put_((self._study.unit_of_pixel, group), values, accumulate=True)
+        return sums
+
+    def _agreed(self) -> float:
+        """Return the root mean square of what poses agree in, cell by cell, metres.
+
+        The noise of two poses is independent, so that the products of different poses estimate it.
+        """
+        weight, square = self._study.fit.weight, 0.0
+        for group in self._cells.split(1, dim=1):
+            own, seen = (self._per_pose(group, x) for x in (weight * self._observed, weight))
+            products, pairs = (float((x.sum(0) ** 2 - (x**2).sum(0)).sum()) for x in (own, seen))
+            if pairs > 0:
+                square = max(square, products / pairs)
+        return square**0.5
+
+    @cached_property
+    def _systems(self) -> Tensor:
+        """Each fold's normal matrix, (folds, cells, cells), or its diagonal (folds, cells).
+
+        Where a pixel lies in one cell only, the matrix is diagonal.
+        """
+        size, weight = [len(self._used)] * self._cells.shape[1], self._study.fit.weight
+        systems = torch.zeros(len(self._study.folds), *size, dtype=torch.float64)
+        for places in product(self._cells.unbind(1), repeat=len(size)):
+            systems.index_put_((self._fold, *places), weight, accumulate=True)
+        return systems
+
+    @property
+    def _fold(self) -> Tensor:
+        """The fold that holds out each pixel, shape (M,)."""
+        return self._study.folds.argmax(0)[self._study.unit_of_pixel]
+
+    def _solved(self, system: Tensor, right: Tensor) -> Tensor:
+        """Return the values of right sides (cells, R)."""
+        prior = self.prior_sd**-2
+        if system.ndim == 1:
+            return right / (system + prior)[:, None]
+        return torch.linalg.solve(system + prior * torch.eye(len(system)).double(), right)
+
+    def _without_folds(self, sums: Tensor) -> list[Tensor]:
+        """Return what every pose adds to the map without each fold, shape (cells, U) each."""
+        systems, kept = self._systems, 1 - self._study.folds
+        whole = systems.sum(0)
+        pairs = zip(systems, kept, strict=True)
+        return [self._solved(whole - own, (sums * inside[:, None]).T) for own, inside in pairs]
+
+    def whole(self) -> Tensor:
+        """Return the map's values estimated from all poses, shape (cells,), metres."""
+        found = self._solved(self._systems.sum(0), self._sums.sum(0)[:, None])[:, 0]
+        every = torch.zeros(self._effect.num_cells(self._effect.shape), dtype=torch.float64)
+        return every.index_copy(0, self._used, found)
+
+    @cached_property
+    def values(self) -> Tensor:
+        """The map's value in every pixel, estimated without the pixel's fold, (M,), metres."""
+        of_folds = torch.stack([own.sum(1) for own in self._without_folds(self._sums)])
+        return of_folds[self._fold[:, None], self._cells].sum(-1)
+
+    def gain(self) -> Tensor:
+        """Return the fall of chi-squared of each held-out pose, shape (U,)."""
+        gain = self._study.weight * (2 * self._observed * self.values - self.values**2)
+        zeros = torch.zeros(self._study.sums.num_units, dtype=torch.float64)
+        return zeros.index_add(0, self._study.unit_of_pixel, gain)
+
+    def null(self, left_out: Tensor) -> Tensor:
+        """Return the total gain under every sign flip, shape (B,).
+
+        The gain is a quadratic form of the signs, so that one matrix (U, U) serves all flips.
+
+        Args:
+            left_out: The residual with every pose left out of its own fit, shape (M,), metres.
+        """
+        study = self._study
         # What the map explains would widen the null distribution of a strong one.
-        unexplained = _without_pose(study, left_out) - of_pixel
-        sums = _sums(cells, weight * unexplained, unit, count, study)
-        null = _null(systems, sums, study, prior_sd) / study.sums.dispersion
-    return MapGain(
-        gain=zeros.index_add(0, unit, gain),
-        values=of_pixel,
-        null=null,
-    )
-
-
-def whole_map(
-    study: Study, effect: MapEffect, residual: Tensor, prior_sd: float | None = None
-) -> Tensor:
-    """Return the map's values estimated from all poses, shape (cells,), metres.
-
-    The arguments are those of `map_gain`.
-    """
-    cells = effect.cells_of(study.inputs)
-    count = effect.num_cells(effect.shape)
-    one_fold = torch.zeros(len(cells), dtype=torch.int64)
-    weight, observed = pixel_weight(study), _without_pose(study, residual)
-    prior_sd = _spread(study, cells, observed, count) if prior_sd is None else prior_sd
-    system = _systems(cells, weight, one_fold, 1, count)
-    right = torch.zeros(count, dtype=torch.float64)
-    for group in cells.unbind(1):
-        right = right.index_add(0, group, weight * observed)
-    prior = prior_sd**-2
-    if system.ndim == 2:
-        return right / (system[0] + prior)
-    return torch.linalg.solve(system[0] + prior * torch.eye(count).double(), right)
-
-
-def map_spread(study: Study, effect: MapEffect, residual: Tensor) -> float:
-    """Return the prior standard deviation of a map's values, metres; the residual is of (M,)."""
-    used, cells = effect.cells_of(study.inputs).unique(return_inverse=True)
-    return _spread(study, cells, _without_pose(study, residual), len(used))
-
-
-def pixel_weight(study: Study) -> Tensor:
-    """Return the inverse variance of each pixel's own noise, shape (M,), 1 / m^2."""
-    return study.fit.trust / study.fit.sigma**2
-
-
-def _spread(study: Study, cells: Tensor, values: Tensor, count: int) -> float:
-    """Return the root mean square of what poses agree in, cell by cell, `MAP_SD` at least, metres.
-
-    The noise of two poses is independent, so that the products of different poses estimate it.
-    """
-    weight, unit, square = pixel_weight(study), study.unit_of_pixel, MAP_SD**2
-    for group in cells.split(1, dim=1):
-        own, seen = (_sums(group, x, unit, count, study) for x in (weight * values, weight))
-        products, pairs = (float((x.sum(0) ** 2 - (x**2).sum(0)).sum()) for x in (own, seen))
-        if pairs > 0:
-            square = max(square, products / pairs)
-    return square**0.5
+        unexplained = _without_pose(study, left_out) - self.values
+        sums = self._per_pose(self._cells, study.fit.weight * unexplained)
+        form = torch.zeros(len(sums), len(sums), dtype=torch.float64)
+        for fold, values in enumerate(self._without_folds(sums)):
+            system = self._systems[fold]
+            curved = system[:, None] * values if system.ndim == 1 else system @ values
+            form.addmm_(values.T, 2 * (sums * study.folds[fold][:, None]).T - curved)
+        return ((study.signs @ form) * study.signs).sum(1) / study.sums.dispersion
 
 
 def _without_pose(study: Study, residual: Tensor) -> Tensor:
@@ -135,52 +144,3 @@ def _without_pose(study: Study, residual: Tensor) -> Tensor:
     inner, score = study.pose_equations(residual)
     guess = torch.linalg.solve(inner + torch.diag(study.sums.pose_sd**-2), score)
     return residual - study.pose_surface(guess)
-
-
-def _systems(cells: Tensor, weight: Tensor, fold: Tensor, folds: int, count: int) -> Tensor:
-    """Return each fold's normal matrix, (folds, cells, cells), or its diagonal (folds, cells).
-
-    Where a pixel lies in one cell only, the matrix is diagonal.
-    """
-    if cells.shape[1] == 1:
-        flat = torch.zeros(folds * count, dtype=torch.float64)
-        return flat.index_add(0, fold * count + cells[:, 0], weight).reshape(folds, count)
-    matrix = torch.zeros(folds * count * count, dtype=torch.float64)
-    for one in cells.unbind(1):
-        for other in cells.unbind(1):
-            matrix = matrix.index_add(0, (fold * count + one) * count + other, weight)
-    return matrix.reshape(folds, count, count)
-
-
-def _sums(cells: Tensor, values: Tensor, unit: Tensor, count: int, study: Study) -> Tensor:
-    """Return the sum of values in each cell and pose, shape (U, cells)."""
-    flat = torch.zeros(study.sums.num_units * count, dtype=torch.float64)
-    for group in cells.unbind(1):
-        flat = flat.index_add(0, unit * count + group, values)
-    return flat.reshape(-1, count)
-
-
-def _solved(systems: Tensor, sums: Tensor, study: Study, prior_sd: float) -> Iterator[Tensor]:
-    """Yield for each fold what every pose adds to the map without the fold, shape (cells, U)."""
-    whole, prior = systems.sum(0), prior_sd**-2
-    for own, inside in zip(systems, study.folds, strict=True):
-        right = (sums * (1 - inside[:, None])).T
-        rest = whole - own
-        if rest.ndim == 1:
-            yield right / (rest + prior)[:, None]
-        else:
-            yield torch.linalg.solve(rest + prior * torch.eye(len(rest)).double(), right)
-
-
-def _null(systems: Tensor, sums: Tensor, study: Study, prior_sd: float) -> Tensor:
-    """Return the total held-out gain of every flip, shape (B,).
-
-    The gain is a quadratic form of the signs, so that one matrix (U, U) serves all flips.
-    """
-    inside, signs = study.folds, study.signs
-    form = torch.zeros(len(sums), len(sums), dtype=torch.float64)
-    for fold, values in enumerate(_solved(systems, sums, study, prior_sd)):
-        system = systems[fold]
-        curved = system[:, None] * values if system.ndim == 1 else system @ values
-        form.addmm_(values.T, 2 * (sums * inside[fold][:, None]).T - curved)
-    return ((signs @ form) * signs).sum(1)

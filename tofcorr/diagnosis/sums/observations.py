@@ -24,37 +24,19 @@ from tofcorr.simulation.effects.numerics import by_frame
 from tofcorr.simulation.scene import planes_from_world
 
 
-def thinned(usable: Tensor, budget: int, rank: Tensor) -> Tensor:
-    """Keep at most `budget` of the usable pixels: those of the lowest rank."""
-    if len(usable) <= budget:
-        return usable
-    first = rank[usable].topk(budget, largest=False, sorted=False).indices
-    return usable[first].sort().values
-
-
-# Inverse of the plastic ratio. Multiples of it and of its square fill the square most evenly, as
-# those of the golden ratio fill a line (Roberts 2018, "The unreasonable effectiveness of
-# quasirandom sequences"). Derived: the real root of x^3 + x^2 = 1.
-_PLASTIC = 0.7548776662466927
-
-
-def ranks(height: int, width: int) -> Tensor:
-    """Return in which order the pixels of an image are chosen, shape (H W,), int64.
+def even_order(height: int, width: int) -> Tensor:
+    """Return the order in which the pixels of an image are chosen, flat indices (H W,), int64.
 
     The first ones of any number are spread evenly, and are the same in all frames: an error of each
-    pixel of its own shows only in a pixel that several poses see.
+    pixel of its own shows only in a pixel that several poses see. Multiples of the inverse of the
+    plastic ratio, the real root of x^3 + x^2 = 1, and of its square fill the square most evenly, as
+    those of the golden ratio fill a line (Roberts 2018, "The unreasonable effectiveness of
+    quasirandom sequences").
     """
+    plastic = float(np.roots([1, 1, 0, -1])[-1].real)
     rows, columns = torch.arange(height)[:, None], torch.arange(width)
-    place = (rows * _PLASTIC + columns * _PLASTIC**2).remainder(1.0)
-    return place.reshape(-1).argsort(stable=True).argsort()
-
-
-# Poses farther apart in time, seconds, do not determine the velocity between them. Chosen: a robot
-# starts and stops within a second.
-_LONGEST_GAP = 1.0
-# Usable pixels are so many times those chosen where some were chosen. Chosen: saturation and other
-# reasons leave out fewer.
-_MORE_THAN = 1.1
+    place = (rows * plastic + columns * plastic**2).remainder(1.0)
+    return place.reshape(-1).argsort(stable=True)
 
 
 TINY = float(torch.finfo(torch.float32).tiny)
@@ -112,8 +94,16 @@ class Observations:
 
     @cached_property
     def is_sample(self) -> bool:
-        """Whether some of the usable pixels were chosen, as of large images."""
-        return int(self.usable.sum()) > _MORE_THAN * len(self.pixel)
+        """Whether some of the usable pixels were chosen, as of large images.
+
+        Saturation and other reasons leave out fewer than a tenth of them.
+        """
+        return int(self.usable.sum()) > 1.1 * len(self.pixel)
+
+    @cached_property
+    def density(self) -> float:
+        """Share of the pixels on the target that were chosen, at most 1."""
+        return min(len(self.pixel) / max(int(self.on_target.sum()), 1), 1.0)
 
     @cached_property
     def frame_ends(self) -> list[tuple[int, int]]:
@@ -137,11 +127,20 @@ class Observations:
             sums[unit] += rows[:, start:end] @ columns[start:end]
         return torch.from_numpy(sums)
 
+    @property
     def conditions(self) -> Tensor:
-        """Return the frames' conditions in the order of `CONDITIONS`, (F, C); NaN: unknown."""
+        """The frames' conditions in the order of `CONDITIONS`, (F, C); NaN: unknown."""
         unknown = torch.full((self.num_frames,), torch.nan, dtype=torch.float64)
         columns = [getattr(self.facts, name) for name in CONDITIONS]
         return torch.stack([unknown if c is None else c.double() for c in columns], dim=1)
+
+    def choosing(self, frame: Tensor, pixel: Tensor) -> "Observations":
+        """Return other pixels of the same images: their frames and flat indices, (M,), in order."""
+        amplitude = None
+        if self.amplitude_images is not None:
+            amplitude = self.amplitude_images.flatten(1)[frame, pixel].double()
+        measured = self.distance_images.flatten(1)[frame, pixel].double()
+        return replace(self, frame=frame, pixel=pixel, measured=measured, amplitude=amplitude)
 
     def at(self, pixels: Tensor | slice) -> "Observations":
         """Return some of the pixels; images stay whole.
@@ -170,91 +169,81 @@ def observe(recording: Recording, most_pixels: int, *, least_per_frame: int = 64
     Raises:
         CalibrationDataError: Fewer than two frames hold usable pixels.
     """
-    height, width = recording.camera.height, recording.camera.width
     budget = max(least_per_frame, most_pixels // recording.num_frames)
-    rank, chosen, images, distances, targets = ranks(height, width), [], [], [], []
+    order = even_order(recording.camera.height, recording.camera.width)
+    chosen, images, distances, masks = [], [], [], []
     for batch in iterate_frames(recording, dtype=torch.float32):
         everywhere = batch.radial_distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
         distances.append(everywhere)
-        targets.append(_target(recording, batch.indices, batch.valid))
         if batch.amplitude is not None:
             images.append(torch.where(everywhere > 0, batch.amplitude, 0.0))
-        usable = batch.valid.flatten(1)
-        chosen += [thinned(torch.nonzero(own).reshape(-1), budget, rank) for own in usable]
+        mask = recording.read("mask", batch.indices.numpy())
+        masks.append(torch.ones_like(batch.valid) if mask is None else torch.from_numpy(mask) > 0)
+        chosen += [order[own[order]][:budget].sort().values for own in batch.valid.flatten(1)]
     counts = torch.tensor([len(own) for own in chosen])
-    frame, pixel = torch.arange(len(chosen)).repeat_interleave(counts), torch.cat(chosen)
     if int((counts > 0).sum()) < 2:
         raise CalibrationDataError(
             f"{recording.path}: a diagnosis needs at least two frames with usable pixels, "
             f"got {int((counts > 0).sum())}."
         )
-    distance_images = torch.cat(distances)
-    amplitude_images = torch.cat(images) if images else None
-    amplitude = None
-    if amplitude_images is not None:
-        amplitude = amplitude_images.flatten(1)[frame, pixel].double()
-    return Observations(
+    none = torch.empty(0, dtype=torch.int64)
+    every = Observations(
         recording=recording,
         facts=_facts(recording),
-        frame=frame,
-        pixel=pixel,
-        measured=distance_images.flatten(1)[frame, pixel].double(),
-        amplitude=amplitude,
-        amplitude_images=amplitude_images,
-        distance_images=distance_images,
-        on_target=torch.cat(targets),
+        frame=none,
+        pixel=none,
+        measured=torch.empty(0, dtype=torch.float64),
+        amplitude=None,
+        amplitude_images=torch.cat(images) if images else None,
+        distance_images=torch.cat(distances),
+        on_target=torch.cat(masks),
         unit=torch.from_numpy(pose_numbers(recording)),
     )
-
-
-def _target(recording: Recording, indices: Tensor, valid: Tensor) -> Tensor:
-    if recording.mask is None:
-        return torch.ones_like(valid)
-    return torch.from_numpy(np.asarray(recording.mask[indices.numpy()])).bool()
+    return every.choosing(torch.arange(len(chosen)).repeat_interleave(counts), torch.cat(chosen))
 
 
 def _facts(recording: Recording) -> FrameFacts:
     table = recording.frames
-    conditions: dict[str, Any] = {
+    known: dict[str, Any] = {
         name: None if values is None else torch.from_numpy(np.asarray(values, dtype=np.float64))
         for name, values in table.by_name().items()
     }
-    timestamp = torch.from_numpy(table.timestamp)
     poses = torch.from_numpy(table.world_from_tool)
     return FrameFacts(
         world_from_tool=poses,
         normal_world=torch.from_numpy(table.normal_world),
         offset=torch.from_numpy(table.offset),
-        tool_twist=_twists(timestamp, poses) if recording.moves else None,
+        tool_twist=_twists(known["timestamp"], poses) if recording.moves else None,
         approach=sides_of_approach(poses),
-        **conditions,
+        **known,
     )
 
 
-def _twists(timestamp: Tensor, poses: Tensor) -> Tensor | None:
+def _twists(timestamp: Tensor, poses: Tensor, *, longest_gap: float = 1.0) -> Tensor | None:
     """Return the tool's velocity in every frame, from a parabola through it and two near it.
 
     At the ends of a stroke both neighbours lie on one side. None if a frame has no two others
     within reach: then its velocity is unknown.
+
+    Args:
+        timestamp: Of the frames, shape (F,), seconds.
+        poses: Of the tool, shape (F, 4, 4).
+        longest_gap: Poses farther apart in time, seconds, do not determine the velocity between
+            them. Chosen: a robot starts and stops within a second.
     """
-    count = len(timestamp)
-    gaps = timestamp.diff()
-    if count < 3 or bool((gaps <= 0).any()):
+    count, gaps = len(timestamp), timestamp.diff()
+    if bool((gaps <= 0).any()):
         return None
+    stroke = torch.cat([gaps.new_zeros(1), (gaps > longest_gap).cumsum(0)])
     twists = torch.empty(count, 6, dtype=torch.float64)
     for frame in range(count):
-        around = sorted((k for k in range(frame - 2, frame + 3) if 0 <= k < count and k != frame),
-                        key=lambda k: (abs(k - frame), k))  # fmt: skip
-        # Frames that follow one another without a pause.
-        joined = [bool((gaps[min(frame, k) : max(frame, k)] <= _LONGEST_GAP).all()) for k in around]
-        near = [k for k, is_joined in zip(around, joined, strict=True) if is_joined][:2]
+        around = (frame - 1, frame + 1, frame - 2, frame + 2)
+        near = [k for k in around if 0 <= k < count and stroke[k] == stroke[frame]][:2]
         if len(near) < 2:
             return None
-        times = timestamp[near] - timestamp[frame]
+        first, second = (timestamp[near] - timestamp[frame]).tolist()
         moved = se3.log(se3.inverse(poses[frame]) @ poses[near])
-        first, second = times.tolist()
-        weights = torch.tensor([second / first, -first / second], dtype=torch.float64)
-        twists[frame] = (weights / (second - first)) @ moved
+        twists[frame] = (second / first * moved[0] - first / second * moved[1]) / (second - first)
     return twists
 
 
@@ -264,13 +253,11 @@ def same_exposure(observations: Observations) -> list[np.ndarray]:
     Errors change with the integration time, pixel by pixel, and would count as noise.
     """
     time = observations.facts.integration_time
-    exposure = np.zeros(observations.num_frames) if time is None else time.numpy()
-    target = observations.recording.frames.target
-    groups: dict[tuple[int, str, float], list[int]] = {}
-    for frame, unit in enumerate(observations.unit.tolist()):
-        key = (unit, str(target[frame]), float(np.nan_to_num(exposure[frame])))
-        groups.setdefault(key, []).append(frame)
-    return [np.array(group) for group in groups.values()]
+    exposure = np.zeros(observations.num_frames) if time is None else np.nan_to_num(time.numpy())
+    target = np.unique(observations.recording.frames.target, return_inverse=True)[1]
+    keys = np.stack([observations.unit.numpy(), target, exposure], axis=1)
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    return [np.flatnonzero(group == number) for number in range(group.max() + 1)]
 
 
 def small_tiles(observations: Observations, *, per_tile: float = 12.0) -> dict[str, Tensor]:
@@ -281,21 +268,18 @@ def small_tiles(observations: Observations, *, per_tile: float = 12.0) -> dict[s
         per_tile: Mean number of pixels in a tile. Chosen: enough pairs, yet smaller than the
             patterns of effects.
     """
-    camera = observations.recording.camera
-    pixel = observations.pixel
-    row, column = pixel // camera.width, pixel % camera.width
-    # All pixels are on the target where there is no mask.
-    density = len(pixel) / float(observations.on_target.double().sum())
-    area = per_tile / min(density, 1.0)
+    width, pixel = observations.recording.camera.width, observations.pixel
+    row, column = pixel // width, pixel % width
+    area = per_tile / observations.density
     side, length = max(2, round(area**0.5)), max(2, round(area))
     return {
-        "squares": row // side * camera.width + column // side,
-        "rows": row * camera.width + column // length,
-        "columns": row // length * camera.width + column,
+        "squares": row // side * width + column // side,
+        "rows": row * width + column // length,
+        "columns": row // length * width + column,
     }
 
 
-def frame_chunks(observations: Observations, most_pixels: int = 4_000_000) -> Iterator[slice]:
+def frame_chunks(observations: Observations, most_pixels: int = 500_000) -> Iterator[slice]:
     """Yield frames of whole images, so many pixels at a time that memory is bounded."""
     step = max(1, most_pixels // observations.on_target[0].numel())
     for start in range(0, observations.num_frames, step):

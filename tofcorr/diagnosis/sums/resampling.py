@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.diagnosis.options import TestOptions
+from tofcorr.diagnosis.sums.observations import Observations
 
 
 def draw_folds(num_units: int, count: int, generator: torch.Generator) -> Tensor:
@@ -22,26 +23,14 @@ def draw_folds(num_units: int, count: int, generator: torch.Generator) -> Tensor
         Which units each fold holds out, shape (folds, U), float64.
     """
     count = min(count, num_units)
-    of_unit = torch.empty(num_units, dtype=torch.int64)
     order = torch.randperm(num_units, generator=generator)
-    of_unit[order] = torch.arange(num_units) % count
+    of_unit = (torch.arange(num_units) % count)[order.argsort()]
     return (of_unit == torch.arange(count)[:, None]).double()
 
 
 def draw_signs(flips: int, num_units: int, generator: torch.Generator) -> Tensor:
     """Draw a sign for every unit and flip, shape (flips, U)."""
     return 2.0 * torch.randint(0, 2, (flips, num_units), generator=generator).double() - 1.0
-
-
-# Number of poses that are cut, and tiles a side of the image. Chosen, not derived: 512 tiles are
-# enough units for the sign flips, and each still holds dozens of pixels.
-_CUT_POSES = 8
-_TILES = 8
-# Least side of a tile, pixels, where a filter leaves neighbours with noise in common. Chosen: after
-# a Gaussian of 1.2 pixels the signs of tiles of six by four allow for half of the variance of slow
-# signals, those of eight for two thirds. Tiles of twelve would allow for four fifths, but are so
-# few in images of 32x24 that saturation of 14 mm was not found.
-_LEAST_FILTERED = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,44 +60,48 @@ class Tiles:
 
 
 def cut_into_tiles(
+    observations: Observations,
     energy: Tensor,
-    pose: Tensor,
-    pixel: Tensor,
-    camera: CameraIntrinsics,
-    folds: int,
-    flips: int,
+    tests: TestOptions,
     generator: torch.Generator,
+    filtered: bool,
     *,
-    filtered: bool = False,
+    most_poses: int = 8,
+    side: int = 8,
 ) -> Tiles:
     """Cut the poses with the most energy into tiles.
 
     Args:
+        observations: The pixels.
         energy: How strongly each pose would show the effects, shape (U,).
-        pose: Pose of every pixel, shape (M,), int64.
-        pixel: Flat index of every pixel, shape (M,), int64.
-        camera: Gives the image size.
-        folds: Number of folds.
-        flips: Number of sign flips.
+        tests: Numbers of folds and sign flips.
         generator: Of folds and flips.
-        filtered: Whether neighbouring pixels share noise.
+        filtered: Whether neighbouring pixels share noise. No side of a tile is then below eight
+            pixels: after a Gaussian of 1.2 pixels the signs of tiles of six by four allow for half
+            of the variance of slow signals, those of eight for two thirds. Tiles of twelve would
+            allow for four fifths, but are so few in images of 32x24 that saturation of 14 mm was
+            not found.
+        most_poses: Poses that are cut.
+        side: Tiles along each side of the image. Both are chosen, not derived: 512 tiles are enough
+            units for the sign flips, and each still holds dozens of pixels.
     """
+    camera, pose = observations.recording.camera, observations.unit[observations.frame]
     ranked = energy.sort(descending=True).indices
-    strongest, whole = ranked[:_CUT_POSES], ranked[_CUT_POSES:].sort().values
+    strongest, whole = ranked[:most_poses], ranked[most_poses:].sort().values
     inside = torch.isin(pose, strongest).nonzero()[:, 0]
-    row, column = pixel[inside] // camera.width, pixel[inside] % camera.width
-    least = _LEAST_FILTERED if filtered else 1
-    down, across = (min(_TILES, max(1, n // least)) for n in (camera.height, camera.width))
-    tile = (row * down // camera.height) * _TILES + column * across // camera.width
-    label = pose[inside] * _TILES**2 + tile
+    pixel = observations.pixel[inside]
+    least = 8 if filtered else 1
+    down, across = (min(side, max(1, n // least)) for n in (camera.height, camera.width))
+    row, column = pixel // camera.width * down, pixel % camera.width * across
+    tile = row // camera.height * side + column // camera.width
+    label = pose[inside] * side**2 + tile
     labels, counts = label.unique(return_counts=True)
     size = len(whole) + len(labels)
-    assigned = draw_folds(size, folds, generator)
     return Tiles(
         whole=whole,
         pixels=inside[label.argsort(stable=True)],
         counts=counts.tolist(),
-        pose=torch.cat([whole, labels // _TILES**2]),
-        folds=assigned,
-        signs=draw_signs(flips, size, generator),
+        pose=torch.cat([whole, labels // side**2]),
+        folds=draw_folds(size, tests.folds, generator),
+        signs=draw_signs(tests.flips, size, generator),
     )

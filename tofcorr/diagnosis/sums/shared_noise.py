@@ -10,42 +10,31 @@ edges, unless hardly any others are left.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.noise import Neighbours, PixelNoise, brightness_of, robust_weights
-from tofcorr.diagnosis.sums.observations import Observations, same_exposure, small_tiles
+from tofcorr.diagnosis.sums.noise import (
+    PixelNoise,
+    brightness_of,
+    common_of_neighbours,
+    robust_weights,
+)
+from tofcorr.diagnosis.sums.observations import (
+    Observations,
+    same_exposure,
+    small_tiles,
+)
 from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
 
-# Correlation counts from this many standard errors on, and is structure where both halves of the
-# frames agree in it by as many. The usual convention.
-_SIGNIFICANT = 3.0
-# Without repeats a smaller mean correlation in a tile does not count, even if it is significant: it
-# may be structure. The largest standard error at which filters are found; otherwise more pixels are
-# used: of single frames, and at last beside edges. And the largest share: some of the noise is each
-# pixel's own. Chosen: filters leave 0.1 to 0.6.
-_LEAST_SHARE, _PRECISE, _MOST_SHARE = 0.05, 0.06, 0.95
 # Least variance of the noise over that assumed, and what is added to the equations of an image's
 # offset and tilts, pixels. Chosen: keeps both solvable without noise, or of few pixels.
 _TINY = 1e-6
-# Beside edges pixels are used if their residuals vary less than this, over the variance of the
-# noise: with more, most of what neighbours share is structure. Pixels away from edges speak for all
-# if they are at least such a share: a few are those that masks and edges leave by chance. Chosen.
-_MOST_WHOLE, _LEAST_AWAY = 2.0, 0.1
-# Residuals are clipped at this many standard deviations. Chosen, as in the noise estimate.
-_CLIP = 6.0
-# Number of frames that correlations are estimated from, at most, evenly spread; and pixels of the
-# images that are looked at: of more, only some poses are. Chosen to bound the time, and the memory
-# to about half a gigabyte. But at least so many frames, so that the mean of the others shows what
-# all have in common.
-_MOST_FRAMES, _MOST_PIXELS, _LEAST_FRAMES = 60, 8_000_000, 20
-# Where pixels were chosen, about how many pixels of whole images are looked at, in at least so many
-# frames. Chosen: correlations of neighbours are then known to a per cent.
-_WHOLE_PIXELS, _LEAST_WHOLE_FRAMES = 400_000, 8
+# Pixels of the images that are looked at: of more, only some poses are. Chosen to bound the memory
+# to about half a gigabyte.
+_MOST_PIXELS = 8_000_000
 
 
 class Lags:
@@ -54,6 +43,11 @@ class Lags:
     Args:
         values: Images of mean zero, shape (F, H, W).
         used: Which pixels count, bool, shape (F, H, W).
+
+    Attributes:
+        products: Sums of the products of two pixels at each lag from -reach to reach, shape
+            (F, 2 rows + 1, 2 columns + 1).
+        counts: Number of these pairs.
 
     Class attributes:
         filter_reach: Filters reach this far, pixels: farther pixels share no noise. Chosen: three
@@ -64,46 +58,49 @@ class Lags:
         structure: Correlation beyond a filter's reach is structure if it varies by more than this
             share of that of neighbours. Set on openings 1 to 4 of `benchmarks.renewed`: stripes 0.3
             to 0.7, filters below 0.1.
+        significant: Correlation counts from this many standard errors on, and is structure where
+            both halves of the frames agree in it by as many. The usual convention.
     """
 
     filter_reach: ClassVar = 8
     farthest: ClassVar = 12
     least_left: ClassVar = 0.25
     structure: ClassVar = 0.25
+    significant: ClassVar = 3
 
     def __init__(self, values: np.ndarray, used: np.ndarray) -> None:
-        height, width = values.shape[1:]
+        shape = values.shape[1:]
         # Multiples of 16: prime factors above 100 take several times as long.
-        size = tuple(-(-(length + self.farthest) // 16) * 16 for length in (height, width))
-        spectrum = np.fft.rfft2(values * used, size)
-        mask = np.fft.rfft2(used.astype(float), size)
-        self.reach = (min(self.farthest, height - 1), min(self.farthest, width - 1))
-        # Lags from -reach to reach, (F, 2 rows + 1, 2 columns + 1).
-        rows, columns = (np.arange(-reach, reach + 1) for reach in self.reach)
-        near = np.s_[:, rows[:, None], columns]
-        self.products = np.fft.irfft2(np.abs(spectrum) ** 2, size)[near]
-        self.counts = np.fft.irfft2(np.abs(mask) ** 2, size).round()[near]
+        size = tuple(-(-(length + self.farthest) // 16) * 16 for length in shape)
+        self.reach = tuple(min(self.farthest, length - 1) for length in shape)
+        rows, columns = self._lags = [np.arange(-reach, reach + 1) for reach in self.reach]
+        self.products, self.counts = (
+            np.fft.irfft2(np.abs(np.fft.rfft2(images, size)) ** 2, size)[:, rows[:, None], columns]
+            for images in (values * used, used.astype(float))
+        )
+        self.counts = self.counts.round()
 
     def at(self, row: int, column: int) -> float:
         """Return the autocovariance at one lag; 0 where no pair has it."""
-        place = (slice(None), row + self.reach[0], column + self.reach[1])
         if abs(row) > self.reach[0] or abs(column) > self.reach[1]:
             return 0.0
+        place = np.s_[:, row + self.reach[0], column + self.reach[1]]
         return float(self.products[place].sum() / max(self.counts[place].sum(), 1.0))
 
     def plateau(self, form: str) -> float:
         """Return what pixels farther apart than a filter reaches still share, at least 0."""
         far = range(self.filter_reach, self.farthest + 1)
-        rows, columns = [self.at(0, k) for k in far], [self.at(k, 0) for k in far]
-        along = {"rows": float(np.mean(rows)), "columns": float(np.mean(columns))}
+        along = {
+            "rows": float(np.mean([self.at(0, k) for k in far])),
+            "columns": float(np.mean([self.at(k, 0) for k in far])),
+        }
         return max(0.0, along.get(form, max(along.values())))
 
     def level(self) -> float:
         """Return the noise over what second differences between neighbours see of it."""
         plateau = self.plateau("rows")
-        own = max(self.at(0, 0) - plateau, _TINY)
-        near = [(self.at(0, k * SPACING) - plateau) / own for k in (1, 2)]
-        seen = 1 - (2 * near[0] - near[1] / 2) / SECOND_DIFFERENCE
+        own, once, twice = (self.at(0, k * SPACING) - plateau for k in range(3))
+        seen = 1 - (2 * once - twice / 2) / max(own, _TINY) / SECOND_DIFFERENCE
         return float(np.clip(seen, self.least_left, 1.0) ** -0.5)
 
     def reaches_far(self, share: float) -> bool:
@@ -115,12 +112,12 @@ class Lags:
         Args:
             share: What neighbours share, over the variance of a pixel.
         """
-        rows, columns = (np.abs(np.arange(-reach, reach + 1)) for reach in self.reach)
-        far = np.maximum(rows[:, None], columns) >= self.filter_reach
-        half = len(self.counts) // 2
-        halves = slice(half), slice(half, None)
-        pairs = np.stack([self.counts[half].sum(0)[far] for half in halves])
-        products = np.stack([self.products[half].sum(0)[far] for half in halves])
+        rows, columns = map(np.abs, self._lags)
+        far, half = np.maximum(rows[:, None], columns) >= self.filter_reach, len(self.counts) // 2
+        pairs, products = (
+            np.stack([sums[:half].sum(0)[far], sums[half:].sum(0)[far]])
+            for sums in (self.counts, self.products)
+        )
         weight = pairs.min(0) / max(float(pairs.min(0).sum()), 1.0)
         both = products / np.maximum(pairs, 1.0)
         both -= (both @ weight)[:, None]
@@ -128,7 +125,8 @@ class Lags:
         square = float(agreed @ weight)
         error = float(np.linalg.norm((agreed - square) * weight))
         # Of few pixels every lag is uncertain, and halves agree by chance.
-        return square > max(_SIGNIFICANT * error, (self.structure * share * self.at(0, 0)) ** 2)
+        least = (self.structure * share * self.at(0, 0)) ** 2
+        return square > max(self.significant * error, least)
 
     def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:
         """Return the mean autocovariance over pairs of a tile, and its standard error.
@@ -139,29 +137,22 @@ class Lags:
             cells: Tile of each pixel of a frame, shape (H, W); -1: not used.
             plateau: Subtracted from every lag within reach.
         """
-        sizes = np.bincount(cells[cells >= 0])
-        total = float((sizes * (sizes - 1)).sum())
-        counts = self.counts.sum(0)
-        own = np.zeros(len(self.products))
-        rows, columns = (min(self.filter_reach, reach) for reach in self.reach)
-        for row, column in product(range(rows + 1), range(-columns, columns + 1)):
-            if row == 0 and column <= 0:
-                continue
-            left, right = max(0, -column), max(0, column)
-            one = cells[: len(cells) - row, left : cells.shape[1] - right]
-            other = cells[row:, right : cells.shape[1] - left]
-            pairs = int(((one == other) & (one >= 0)).sum())
-            if pairs:
-                place = (slice(None), row + self.reach[0], column + self.reach[1])
-                excess = self.products[place] - plateau * self.counts[place]
-                own += 2 * pairs * excess / max(float(counts[place[1:]]), 1.0)
-        own /= max(total, 1.0)
         weight = self.counts[:, self.reach[0], self.reach[1]]
         if (weight > 0).sum() < 2:
             return 0.0, float("inf")
-        weight = weight / max(float(weight.sum()), 1.0)
+        height, width = cells.shape
+        padded, near = np.pad(cells, self.farthest, constant_values=-1), self.farthest
+        pairs = np.zeros(self.counts.shape[1:])
+        for i, row in enumerate(self._lags[0]):
+            for j, column in enumerate(self._lags[1]):
+                if (row, column) != (0, 0) and max(abs(row), abs(column)) <= self.filter_reach:
+                    other = padded[near + row :, near + column :][:height, :width]
+                    pairs[i, j] = ((cells == other) & (cells >= 0)).sum()
+        sizes = np.bincount(cells[cells >= 0])
+        excess = (self.products - plateau * self.counts) / np.maximum(self.counts.sum(0), 1.0)
+        own = (pairs * excess).sum((1, 2)) / max(float((sizes * (sizes - 1)).sum()), 1.0)
         mean = float(own.sum())
-        return mean, float(np.sqrt(np.sum((own - mean * weight) ** 2)))
+        return mean, float(np.linalg.norm(own - mean * weight / weight.sum()))
 
 
 @dataclass(frozen=True)
@@ -187,8 +178,8 @@ class SharedNoise:
 
     @property
     def precise(self) -> bool:
-        """Whether a filter that is there would be found."""
-        return max(self.error.values()) <= _PRECISE
+        """Whether a filter that is there would be found: filters leave shares of 0.1 to 0.6."""
+        return max(self.error.values()) <= 0.06
 
 
 def shared_noise(
@@ -198,6 +189,9 @@ def shared_noise(
     trust: Tensor,
     *,
     least_repeats: int = 4,
+    most_frames: int = 60,
+    least_away: float = 0.1,
+    most_whole: float = 2.0,
 ) -> SharedNoise:
     """Estimate what pixels share of their noise.
 
@@ -208,12 +202,23 @@ def shared_noise(
         trust: Robust weights, shape (M,); pixels without weight are not used.
         least_repeats: Repeats beyond the first frame of each pose that a standard error needs.
             Chosen.
+        most_frames: Without repeats, about how many frames are used, evenly spread. Chosen to bound
+            the time.
+        least_away: Pixels away from edges speak for all if they are such a share: a few are those
+            that masks and edges leave by chance. Chosen.
+        most_whole: Beside edges pixels are used if their residuals vary less than this, over the
+            variance of the noise: with more, most of what neighbours share is structure. Chosen.
     """
     frames = _frames(observations)
     used = _image(observations, trust > 0, frames)
     precision = _image(observations, 1 / sigma, frames)
     images = _image(observations, residual / sigma, frames)
-    tiles = {form: _cells(observations, own) for form, own in small_tiles(observations).items()}
+    # Tile of each pixel of the frame with the most pixels.
+    fullest = torch.bincount(observations.frame).argmax(0, keepdim=True).numpy()
+    tiles = {
+        form: _image(observations, own, fullest, -1)[0]
+        for form, own in small_tiles(observations).items()
+    }
     together = [np.flatnonzero(np.isin(frames, group)) for group in same_exposure(observations)]
     repeats = [group for group in together if len(group) > 1]
     if sum(len(group) - 1 for group in repeats) >= least_repeats:
@@ -222,27 +227,31 @@ def shared_noise(
         found = _found(values, same, tiles, from_repeats=True)
         if found.precise or found.striped:
             return found
-    step = max(1, len(images) // _MOST_FRAMES)
+    step = max(1, len(images) // most_frames)
     away = used & ~_edges(observations, frames)
     found = _found(*_apart_from_pattern(images, precision, away, step), tiles, from_repeats=False)
-    if found.precise and away.sum() >= _LEAST_AWAY * used.sum():
+    if found.precise and away.sum() >= least_away * used.sum():
         return found
     every = _found(*_apart_from_pattern(images, precision, used, step), tiles, from_repeats=False)
-    return every if every.whole < _MOST_WHOLE else found
+    return every if every.whole < most_whole else found
 
 
 def _found(
     values: np.ndarray, used: np.ndarray, tiles: Mapping[str, np.ndarray], *, from_repeats: bool
 ) -> SharedNoise:
-    """Estimate what pixels share from images (F, H, W), for tiles (H, W) of every form."""
+    """Estimate what pixels share from images (F, H, W), for tiles (H, W) of every form.
+
+    Without repeats a mean correlation in a tile below 0.05 does not count, even if it is
+    significant: it may be structure. Some of the noise is each pixel's own: at most 0.95 is shared.
+    """
     lags, share, error = Lags(values, used), {}, {}
     # Noise over that assumed: less where a filter over time makes repeats alike.
     whole = max(lags.at(0, 0) - (0.0 if from_repeats else lags.plateau("squares")), _TINY)
     for form, cells in tiles.items():
         plateau = 0.0 if from_repeats else lags.plateau(form)
         value, own = (x / whole for x in lags.mean_in_tiles(cells, plateau))
-        least = max(_SIGNIFICANT * own, 0.0 if from_repeats else _LEAST_SHARE)
-        share[form] = min(value, _MOST_SHARE) if value > least else 0.0
+        least = max(lags.significant * own, 0.0 if from_repeats else 0.05)
+        share[form] = min(value, 0.95) if value > least else 0.0
         error[form] = own
     most = max(share.values())
     striped = most > 0 and lags.reaches_far(most)
@@ -251,35 +260,30 @@ def _found(
 
 
 def _frames(observations: Observations) -> np.ndarray:
-    """Return the frames that are looked at: all that have pixels, or those of some poses."""
-    camera, seen = observations.recording.camera, observations.frame.unique().numpy()
-    most = max(_MOST_PIXELS // (camera.height * camera.width), _LEAST_FRAMES)
-    if len(seen) <= most:
-        return seen
+    """Return the frames that are looked at: all that have pixels, or those of some poses.
+
+    They are 20 at least, so that the mean of the others shows what all have in common.
+    """
+    seen = observations.frame.unique().numpy()
+    most = max(_MOST_PIXELS // observations.on_target[0].numel(), 20)
     unit = observations.unit.numpy()[seen]
     poses = np.unique(unit)
-    places = np.linspace(0, len(poses) - 1, max(len(poses) * most // len(seen), 1)).round()
-    return seen[np.isin(unit, poses[places.astype(int)])]
+    some = max(len(poses) * most // len(seen), 1)
+    if len(seen) > most:
+        poses = poses[np.linspace(0, len(poses) - 1, some).round().astype(int)]
+    return seen[np.isin(unit, poses)]
 
 
 def _image(
     observations: Observations, values: Tensor, frames: np.ndarray, fill: float = 0
 ) -> np.ndarray:
     """Return values (M,) as images (F, H, W) of some frames; `fill` where there are none."""
-    camera = observations.recording.camera
-    place = torch.full((observations.num_frames,), -1)
-    place[torch.from_numpy(frames)] = torch.arange(len(frames))
-    row = place[observations.frame]
-    own = row >= 0
-    images = torch.full((len(frames), camera.height * camera.width), fill, dtype=values.dtype)
-    images[row[own], observations.pixel[own]] = values[own]
-    return images.reshape(-1, camera.height, camera.width).numpy()
-
-
-def _cells(observations: Observations, cells: Tensor) -> np.ndarray:
-    """Return the tile of each pixel of the frame with the most pixels, (H, W); -1: not used."""
-    frame = torch.bincount(observations.frame).argmax(0, keepdim=True).numpy()
-    return _image(observations, cells, frame, -1)[0]
+    size, frame = observations.on_target.shape[1:], torch.from_numpy(frames)
+    own = torch.isin(observations.frame, frame)
+    images = torch.full((len(frames), size.numel()), fill, dtype=values.dtype)
+    row = torch.searchsorted(frame, observations.frame[own])
+    images[row, observations.pixel[own]] = values[own]
+    return images.reshape(-1, *size).numpy()
 
 
 def _around_mean(images: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -297,7 +301,7 @@ def _apart_from_pattern(
     """Return images less what all have in common, and less the offset and tilts of each.
 
     What they have in common is so in metres. In units of the noise it is smaller where an image is
-    darker.
+    darker. A pose tilts a whole image; pixels far apart would seem to share that.
 
     Args:
         images: Residuals over the standard deviation of the noise, shape (F, H, W).
@@ -305,33 +309,23 @@ def _apart_from_pattern(
         used: Which pixels count, shape (F, H, W).
         step: Of the images that are returned.
     """
-    count, weight, part = used.sum(0), used * precision, slice(None, None, step)
+    weight, part = used * precision, slice(None, None, step)
     # The mean of all other images has nothing of an image's own noise.
     others = (weight * images).sum(0) - (weight * images)[part]
     certain = (weight**2).sum(0) - weight[part] ** 2
     own = images[part] - precision[part] * others / np.where(certain > 0, certain, 1.0)
-    use = used[part] & (count > 1)
-    return _clipped(own - _planes(own, use)), use
+    use = used[part] & (used.sum(0) > 1)
+    row, column = (np.linspace(-1, 1, length) for length in images.shape[1:])
+    basis = np.stack(np.broadcast_arrays(1.0, row[:, None], column)).reshape(3, -1)
+    flat, inside = own.reshape(len(own), -1), use.reshape(len(use), -1).astype(float)
+    inner = np.einsum("fp,ip,jp->fij", inside, basis, basis, optimize=True) + _TINY * np.eye(3)
+    tilts = np.linalg.solve(inner, ((flat * inside) @ basis.T)[..., None])[..., 0]
+    return _clipped(own - (tilts @ basis).reshape(own.shape)), use
 
 
 def _clipped(values: np.ndarray) -> np.ndarray:
-    return np.clip(values, -_CLIP, _CLIP)
-
-
-def _planes(images: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the offset and two tilts of each image, fitted to the used pixels, (F, H, W).
-
-    A pose tilts a whole image; pixels far apart would seem to share that.
-    """
-    height, width = images.shape[1:]
-    row, column = np.linspace(-1, 1, height), np.linspace(-1, 1, width)
-    basis = np.stack(np.broadcast_arrays(np.ones((height, width)), row[:, None], column))
-    basis = basis.reshape(3, -1)
-    flat, weight = images.reshape(len(images), -1), used.reshape(len(images), -1)
-    products = (basis[:, None] * basis).reshape(9, -1)
-    inner = (weight @ products.T).reshape(-1, 3, 3) + _TINY * np.eye(3)
-    own = np.linalg.solve(inner, ((flat * weight) @ basis.T)[..., None])[..., 0]
-    return (own @ basis).reshape(images.shape)
+    """Clip residuals at six standard deviations, as in the noise estimate."""
+    return np.clip(values, -6, 6)
 
 
 def _edges(observations: Observations, frames: np.ndarray) -> np.ndarray:
@@ -340,10 +334,7 @@ def _edges(observations: Observations, frames: np.ndarray) -> np.ndarray:
     if observations.amplitude_images is None:
         return edges
     amplitude = observations.amplitude_images.numpy()[frames]
-    for one, other in (
-        (np.s_[:, :-1], np.s_[:, 1:]),
-        (np.s_[:, :, :-1], np.s_[:, :, 1:]),
-    ):
+    for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:, :, :-1], np.s_[:, :, 1:])):
         low = np.minimum(amplitude[one], amplitude[other])
         odd = np.abs(amplitude[other] - amplitude[one]) > SAME_BRIGHTNESS * low
         edges[one] |= odd
@@ -351,31 +342,13 @@ def _edges(observations: Observations, frames: np.ndarray) -> np.ndarray:
     return edges
 
 
-def whole_images(observations: Observations) -> Observations | None:
-    """Return all pixels of some evenly spread frames; None where all pixels were chosen anyway."""
-    if not observations.is_sample:
-        return None
-    usable = observations.usable
-    counts = usable.flatten(1).sum(1)
-    seen = torch.nonzero(counts)[:, 0]
-    most = max(int(_WHOLE_PIXELS / counts[seen].double().mean()), _LEAST_WHOLE_FRAMES)
-    frames = seen[torch.linspace(0, len(seen) - 1, min(most, len(seen))).round().long()]
-    number, pixel = usable[frames].flatten(1).nonzero(as_tuple=True)
-    frame, images = frames[number], observations.amplitude_images
-    return replace(
-        observations,
-        frame=frame,
-        pixel=pixel,
-        measured=observations.distance_images.flatten(1)[frame, pixel].double(),
-        amplitude=None if images is None else images.flatten(1)[frame, pixel].double(),
-    )
-
-
 def with_level_of_images(
     shared: SharedNoise,
     observations: Observations,
     noise: PixelNoise,
     residual_of: Callable[[Observations], Tensor],
+    *,
+    most_pixels: int = 400_000,
 ) -> SharedNoise:
     """Return what neighbours share, its level from whole images where pixels were chosen.
 
@@ -386,11 +359,19 @@ def with_level_of_images(
         observations: The chosen pixels.
         noise: That differences between neighbours see.
         residual_of: Returns the residual of a fit in other pixels, metres.
+        most_pixels: About how many pixels of whole images are looked at, in eight frames at least.
+            Chosen: correlations of neighbours are then known to a per cent.
     """
-    whole = whole_images(observations)
-    if whole is None:
+    if not observations.is_sample:
         return shared
+    usable = observations.usable.flatten(1)
+    counts = usable.sum(1)
+    seen = counts.nonzero()[:, 0]
+    most = max(int(most_pixels / counts[seen].double().mean()), 8)
+    frames = seen[torch.linspace(0, len(seen) - 1, min(most, len(seen))).round().long()]
+    number, pixel = usable[frames].nonzero(as_tuple=True)
+    whole = observations.choosing(frames[number], pixel)
     residual, sigma = residual_of(whole), noise.at(brightness_of(whole), whole.frame)
-    trust = robust_weights(residual, sigma, Neighbours(whole).common(residual))
+    trust = robust_weights(residual, sigma, common_of_neighbours(whole, residual))
     level = max(shared.level, shared_noise(whole, residual, sigma, trust).level)
     return replace(shared, level=level, whole=shared.whole * (shared.level / level) ** 2)

@@ -30,14 +30,8 @@ from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
 
-# Periods of the periodic probe, frames. Chosen: cycles of exposures and modulation frequencies.
-_PERIODS = (2, 3, 4, 5)
-# Most half waves over the image, in both directions together. Chosen.
-_MAP_WAVES = 9
 # Prior standard deviation of a probe, metres. Chosen.
 _SIZE = 0.01
-# Amplitude ratios are clamped here, so that dark pixels do not dominate a probe.
-_MOST_BRIGHTER = 20.0
 
 
 @dataclass(frozen=True)
@@ -74,14 +68,12 @@ def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
 
 
 def _frame_period(inputs: EffectInputs) -> Tensor:
+    """Return waves over 2 to 5 frames: cycles of exposures and modulation frequencies."""
     number = torch.arange(len(inputs.facts.timestamp), dtype=torch.float64)
-    columns = []
-    for period in _PERIODS:
-        turn = 2 * torch.pi * number / period
-        columns.append(torch.cos(turn))
-        if period > 2:
-            columns.append(torch.sin(turn))
-    return inputs.of_frame(_SIZE * torch.stack(columns, dim=-1))
+    turns = [2 * torch.pi * number / period for period in (2, 3, 4, 5)]
+    waves = [wave(turn) for turn in turns for wave in (torch.cos, torch.sin)]
+    # The sine of every second frame is zero.
+    return inputs.of_frame(_SIZE * torch.stack([waves[0], *waves[2:]], dim=-1))
 
 
 def _map(inputs: EffectInputs) -> Tensor:
@@ -92,33 +84,35 @@ def _map(inputs: EffectInputs) -> Tensor:
     # Each pixel once, however many frames show it.
     used, number = inputs.pixel.unique(return_inverse=True)
     height, width = inputs.camera.height, inputs.camera.width
-    x = torch.remainder(used, width).double() / max(width - 1, 1)
-    y = torch.div(used, width, rounding_mode="floor").double() / max(height - 1, 1)
-    of_x, of_y = ([torch.cos(torch.pi * i * at) for i in range(_MAP_WAVES)] for at in (x, y))
+    places = (used % width) / max(width - 1, 1), (used // width) / max(height - 1, 1)
+    of_x, of_y = ([torch.cos(torch.pi * i * at.double()) for i in range(9)] for at in places)
     columns = [
         _SIZE / (1 + 3 * (i + j) / 10) * of_x[i] * of_y[j]
-        for i, j in product(range(_MAP_WAVES), repeat=2)
-        if 0 < i + j <= _MAP_WAVES
+        for i, j in product(range(9), repeat=2)
+        if 0 < i + j <= 9
     ]
     return torch.stack(columns, dim=-1)[number]
 
 
-def _previous_frame(inputs: EffectInputs) -> Tensor:
+def _previous_frame(inputs: EffectInputs, *, most_brighter: float = 20.0) -> Tensor:
     """Return the change since the previous frame, and the error by a tenth of its signal, metres.
 
     That is added to the pixel's own.
+
+    Args:
+        inputs: The pixels.
+        most_brighter: Ratios of amplitudes are clamped here, so that dark pixels do not dominate.
     """
     before = (inputs.frame - 1).clamp(min=0)
     assert inputs.distance_images is not None
     distance = inputs.distance_images.flatten(1)[before, inputs.pixel].double()
     seen = (distance > 0) & (inputs.frame > 0)
-    further = torch.where(seen, distance - inputs.radial_distance, 0.0)
-    columns = [further / 20]
+    columns = [torch.where(seen, distance - inputs.radial_distance, 0.0) / 20]
     if inputs.amplitude_images is not None and inputs.modulation_frequency is not None:
         amplitude = inputs.amplitude_images.flatten(1)[before, inputs.pixel].double()
         share = torch.where(seen, amplitude, 0.0) / inputs.known_amplitude.clamp(min=TINY)
         phase = phase_from_radial_distance(distance, inputs.known_frequency) - inputs.phase
-        share = share.clamp(max=_MOST_BRIGHTER) * torch.sin(phase)
+        share = share.clamp(max=most_brighter) * torch.sin(phase)
         columns.append(inputs.metres_per_radian / 10 * share)
     return torch.stack(columns, dim=-1)
 
@@ -253,18 +247,15 @@ def build_study(
     folds = draw_folds(num_units, tests.folds, generator)
     signs = draw_signs(tests.flips, num_units, generator)
     candidates = candidate_effects(options, inputs)
-    sources: dict[str, Callable[[EffectInputs], Tensor]] = {
-        name: partial(_scaled_columns, effect) for name, effect in candidates.effects.items()
-    }
+    sources = {name: partial(_scaled_columns, e) for name, e in candidates.effects.items()}
     sources |= {name: probe.columns for name, probe in candidates.probes.items()}
-    system = linear_system(observations, fit, inputs, sources)
     study = Study(
         options=options,
         observations=observations,
         fit=fit,
         inputs=inputs,
         candidates=candidates,
-        system=system,
+        system=linear_system(observations, fit, inputs, sources),
         folds=folds,
         signs=signs,
         tiles=None,
@@ -272,18 +263,10 @@ def build_study(
     few = [n for n in candidates.effects if candidates.is_tested_by_tiles(n)]
     if not few:
         return study
-    own = torch.cat([torch.arange(*system.sums.layout.effects[name]) for name in few])
-    tiles = cut_into_tiles(
-        system.sums.gls.gram.diagonal(dim1=1, dim2=2)[:, own].sum(1),
-        study.unit_of_pixel,
-        observations.pixel,
-        observations.recording.camera,
-        tests.folds,
-        tests.flips,
-        generator,
-        filtered=max(fit.shared.share.values()) > 0,
-    )
-    return replace(study, tiles=tiles)
+    gls, base = study.sums.gls, study.sums.layout.base
+    energy = gls.gram.diagonal(dim1=1, dim2=2)[:, gls.layout.of(few)[base:]].sum(1)
+    filtered = max(fit.shared.share.values()) > 0
+    return replace(study, tiles=cut_into_tiles(observations, energy, tests, generator, filtered))
 
 
 def _scaled_columns(effect: CatalogueEffect, inputs: EffectInputs) -> Tensor:
@@ -339,8 +322,12 @@ def relinearised(study: Study, names: Sequence[str], *, most_linearisations: int
     """
     effects = study.candidates.effects
     bent = [name for name in names if name in effects and not effects[name].linear]
-    best, best_loss = study, _loss(study, names)
-    system = study.system
+
+    def loss(study: Study) -> float:
+        """Return the weighted sum of squares of the model fitted to all poses, m^2."""
+        return float((study.fit.share * study.system.residual_of(names) ** 2).sum())
+
+    best, best_loss, system = study, loss(study), study.system
     for _ in range(most_linearisations if bent else 0):
         theta, places = system.sums.ols.solve(names), system.sums.layout.only(names).effects
         residual, changed = study.system.residual, dict[str, Tensor]()
@@ -352,13 +339,7 @@ def relinearised(study: Study, names: Sequence[str], *, most_linearisations: int
             changed[name] = slope * sd
         system = changed_system(system, study.observations, study.fit, residual, names, changed)
         current = replace(study, system=system)
-        loss = _loss(current, names)
-        if not loss < best_loss:
+        if not loss(current) < best_loss:
             break
-        best, best_loss = current, loss
+        best, best_loss = current, loss(current)
     return best
-
-
-def _loss(study: Study, names: Sequence[str]) -> float:
-    """Return the weighted sum of squares of a model fitted to all poses, m^2."""
-    return float((study.fit.share * study.system.residual_of(names) ** 2).sum())
