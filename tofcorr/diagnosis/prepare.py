@@ -88,35 +88,24 @@ def prepare(
 
 
 def _both_known(
-    observations: Observations,
-    simulator: GivenSimulator,
-    options: DiagnosisOptions,
-    *,
-    least_known: float = 0.1,
-    worth_saying: float = 0.001,
+    observations: Observations, simulator: GivenSimulator, options: DiagnosisOptions
 ) -> tuple[Observations, SimulatorError, list[str]]:
     """Return the pixels for which a simulator has a distance, its error there, and warnings.
 
-    Args:
-        observations: The pixels of the recording.
-        simulator: The simulator under diagnosis.
-        options: Of the diagnosis.
-        least_known: Least share of the pixels that a simulator must know. Chosen: with fewer, the
-            comparison would be about another recording.
-        worth_saying: Shares of pixels without a simulated distance above this are worth a warning.
-            Chosen.
+    With fewer than a tenth of the pixels the comparison would be about another recording; a
+    thousandth without a distance is worth a warning.
     """
     error, warnings = simulator.simulate(observations, options)
     known = error.error.isfinite()
     share = float(known.double().mean())
     frames = len(torch.unique(observations.frame[known]))
-    if share < least_known or frames < 2:
+    if 10 * share < 1 or frames < 2:
         raise CalibrationDataError(
             f"{observations.recording.path}: the simulator has a distance for {100 * share:.1f} % "
             f"of the recording's pixels, in {frames} frames; simulate its poses and targets, or "
             "a range of distances and amplitudes that covers it."
         )
-    if share <= 1 - worth_saying:
+    if 1000 * (1 - share) >= 1:
         warnings.append(
             f"The simulator has no distance for {100 * (1 - share):.1f} % of the recording's "
             "pixels; they are left out."

@@ -18,17 +18,15 @@ from tofcorr.plausibility.look import Look
 from tofcorr.simulation.options import SimulatorOptions
 
 
-def refuse_other_camera(
-    real: Recording, simulated: Recording, *, same_ray_px: float = 0.01
-) -> None:
+def refuse_other_camera(real: Recording, simulated: Recording) -> None:
     """Refuse frames of another image size or of other viewing rays.
+
+    Two cameras are the same if no pixel's ray differs by more than a hundredth of a pixel: at an
+    incidence of 45 degrees it changes a distance of 1 m by 0.1 mm at 100 pixels of focal length.
 
     Args:
         real: The recording.
         simulated: The rendered frames.
-        same_ray_px: Two cameras are the same if no pixel's ray differs by more than this, pixels.
-            Chosen: at an incidence of 45 degrees it changes a distance of 1 m by 0.1 mm at 100
-            pixels of focal length.
 
     Raises:
         CalibrationDataError: The cameras differ; the sentence says by how much.
@@ -41,7 +39,7 @@ def refuse_other_camera(
         )
     apart = (ray_directions(one) - ray_directions(other)).norm(dim=-1).max()
     pixels = float(apart) * max(one.matrix[0][0], one.matrix[1][1])
-    if not pixels <= same_ray_px:
+    if not 100 * pixels <= 1:
         raise CalibrationDataError(
             f"{simulated.path}: its pixels look up to {pixels:.2g} pixels beside those of "
             f"{real.path}; render with the recording's own K and distortion (recording.yaml: "
@@ -49,24 +47,12 @@ def refuse_other_camera(
         )
 
 
-def refuse_without_truth(
-    simulated: Recording,
-    observations: Observations,
-    *,
-    absurd: float = 0.3,
-    slope_tolerance: float = 0.3,
-) -> None:
+def refuse_without_truth(simulated: Recording, observations: Observations) -> None:
     """Refuse frames that disagree with their own geometry beyond what any camera does.
 
     Args:
         simulated: The rendered frames.
         observations: Their pixels.
-        absurd: Rendered frames whose median distance is off by more than this from their own
-            planes, metres, are refused. Chosen: no depth camera is as wrong, and every mistaken
-            axis or unit gives more.
-        slope_tolerance: The kind of depth is wrong if the difference from the planes follows the
-            difference between the kinds with a slope within this of -1. The slope is 0 if the kind
-            is right; chosen, far from both.
 
     Raises:
         CalibrationDataError: Planes, hand-eye transform, axes, unit or kind of depth are wrong.
@@ -86,13 +72,15 @@ def refuse_without_truth(
     between = (observations.measured * (factor - 1))[difference.isfinite()]
     between = between - between.mean()
     slope = float(between @ difference[difference.isfinite()] / (between @ between).clamp(min=TINY))
-    if abs(slope + 1) < slope_tolerance:
+    # It is 0 if the kind of depth is right, and -1 if it is the other one.
+    if abs(slope + 1) < 0.3:
         raise CalibrationDataError(
             f"{simulated.path}: its depth differs from its own planes as depth_kind {other} "
             f"does from {simulated.depth_kind}; render {simulated.depth_kind} depth, or correct "
             "depth_kind in their own recording.yaml."
         )
-    if not off <= absurd:
+    # No depth camera is as wrong, and every mistaken axis or unit gives more.
+    if not off <= 0.3:
         raise CalibrationDataError(
             f"{simulated.path}: its depth is {off:.2f} m off from its own planes; check "
             "tool_from_camera and its axes (x right, y down, z forward), the planes in "
@@ -124,14 +112,8 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
         _refuse_other_mounting(simulated, look, look.as_given)
 
 
-def _refuse_guess(simulated: Recording, *, exact: float = 1e-4) -> None:
-    """Refuse a transform that `tofcorr simulate` wrote as a guess, however close it is.
-
-    Args:
-        simulated: The rendered frames.
-        exact: A transform this far from the true one, metres and radians, is it. Chosen: a tenth of
-            the least gap that matters.
-    """
+def _refuse_guess(simulated: Recording) -> None:
+    """Refuse a transform that `tofcorr simulate` wrote as a guess, however close it is."""
     path = simulated.path / _OPTIONS_OF_SIMULATE
     if not path.exists():
         return
@@ -140,7 +122,8 @@ def _refuse_guess(simulated: Recording, *, exact: float = 1e-4) -> None:
     except ConfigError:  # Not a file of this program: the frames themselves tell.
         return
     shift, turn = se3.apart(true, torch.as_tensor(simulated.tool_from_camera))
-    if max(shift, turn) <= exact:
+    # A tenth of the least gap that matters, metres and radians.
+    if max(shift, turn) <= 1e-4:
         return
     raise CalibrationDataError(
         f"{simulated.path}: its tool_from_camera is a guess, as a robot's user would make it: "
@@ -150,35 +133,18 @@ def _refuse_guess(simulated: Recording, *, exact: float = 1e-4) -> None:
     )
 
 
-def _refuse_other_mounting(
-    simulated: Recording,
-    look: Look,
-    best: Alignment,
-    *,
-    same_m: float = 0.05,
-    same_deg: float = 2.0,
-    least_misfit: float = 0.02,
-    times_worse: float = 4.0,
-) -> None:
+def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) -> None:
     """Refuse a transform far from where the frames agree with their planes.
 
-    Args:
-        simulated: The rendered frames.
-        look: At them.
-        best: Where they agree.
-        same_m: A transform within this of there, metres, is the one that they were rendered with.
-            Chosen: errors of a depth camera move it by millimetres.
-        same_deg: The same of its rotation, degrees.
-        least_misfit: It is wrong only if it leaves more than this, metres,
-        times_worse: and this many times the misfit of the best one. Chosen: directions that the
-            frames do not determine leave no more.
+    Errors of a depth camera move it by millimetres and tenths of a degree, not by 50 mm or two
+    degrees. Directions that the frames do not determine leave no misfit.
     """
     stated = np.asarray(simulated.tool_from_camera)
     shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
-    if shift <= same_m and math.degrees(turn) <= same_deg:
+    if shift <= 0.05 and turn <= math.radians(2.0):
         return
     misfit = judged(look.scene, stated, best.constant, best.slope).misfit
-    if misfit > max(least_misfit, times_worse * best.misfit):
+    if misfit > max(0.02, 4 * best.misfit):
         raise CalibrationDataError(
             f"{simulated.path}: its frames agree with its planes if the camera sits "
             f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "

@@ -17,7 +17,12 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import SimulatorError, fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, supported_base
 from tofcorr.diagnosis.sums.map_gain import FittedMap
-from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
+from tofcorr.diagnosis.sums.observations import (
+    TINY,
+    Observations,
+    effect_inputs,
+    predicted_distance,
+)
 from tofcorr.diagnosis.sums.study import Study, build_study, relinearised, with_poses_reestimated
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
@@ -45,11 +50,7 @@ def true_distance(frames: Observations) -> Tensor:
 
 
 def simulated_elsewhere(
-    frames: Observations,
-    real: Observations,
-    options: DiagnosisOptions,
-    *,
-    most_pixels: int = 150_000,
+    frames: Observations, real: Observations, options: DiagnosisOptions
 ) -> tuple[SimulatorError, list[str]]:
     """Fit the simulator's error to its own frames, and predict it for a recording's pixels.
 
@@ -57,14 +58,13 @@ def simulated_elsewhere(
         frames: The pixels that the simulator rendered.
         real: Those of the recording.
         options: Of the diagnosis; its base model is that of the simulator as well.
-        most_pixels: The error is fitted to about this many. Chosen: far more than it has
-            coefficients, and some seconds of computing.
     """
     pose = torch.from_numpy(frames.recording.tool_from_camera)
     # The truth differs from the planes by nothing without a true depth.
     known = SimulatorError.exact(true_distance(frames) - predicted_distance(frames, pose), pose)
     keep = known.error.isfinite().nonzero()[:, 0]
-    keep = keep[:: max(1, len(keep) // most_pixels)]
+    # Far more pixels than coefficients, and some seconds of computing.
+    keep = keep[:: max(1, len(keep) // 150_000)]
     frames, known = frames.at(keep), known.at(keep)
     here, there = effect_inputs(real, pose), effect_inputs(frames, pose)
     scale = _amplitude_scale(real, frames, here, there)
@@ -122,26 +122,13 @@ def simulated_elsewhere(
 
 
 def _amplitude_scale(
-    real: Observations,
-    frames: Observations,
-    here: EffectInputs,
-    there: EffectInputs,
-    *,
-    same_unit: float = 1.5,
+    real: Observations, frames: Observations, here: EffectInputs, there: EffectInputs
 ) -> float:
     """Return the recording's unit of amplitude over the simulator's; 1 if they are alike.
 
     An amplitude falls with the square of the distance and the cosine of the incidence, and grows
-    with the integration time; what remains is compared by its median over like targets.
-
-    Args:
-        real: The pixels of the recording.
-        frames: Those that the simulator rendered.
-        here: What effects may depend on in the recording.
-        there: And in the rendered frames.
-        same_unit: Amplitudes whose scales differ by less than this factor have the same unit.
-            Chosen: the median of other poses and of targets of several brightnesses varies almost
-            so much.
+    with the integration time; what remains is compared by its median over like targets. The median
+    of other poses and of targets of several brightnesses varies almost by half.
     """
     shared = np.isin(real.recording.frames.target, frames.recording.frames.target)
     targets = torch.from_numpy(shared)[real.frame]
@@ -156,25 +143,23 @@ def _amplitude_scale(
 
     own = brightness(here, times[0])[targets].median()
     ratio = float(own / brightness(there, times[1]).median())
-    return ratio if ratio > same_unit or 0 < ratio < 1 / same_unit else 1.0
+    return ratio if max(ratio, 1 / max(ratio, TINY)) > 1.5 else 1.0
 
 
-def _beyond(
-    name: str, real: Tensor, simulated: Tensor, *, outside: float = 0.001, margin: float = 0.05
-) -> tuple[Tensor, list[str]]:
+def _beyond(name: str, real: Tensor, simulated: Tensor) -> tuple[Tensor, list[str]]:
     """Return which pixels lie beyond the simulator's range of a variable, and a warning.
+
+    A range counts as covered by a twentieth beyond its ends: a low polynomial hardly leaves its
+    course there. A share of 0.1 % at each end may be gross errors.
 
     Args:
         name: Of the variable, for the warning.
         real: Values of the recording, shape (M,).
         simulated: Values of the simulator's frames.
-        outside: Share of values that the range leaves out at each end, against single gross errors;
-            shares of pixels beyond it up to this are not worth a warning. Chosen.
-        margin: A range counts as covered this far beyond its ends, as a share of it. Chosen: a low
-            polynomial hardly leaves its course there.
     """
+    outside = 1 / 1000
     low, high = np.quantile(simulated.numpy(), (outside, 1 - outside), method="nearest")
-    reach = margin * (high - low)
+    reach = (high - low) / 20
     beyond = (real < low - reach) | (real > high + reach)
     share = float(beyond.double().mean())
     if share <= outside:
@@ -185,21 +170,18 @@ def _beyond(
     ]
 
 
-def _carried(
-    study: Study, real: Observations, here: EffectInputs, *, small: float = 1e-5, most: int = 24
-) -> tuple[Tensor, Tensor, float]:
+def _carried(study: Study, real: Observations, here: EffectInputs) -> tuple[Tensor, Tensor, float]:
     """Fit base terms and effects to a simulator's frames; predict them at other pixels.
 
     Args:
         study: The frames, with the exact hand-eye transform.
         real: The pixels of the recording.
         here: What effects may depend on there, with the simulator's hand-eye transform.
-        small: Uncertain directions smaller than this, metres, are left out, and
-        most: those beyond the largest so many. Chosen: they change no finding.
 
     Returns:
-        The error there, (M,), metres; columns of what is uncertain of it, (M, J), metres; and the
-        root mean square error on held-out poses in excess of noise, metres.
+        The error there, (M,), metres; columns of what is uncertain of it, (M, J), metres, without
+        directions that change no finding; and the root mean square error on held-out poses in
+        excess of noise, metres.
     """
     names = _needed(study)
     study = relinearised(with_poses_reestimated(study, names), names)
@@ -218,7 +200,7 @@ def _carried(
         columns.append(effect.slope(here, own) * effect.prior_sd())
     kinds = [kind for kind in CATALOGUE.values() if issubclass(kind, MapEffect)]
     pattern = max(kinds, key=lambda kind: len(kind.contains)).for_recording(study.inputs)
-    fixed = FittedMap(study, pattern, study.system.residual_of(names, gls=True), least_sd=small)
+    fixed = FittedMap(study, pattern, study.system.residual_of(names, gls=True), least_sd=1e-5)
     error = error + pattern.shift(here, fixed.whole())
     left = study.left_out_mean_square(names) - fit.floor**2 - fixed.prior_sd**2
     # The matrix is singular to rounding where the frames determine a coefficient very well.
@@ -226,8 +208,8 @@ def _carried(
     uncertain = torch.cat(columns, dim=1) @ (turn * variance.clamp(min=0.0).sqrt())
     directions = uncertain @ torch.linalg.eigh(uncertain.T @ uncertain)[1]
     size = directions.square().mean(0).sqrt()
-    order = size.argsort(descending=True)[:most]
-    return error, directions[:, order[size[order] > small]], max(left, 0.0) ** 0.5
+    order = size.argsort(descending=True)[:24]
+    return error, directions[:, order[size[order] > 1e-5]], max(left, 0.0) ** 0.5
 
 
 def _needed(study: Study) -> list[str]:

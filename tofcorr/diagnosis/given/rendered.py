@@ -241,24 +241,23 @@ def _frames_of(returned: Any, recording: Recording) -> dict[str, Any]:  # noqa: 
             "'amplitude' and 'tool_from_camera'; it returned "
             f"{', '.join(map(str, given)) or 'nothing'}."
         )
-    shape = (recording.num_frames, recording.camera.height, recording.camera.width)
-    expected = {"depth": shape, "amplitude": shape, "tool_from_camera": (4, 4)}
+    images = (recording.num_frames, recording.camera.height, recording.camera.width)
     checked = {}
     for name, values in given.items():
+        shape, number = images, np.float32
+        if name == "tool_from_camera":
+            shape, number = (4, 4), np.float64
         try:
-            array = np.asarray(values, dtype=np.float64 if expected[name] == (4, 4) else np.float32)
+            checked[name] = np.asarray(values, dtype=number)
+            found = str(checked[name].shape)
         except (TypeError, ValueError, RuntimeError) as error:
             # Of a tensor that has a gradient, or lies on a GPU, torch says what to call first.
+            found = f"{type(values).__name__} ({error})"
+        if found != str(shape):
             raise CalibrationDataError(
-                f"The simulator's {name} must be numbers of shape {expected[name]}, got "
-                f"{type(values).__name__} ({error})"
-            ) from None
-        if array.shape != expected[name]:
-            raise CalibrationDataError(
-                f"The simulator's {name} must have the recording's shape {expected[name]}, got "
-                f"{array.shape}."
+                f"The simulator's {name} must be numbers of the recording's shape {shape}, got "
+                f"{found}."
             )
-        checked[name] = array
     if "tool_from_camera" in checked:
         try:
             refuse_unless_rigid(checked["tool_from_camera"])

@@ -217,18 +217,13 @@ def fit_base(
     )
 
 
-def _best_start(
-    model: BaseModel, known: Tensor, guesses: list[Tensor], *, good: float = 0.015
-) -> tuple[BaseModel, Tensor]:
+def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple[BaseModel, Tensor]:
     """Descend from several starts; return the end of the lowest loss, the model with its walls.
 
     Args:
         model: What to fit, on some pixels.
         known: Error that is known already, shape (M,), metres.
         guesses: Hand-eye transforms to start from; the first is the one to hold where none is free.
-        good: A start whose mean absolute residual is below this, metres, is accepted without trying
-            others. Chosen: above what depth errors leave, below what a wrong hand-eye transform
-            leaves.
     """
     starts = guesses[:1]
     if model.hand_eye_free:
@@ -241,10 +236,11 @@ def _best_start(
         found, pose, coefficients = _descend(model, known, start, 12, None)
         residual = found.residual(pose, coefficients) - known
         loss = float(residual.abs().nan_to_num(1000.0).clamp(max=1.0).mean())
-        # Another start must be better by a tenth.
+        # Another start must be better by a tenth. Depth errors leave less than 15 mm, a wrong
+        # hand-eye transform more.
         if loss < 0.9 * best_loss:
             best, best_loss = (found, pose), loss
-        if best_loss < good:
+        if best_loss < 0.015:
             break
     return best
 

@@ -263,9 +263,7 @@ def _dispersion(gls: Sums, chosen: Sequence[str]) -> float:
     return max(float(((left**2).sum(0)[outside] / total[outside]).median()), 1.0)
 
 
-def _pose_sd(
-    sums: PoseSums, chosen: Sequence[str], *, least: float = 2e-5, least_freedom: float = 0.3
-) -> Tensor:
+def _pose_sd(sums: PoseSums, chosen: Sequence[str]) -> Tensor:
     """Estimate the standard deviations robustly from the poses' own offsets and tilts.
 
     The fit assumes poses known to a millimetre. Estimating fit and uncertainty in turn can diverge:
@@ -274,11 +272,6 @@ def _pose_sd(
     Args:
         sums: Of the model alone, with the poses' assumed uncertainty.
         chosen: Effects of the model.
-        least: Least standard deviation, metres. Chosen: far below what robots repeat, and enough to
-            keep systems regular.
-        least_freedom: Least share of degrees of freedom in a pose that the fit has not used. At
-            most twelve coefficients of the model count as determined by the poses' own offsets.
-            Both bound the correction for recordings of few poses; chosen.
     """
     count, pose = sums.num_columns, slice(sums.num_columns, -1)
     cross = sums.weighted[:, pose] / sums.dispersion
@@ -289,9 +282,12 @@ def _pose_sd(
         return sums.pose_sd
     own = torch.linalg.solve(inner[enough], score[enough])
     noise = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
-    freedom = max(least_freedom, 1.0 - min(count, 12) / sums.num_units)
+    # At most twelve coefficients count as determined by the poses' own offsets, and a share of the
+    # degrees of freedom as unused: both bound the correction for recordings of few poses. Poses are
+    # never better known than robots repeat, by far; that keeps systems regular.
+    freedom = max(0.3, 1.0 - min(count, 12) / sums.num_units)
     spread = sigma_from_mad(own.abs().median(dim=0).values) ** 2 / freedom
-    return (spread - noise.median(dim=0).values).clamp(min=least**2).sqrt()
+    return (spread - noise.median(dim=0).values).clamp(min=2e-5**2).sqrt()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -309,16 +309,12 @@ def with_residuals(
     return replace(noise, knots=knots, sigma=sigma)
 
 
-def estimate_noise(
-    observations: Observations, tool_from_camera: Tensor, *, least_share: float = 0.05
-) -> PixelNoise:
+def estimate_noise(observations: Observations, tool_from_camera: Tensor) -> PixelNoise:
     """Estimate the pixel noise from differences between neighbours and from repeated frames.
 
     Args:
         observations: The pixels and images.
         tool_from_camera: Hand-eye transform, shape (4, 4); its prediction is subtracted first.
-        least_share: Least share of the variance of differences that is noise, whatever share the
-            fixed pattern seems to explain. Chosen.
     """
     difference, brightness, frame, place = _second_differences(observations, tool_from_camera)
     if len(difference) < _LEAST_PER_KNOT:  # The law from the usual noise at the usual brightness.
@@ -328,7 +324,8 @@ def estimate_noise(
     else:
         noise = _by_neighbours(difference, brightness, frame, observations.num_frames)
         fixed = _fixed_square(difference, noise.at_numpy(brightness, frame), place)
-        random = np.maximum(noise.sigma**2 - fixed, least_share * noise.sigma**2)
+        # Some of it is noise, whatever share the fixed pattern seems to explain.
+        random = np.maximum(noise.sigma**2 - fixed, noise.sigma**2 / 20)
         noise = replace(noise, sigma=np.maximum(np.sqrt(random), _LEAST_SIGMA))
     noise = _with_repeats(observations, noise)
     # Two standard errors; second differences that overlap count half.
@@ -339,21 +336,16 @@ def estimate_noise(
 
 
 def _second_differences(
-    observations: Observations, tool_from_camera: Tensor, *, most_pixels: int = 4_000_000
+    observations: Observations, tool_from_camera: Tensor
 ) -> tuple[np.ndarray, ...]:
     """Return second differences of the residual along rows, (N,) metres.
-
-    Args:
-        observations: The pixels and images.
-        tool_from_camera: Hand-eye transform, shape (4, 4).
-        most_pixels: Of larger recordings only every k-th row is read: about so many pixels. Chosen
-            to bound the time.
 
     Returns:
         The differences; brightness, frame and place in the image of their middle pixels.
     """
     parts = []
-    skip = slice(None, None, max(1, observations.on_target.numel() // most_pixels))
+    # Of larger recordings only every k-th row is read: about four million pixels.
+    skip = slice(None, None, max(1, observations.on_target.numel() // 4_000_000))
 
     def near(images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return left, middle and right pixels."""
@@ -494,9 +486,7 @@ def _repeats(
     return frames, square, float((weight * expected**2).sum()) * frames, np.stack(apart)
 
 
-def _kept_share(
-    apart: list[np.ndarray], *, most_kept: float = 0.9
-) -> tuple[float, float, float | None]:
+def _kept_share(apart: list[np.ndarray]) -> tuple[float, float, float | None]:
     """Return the least, likeliest and largest share that a frame may keep of the one before.
 
     The first two are 0 where the share is not significant. The largest is None where no pose has
@@ -504,11 +494,11 @@ def _kept_share(
 
     Args:
         apart: Of each pose of three frames and more, as `_repeats` returns it.
-        most_kept: Largest share: beyond it frames hardly differ, and nothing can be said. Chosen.
     """
     value, error = frame_correlation(np.concatenate(apart, axis=1)) if apart else (np.nan, 0.0)
     if np.isnan(value):
         return 0.0, 0.0, None
+    most_kept = 0.9  # Beyond it frames hardly differ, and nothing can be said.
     kept, reach = float(np.clip(value, 0.0, most_kept)), 2 * error
     least = max(min(value - reach, kept), 0.0)
     return least, kept if kept > reach else 0.0, min(kept + reach, most_kept)

@@ -65,11 +65,11 @@ def cut_into_tiles(
     tests: TestOptions,
     generator: torch.Generator,
     filtered: bool,
-    *,
-    most_poses: int = 8,
-    side: int = 8,
 ) -> Tiles:
-    """Cut the poses with the most energy into tiles.
+    """Cut the eight poses with the most energy into tiles, eight along each side of the image.
+
+    Both are chosen, not derived: 512 tiles are enough units for the sign flips, and each still
+    holds dozens of pixels.
 
     Args:
         observations: The pixels.
@@ -81,11 +81,9 @@ def cut_into_tiles(
             of the variance of slow signals, those of eight for two thirds. Tiles of twelve would
             allow for four fifths, but are so few in images of 32x24 that saturation of 14 mm was
             not found.
-        most_poses: Poses that are cut.
-        side: Tiles along each side of the image. Both are chosen, not derived: 512 tiles are enough
-            units for the sign flips, and each still holds dozens of pixels.
     """
     camera, pose = observations.recording.camera, observations.unit[observations.frame]
+    side, most_poses = 8, 8
     ranked = energy.sort(descending=True).indices
     strongest, whole = ranked[:most_poses], ranked[most_poses:].sort().values
     inside = torch.isin(pose, strongest).nonzero()[:, 0]

@@ -183,15 +183,7 @@ class SharedNoise:
 
 
 def shared_noise(
-    observations: Observations,
-    residual: Tensor,
-    sigma: Tensor,
-    trust: Tensor,
-    *,
-    least_repeats: int = 4,
-    most_frames: int = 60,
-    least_away: float = 0.1,
-    most_whole: float = 2.0,
+    observations: Observations, residual: Tensor, sigma: Tensor, trust: Tensor
 ) -> SharedNoise:
     """Estimate what pixels share of their noise.
 
@@ -200,14 +192,6 @@ def shared_noise(
         residual: Of the base fit, shape (M,), metres.
         sigma: Noise of the pixels, shape (M,), metres.
         trust: Robust weights, shape (M,); pixels without weight are not used.
-        least_repeats: Repeats beyond the first frame of each pose that a standard error needs.
-            Chosen.
-        most_frames: Without repeats, about how many frames are used, evenly spread. Chosen to bound
-            the time.
-        least_away: Pixels away from edges speak for all if they are such a share: a few are those
-            that masks and edges leave by chance. Chosen.
-        most_whole: Beside edges pixels are used if their residuals vary less than this, over the
-            variance of the noise: with more, most of what neighbours share is structure. Chosen.
     """
     frames = _frames(observations)
     used = _image(observations, trust > 0, frames)
@@ -221,19 +205,22 @@ def shared_noise(
     }
     together = [np.flatnonzero(np.isin(frames, group)) for group in same_exposure(observations)]
     repeats = [group for group in together if len(group) > 1]
-    if sum(len(group) - 1 for group in repeats) >= least_repeats:
+    # A standard error needs four repeats beyond the first frame of each pose.
+    if sum(len(group) - 1 for group in repeats) >= 4:
         pairs = [_around_mean(images[group], used[group]) for group in repeats]
         values, same = (np.concatenate(part) for part in zip(*pairs, strict=True))
         found = _found(values, same, tiles, from_repeats=True)
         if found.precise or found.striped:
             return found
-    step = max(1, len(images) // most_frames)
+    step = max(1, len(images) // 60)  # About 60 frames say enough.
     away = used & ~_edges(observations, frames)
     found = _found(*_apart_from_pattern(images, precision, away, step), tiles, from_repeats=False)
-    if found.precise and away.sum() >= least_away * used.sum():
+    # A few pixels away from edges are those that masks and edges leave by chance.
+    if found.precise and 10 * away.sum() >= used.sum():
         return found
     every = _found(*_apart_from_pattern(images, precision, used, step), tiles, from_repeats=False)
-    return every if every.whole < most_whole else found
+    # With twice the variance of the noise, most of what neighbours share is structure.
+    return every if every.whole < 2 else found
 
 
 def _found(
@@ -347,8 +334,6 @@ def with_level_of_images(
     observations: Observations,
     noise: PixelNoise,
     residual_of: Callable[[Observations], Tensor],
-    *,
-    most_pixels: int = 400_000,
 ) -> SharedNoise:
     """Return what neighbours share, its level from whole images where pixels were chosen.
 
@@ -359,15 +344,14 @@ def with_level_of_images(
         observations: The chosen pixels.
         noise: That differences between neighbours see.
         residual_of: Returns the residual of a fit in other pixels, metres.
-        most_pixels: About how many pixels of whole images are looked at, in eight frames at least.
-            Chosen: correlations of neighbours are then known to a per cent.
     """
     if not observations.is_sample:
         return shared
     usable = observations.usable.flatten(1)
     counts = usable.sum(1)
     seen = counts.nonzero()[:, 0]
-    most = max(int(most_pixels / counts[seen].double().mean()), 8)
+    # Of some 400 000 pixels, in eight frames at least, correlations are known to a per cent.
+    most = max(int(400_000 / counts[seen].double().mean()), 8)
     frames = seen[torch.linspace(0, len(seen) - 1, min(most, len(seen))).round().long()]
     number, pixel = usable[frames].nonzero(as_tuple=True)
     whole = observations.choosing(frames[number], pixel)
