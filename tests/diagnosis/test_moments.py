@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tofcorr.diagnosis.sums.gains import HeldOutSquares
-from tofcorr.diagnosis.sums.linear_system import BASE, changed_system, pose_sums
+from tofcorr.diagnosis.sums.linear_system import BASE, pose_sums
 from tofcorr.diagnosis.sums.resampling import draw_folds
 from tofcorr.diagnosis.sums.study import Study, with_residual
 from tofcorr.pixels.dataset import thread_number
@@ -82,9 +82,7 @@ def test_other_columns_need_no_other_sums_than_their_own(nothing_study: Study) -
     other = system.columns["wiggling"] * (1 + plain.inputs.rows[:, None])
     changed = {"wiggling": other}
     residual, columns = system.residual, {**system.columns, **changed}
-    quick = changed_system(
-        system, plain.observations, plain.fit, residual, ("wiggling",), changed
-    ).sums
+    quick = with_residual(plain, residual, ("wiggling",), changed).sums
     shared = (plain.observations, columns, system.pose, residual, plain.fit)
     whole = pose_sums(*shared, _base_prior(plain))
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)

@@ -263,7 +263,6 @@ def _descend(
             of squares (below their median: squares).
     """
     observations, count = model.observations, model.num_geometry
-    prior, roughness = model.prior_precision(), model.roughness()
     start, away = pose, torch.zeros(model.num_columns, dtype=torch.float64)
     tie = torch.zeros_like(away)
     # Poses, not their pixels, are independent of one another.
@@ -288,8 +287,8 @@ def _descend(
         weighted = columns * now[:, None]
         if model.hand_eye_free:
             away[:6] = se3.log(se3.inverse(start) @ pose)
-        normal = weighted.T @ columns + scale * prior + hold * torch.diag(tie)
-        normal = normal + now.sum() * roughness
+        prior = scale * model.prior_precision(float(now.sum()) / scale)
+        normal = weighted.T @ columns + prior + hold * torch.diag(tie)
         step = torch.linalg.solve(normal, weighted.T @ response - hold * tie * away)
         coefficients = step[count:]
         away[model.num_hand_eye : count] += step[model.num_hand_eye : count]

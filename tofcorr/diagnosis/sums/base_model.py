@@ -42,6 +42,7 @@ from tofcorr.diagnosis.sums.observations import (
 from tofcorr.error_terms.base import Domain, Term
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.regularisation import penalties_of
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.fit.walls import name_walls
@@ -281,24 +282,24 @@ class BaseModel:
         walls = step[self.num_hand_eye : self.num_geometry]
         return self.on(with_walls_moved(self.observations, walls))
 
-    def prior_precision(self) -> Tensor:
-        """Return the precision of the coefficients' priors, diagonal, shape (K, K)."""
+    def prior_precision(self, total_weight: float) -> Tensor:
+        r"""Return the precision of the coefficients' priors, with curves held smooth, (K, K).
+
+        To the diagonal of their variances comes :math:`\sum \lambda F^T F`: a strength weighs
+        roughness against the mean square, as in training.
+
+        Args:
+            total_weight: Sum of the weights of the residuals.
+        """
         hand_eye = self.hand_eye_sd[: self.num_hand_eye]
         walls = self.wall_sd * self.observations.num_walls
         sd = [*hand_eye, *walls, *[self.error_sd] * (self.num_columns - self.num_geometry)]
-        return torch.diag(torch.tensor(sd, dtype=torch.float64) ** -2)
-
-    def roughness(self) -> Tensor:
-        r"""Return the penalty matrix of curves, :math:`\sum \lambda F^T F`, shape (K, K).
-
-        As in training, its unit is one over the sum of the weights of the residuals.
-        """
-        matrix = torch.zeros(self.num_columns, self.num_columns, dtype=torch.float64)
-        for term, first in self.error_model.penalised():
-            rows = term.roughness()
-            start = self.num_geometry + first
-            inside = slice(start, start + rows.shape[1])
-            matrix[inside, inside] += float(term.strength) * rows.T @ rows
+        matrix = torch.diag(torch.tensor(sd, dtype=torch.float64) ** -2)
+        for penalty in penalties_of(self.error_model):
+            roughness = penalty.factor.T @ penalty.factor
+            matrix[self.num_geometry :, self.num_geometry :].add_(
+                roughness, alpha=total_weight * float(penalty.strength)
+            )
         return matrix
 
     def error_columns(self, distance: Tensor) -> Tensor:

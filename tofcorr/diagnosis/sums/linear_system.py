@@ -206,29 +206,23 @@ class PoseSums:
     @cached_property
     def ols(self) -> Sums:
         """Ordinary least squares: a pose weighs as much as one value known to 1 mm."""
-        own = slice(self.num_columns)
-        return Sums(
-            gram=self.scale * self.plain[:, own, own],
-            score=self.scale * self.plain[:, own, -1],
-            square=self.plain[:, -1, -1],
-            scale=self.scale,
-            layout=self.layout,
-        )
+        return self._equations(self.scale * self.plain, self.scale)
 
     @cached_property
     def gls(self) -> Sums:
         """Generalised least squares: weighted by likelihood, with the uncertainty of the poses."""
-        count, pose = self.num_columns, slice(self.num_columns, -1)
-        cross = self.weighted[:, pose] / self.dispersion
+        whole, pose = self.weighted / self.dispersion, slice(self.num_columns, -1)
+        cross = whole[:, pose]
         solved = torch.linalg.solve(cross[:, :, pose] + torch.diag(self.pose_sd**-2), cross)
-        products = torch.baddbmm(
-            self.weighted, cross.mT, solved, beta=1 / self.dispersion, alpha=-1
-        )
+        return self._equations(torch.baddbmm(whole, cross.mT, solved, alpha=-1), 1.0)
+
+    def _equations(self, products: Tensor, scale: float) -> Sums:
+        count = self.num_columns
         return Sums(
             gram=products[:, :count, :count],
             score=products[:, :count, -1],
-            square=products[:, -1, -1],
-            scale=1.0,
+            square=products[:, -1, -1] / scale,
+            scale=scale,
             layout=self.layout,
         )
 
@@ -316,10 +310,7 @@ class LinearSystem:
         """Return what base model and some effects predict with coefficients (K,), (M,), metres."""
         parts = self.of(names)
         own = coefficients.split([part.shape[1] for part in parts])
-        return sum(
-            (part @ theta for part, theta in zip(parts, own, strict=True)),
-            torch.zeros_like(self.residual),
-        )
+        return torch.stack([x @ theta for x, theta in zip(parts, own, strict=True)]).sum(0)
 
     def residual_of(self, names: Sequence[str], *, gls: bool = False) -> Tensor:
         """Return the residual of base model and effects fitted to all poses, shape (M,), metres.
@@ -351,10 +342,8 @@ def linear_system(
     uncertain = unknown_amplitude_columns(observations, inputs)
     if fit.known is not None:
         uncertain = torch.cat([fit.known.uncertain, uncertain], dim=1)
-    # A strength weighs roughness against the mean square, so that it is multiplied by the sum of
-    # the ordinary weights: one a pose, each with a variance of OLS_SD^2.
-    prior = fit.model.prior_precision()
-    prior = prior + observations.num_units / OLS_SD**2 * fit.model.roughness()
+    # The ordinary weights of a pose add up to one value with a variance of OLS_SD^2.
+    prior = fit.model.prior_precision(observations.num_units / OLS_SD**2)
     prior = torch.block_diag(prior, torch.eye(uncertain.shape[1], dtype=torch.float64))
     found = in_threads(lambda source: source(inputs), sources.values())
     base = torch.cat([fit.model.columns(fit.tool_from_camera), uncertain], dim=1)
@@ -447,43 +436,6 @@ def _products(
 
     weighted, plain, count = zip(*in_threads(of_unit, pixels), strict=True)
     return torch.stack(weighted), torch.stack(plain), torch.stack(count)
-
-
-def changed_system(
-    system: LinearSystem,
-    observations: Observations,
-    fit: BaseFit,
-    residual: Tensor,
-    names: Sequence[str] = (),
-    changed: Mapping[str, Tensor] | None = None,
-) -> LinearSystem:
-    """Return the system of another residual, and of other columns; unchanged products are kept.
-
-    Args:
-        system: The system before.
-        observations: The pixels.
-        fit: Its noise and robust weights.
-        residual: The new one, shape (M,), metres.
-        names: Effects of the model whose residual the uncertainty of the poses is estimated from.
-        changed: The columns of effects that differ, shape (M, E) each; None: all are the same.
-    """
-    changed, before = changed or {}, system.sums
-    columns = {**system.columns, **changed}
-    last = before.plain.shape[-1] - 1
-    spans = [*(before.layout.effects[name] for name in changed), (last, last + 1)]
-    places = torch.cat([torch.arange(*span) for span in spans])
-    new = torch.cat([*changed.values(), residual[:, None]], dim=1)
-    weights = fit.weight, fit.share
-    # One pass over the columns gives both sums.
-    right = torch.cat([own[:, None] * new for own in weights], dim=1)
-    parts = [*columns.values(), system.pose, residual[:, None]]
-    products = torch.cat([observations.products(part, right) for part in parts], dim=1)
-    weighted, plain = before.weighted.clone(), before.plain.clone()
-    for sums, own in zip((weighted, plain), products.chunk(2, dim=-1), strict=True):
-        sums[:, :, places] = own
-        sums[:, places, :] = own.mT
-    sums = replace(before, weighted=weighted, plain=plain).with_pose_uncertainty(names)
-    return replace(system, columns=columns, residual=residual, sums=sums)
 
 
 def tile_sums(system: LinearSystem, names: Sequence[str], tiles: Tiles, fit: BaseFit) -> PoseSums:

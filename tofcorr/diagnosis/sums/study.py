@@ -19,7 +19,6 @@ from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.linear_system import (
     LinearSystem,
     PoseSums,
-    changed_system,
     linear_system,
     tile_sums,
 )
@@ -287,10 +286,35 @@ def with_poses_reestimated(study: Study, names: Sequence[str]) -> Study:
     return replace(study, system=replace(study.system, sums=sums))
 
 
-def with_residual(study: Study, residual: Tensor) -> Study:
-    """Return the study of another residual (M,), metres."""
-    system = changed_system(study.system, study.observations, study.fit, residual)
-    return replace(study, system=system)
+def with_residual(
+    study: Study,
+    residual: Tensor,
+    names: Sequence[str] = (),
+    changed: Mapping[str, Tensor] | None = None,
+) -> Study:
+    """Return the study of another residual, and of other columns; unchanged products are kept.
+
+    Args:
+        study: Before.
+        residual: The new one, shape (M,), metres.
+        names: Effects of the model whose residual the uncertainty of the poses is estimated from.
+        changed: The columns of effects that differ, shape (M, E) each; None: all are the same.
+    """
+    system, changed, before = study.system, changed or {}, study.sums
+    columns = {**system.columns, **changed}
+    spans = [before.layout.effects[name] for name in changed]
+    places = torch.cat([*(torch.arange(*span) for span in spans), torch.tensor([-1])])
+    new = torch.cat([*changed.values(), residual[:, None]], dim=1)
+    # One pass over the columns gives both sums.
+    right = torch.cat([own[:, None] * new for own in (study.fit.weight, study.fit.share)], dim=1)
+    parts = [*columns.values(), system.pose, residual[:, None]]
+    products = torch.cat([study.observations.products(part, right) for part in parts], dim=1)
+    weighted, plain = before.weighted.clone(), before.plain.clone()
+    for sums, own in zip((weighted, plain), products.chunk(2, dim=-1), strict=True):
+        sums[:, :, places] = own
+        sums[:, places, :] = own.mT
+    sums = replace(before, weighted=weighted, plain=plain).with_pose_uncertainty(names)
+    return replace(study, system=replace(system, columns=columns, residual=residual, sums=sums))
 
 
 def without_map(study: Study, values: Tensor, spent: Collection[str]) -> Study:
@@ -327,18 +351,17 @@ def relinearised(study: Study, names: Sequence[str], *, most_linearisations: int
         """Return the weighted sum of squares of the model fitted to all poses, m^2."""
         return float((study.fit.share * study.system.residual_of(names) ** 2).sum())
 
-    best, best_loss, system = study, loss(study), study.system
+    best, best_loss, current = study, loss(study), study
     for _ in range(most_linearisations if bent else 0):
-        theta, places = system.sums.ols.solve(names), system.sums.layout.only(names).effects
-        residual, changed = study.system.residual, dict[str, Tensor]()
+        ols, residual, changed = current.sums.ols, study.system.residual, dict[str, Tensor]()
+        theta, places = ols.solve(names), ols.layout.only(names).effects
         for name in bent:
             effect, sd = effects[name], effects[name].prior_sd()
             own = theta[slice(*places[name])] * sd
             slope = effect.slope(study.inputs, own)
             residual = residual - (effect.shift(study.inputs, own) - slope @ own)
             changed[name] = slope * sd
-        system = changed_system(system, study.observations, study.fit, residual, names, changed)
-        current = replace(study, system=system)
+        current = with_residual(current, residual, names, changed)
         if not loss(current) < best_loss:
             break
         best, best_loss = current, loss(current)
