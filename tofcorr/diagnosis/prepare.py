@@ -15,7 +15,7 @@ from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, with_num
 from tofcorr.diagnosis.sums.map_gain import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, observe
 from tofcorr.diagnosis.sums.study import Study, build_study, without_map
-from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
+from tofcorr.error_terms.pixel_terms import FixedPatternOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 
