@@ -119,10 +119,10 @@ def _with_base_pattern(study: Study) -> Study:
     Each pixel's value is estimated from the poses of other folds, as with a map that is named. The
     spread `auto` is what the residual has in common in all images.
     """
-    term = study.fit.model.options.pixel_map
+    terms = study.fit.model.options.terms
+    term = next((term for term in terms if isinstance(term, FixedPatternOptions)), None)
     if term is None:
         return study
-    assert isinstance(term, FixedPatternOptions)
     kind = CATALOGUE[term.kind]
     pattern = kind.for_recording(study.inputs)
     assert isinstance(pattern, MapEffect)

@@ -174,9 +174,9 @@ def definite_base(
     Raises:
         CalibrationDataError: The recording lacks what another term needs; names the term.
     """
-    warnings, kept = [], base.without("amplitude")
-    if recording.amplitude is None and kept != base:
-        dropped = ", ".join(term.kind for term in base.terms if term not in kept.terms)
+    warnings, kept = [], tuple(term for term in base.terms if "amplitude" not in term.needs)
+    if recording.amplitude is None and len(kept) < len(base.terms):
+        dropped = ", ".join(term.kind for term in base.terms if term not in kept)
         warnings = [
             f"{recording.path}: amplitude.npy is missing; the base model has no amplitude term "
             f"({dropped} left out). An error that depends on the amplitude cannot be named. What "
@@ -184,7 +184,7 @@ def definite_base(
             "for other effects; on a patterned target it also raises the noise floor, an upper "
             "bound therefore."
         ]
-        base = kept
+        base = ErrorModelOptions(terms=kept)
     dataset, columns = Dataset((recording,)), base.with_columns()
     refuse_missing_inputs(dataset, base)
     if not any(term.is_open(option) for term in columns.terms for option in term.found_in_data):
