@@ -20,14 +20,15 @@ from tofcorr.simulation.effects.lens import true_rays
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
 from tofcorr.simulation.effects.motion import MotionEffect, radial_speed
 from tofcorr.simulation.effects.robot_kinematics import RobotKinematicsEffect
-from tofcorr.simulation.effects.room_temperature import (
+from tofcorr.simulation.effects.target_registration import TargetRegistrationEffect
+from tofcorr.simulation.effects.temperature import (
     RoomTemperatureEffect,
     RoomTemperatureShape,
+    WarmUpShape,
+    heats,
     lagged_by,
 )
-from tofcorr.simulation.effects.target_registration import TargetRegistrationEffect
 from tofcorr.simulation.effects.timestamp_offset import TimestampOffsetEffect
-from tofcorr.simulation.effects.warm_up import WarmUpShape, _heats
 
 FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
 
@@ -71,7 +72,7 @@ def test_the_heat_of_a_camera_does_not_depend_on_how_often_it_was_recorded() -> 
     shape = WarmUpShape(frame_interval_s=30.0)
     stations = torch.tensor([0.0, 30.0, 65.0, 80.0, 500.0, 540.0], dtype=torch.float64)
     often = torch.cat([stations, stations + 0.5, stations + 1.0]).sort().values
-    once, thrice = (torch.stack(_heats(times, shape)) for times in (stations, often))
+    once, thrice = (torch.stack(heats(times, shape)) for times in (stations, often))
     # In the pause of 420 s the camera ran for 90 s; the frames after 80 s let it run a second more.
     torch.testing.assert_close(thrice[:, torch.isin(often, stations)], once, atol=0.01, rtol=0)
     torch.testing.assert_close(thrice[:, 9], once[:, 3], atol=1e-12, rtol=0)
@@ -80,7 +81,7 @@ def test_the_heat_of_a_camera_does_not_depend_on_how_often_it_was_recorded() -> 
 def test_a_camera_that_runs_warms_exponentially_and_cools_in_a_pause() -> None:
     shape = WarmUpShape(heat_s=(100.0,), frame_interval_s=10.0)
     times = torch.tensor([0.0, 20.0, 40.0, 340.0], dtype=torch.float64)
-    (heat,) = _heats(times, shape)
+    (heat,) = heats(times, shape)
     warm = 1 - np.exp(-0.4)
     # Off for 270 s, then on for the 30 s before the last frame.
     last = 1 - (1 - warm * np.exp(-2.7)) * np.exp(-0.3)

@@ -5,7 +5,8 @@ know, the stage of the simulator where it acts, and its columns in a linear fit.
 the same class that the diagnosis fits. Whatever is asked about an effect, the effect answers.
 """
 
-from tofcorr.simulation.effects.base import CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.base import CatalogueEffect
+from tofcorr.simulation.effects.patterns import MapEffect
 from tofcorr.simulation.effects.registry import CATALOGUE
 
 __all__ = ["CATALOGUE", "CatalogueEffect", "MapEffect"]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import AMBIENT, AMPLITUDE, EffectInputs
+from tofcorr.simulation.effects.inputs import AMBIENT, AMPLITUDE, EffectInputs, known
 
 
 class AmbientLightShape(Options):
@@ -53,19 +53,14 @@ class AmbientLightEffect(LinearDelay):
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return share, background, logarithm and false signals, shape (M, 7)."""
-        ambient = inputs.facts.ambient
-        if ambient is None:
-            raise ValueError("The background light is unknown; ambient_light needs it.")
-        background = inputs.of_frame(ambient)
+        background = inputs.of_frame(known(inputs.facts, "ambient"))
         amplitude = inputs.known_amplitude.clamp(min=1e-3 * self.shape.reference_counts)
         share = background / (amplitude + background).clamp(min=1e-12)
         linear = background / self.shape.reference_counts
         ratio = background / amplitude
         returned = linear * inputs.radial_distance**2 / inputs.incidence_cosine
-        phase = torch.zeros_like(ratio)
-        if inputs.modulation_frequency is not None:
-            phase = inputs.phase
-        false = [
-            weight * wave for weight in (ratio, returned) for wave in (phase.cos(), phase.sin())
-        ]
+        known_phase = inputs.modulation_frequency is not None
+        phase = inputs.phase if known_phase else torch.zeros_like(ratio)
+        waves = phase.cos(), phase.sin()
+        false = [weight * wave for weight in (ratio, returned) for wave in waves]
         return torch.stack([share, linear, (1 + ratio).log(), *false], dim=-1)

@@ -9,7 +9,7 @@ metres, and `columns`, the derivative of `shift` at zero: the effect's columns i
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -24,6 +24,7 @@ from tofcorr.simulation.effects.inputs import (
     Need,
     facts_from_state,
     inputs_from_state,
+    joined,
 )
 from tofcorr.simulation.effects.numerics import by_frame, by_parameters
 from tofcorr.simulation.hooks import Effect, FrameState
@@ -202,6 +203,33 @@ def add_delay(state: FrameState, shift: Tensor) -> None:
     state.delay = state.delay + shift.expand(state.delay.numel()).reshape(state.delay.shape)
 
 
+class FrameEffect(CatalogueEffect):
+    """A delay that is the same in all pixels of a frame; it may depend on the frames before."""
+
+    of_frame = True
+
+    def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
+        super().__init__(shape, coefficients)
+        self._seen: list[FrameFacts] = []
+
+    @abstractmethod
+    def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
+        """Return the shift of each frame, shape (F,), metres."""
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the shift of each pixel's frame, shape (M,), metres."""
+        return inputs.of_frame(self.shifts(inputs.facts, coefficients))
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`, shape (M, K): frames are differentiated."""
+        return inputs.of_frame(by_parameters(partial(self.shifts, inputs.facts), coefficients))
+
+    def on_delay(self, state: FrameState) -> None:
+        """Delay the frame, given those before it."""
+        self._seen.append(facts_from_state(state))
+        add_delay(state, self.shifts(joined(self._seen), self.coefficients)[-1])
+
+
 class GeometryEffect(CatalogueEffect):
     """An effect that moves camera or target, so that the rays meet the target elsewhere."""
 
@@ -287,79 +315,3 @@ class SignalEffect(CatalogueEffect):
         shares = self.shares(inputs)
         light = 1 + shares @ coefficients.to(shares.dtype)
         return inputs.metres_per_radian * (shares / light[:, None]).imag
-
-
-# Effects with one value for each place in the image: too many for columns of a fit.
-
-
-class MapEffect(CatalogueEffect):
-    """A delay of each cell of the image; a pixel may lie in several cells (its row, its column).
-
-    The values have independent priors around zero. The diagnosis estimates them from the mean
-    residual of each cell instead of fitting columns.
-    """
-
-    shape_type: ClassVar[type[Options]]
-    form_error = 0.0  # A map holds every pattern of its kind.
-
-    @classmethod
-    @abstractmethod
-    def num_cells(cls, shape: Any) -> int:  # noqa: ANN401 - each its own shape
-        """Return the number of values."""
-
-    @classmethod
-    @abstractmethod
-    def cells(cls, shape: Any, rows: Tensor, columns: Tensor) -> Tensor:  # noqa: ANN401
-        """Return the cells that pixels (M,) lie in, shape (M, G), int64."""
-
-    @abstractmethod
-    def listed(self, decimals: int) -> dict[str, Any]:
-        """Return name, shape and values as lists, metres rounded to so many decimals."""
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return an entry of a simulator's YAML, values rounded to 1 um."""
-        return self.listed(decimals=6)
-
-    @classmethod
-    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return one coefficient per cell; 10 mm is the size that Kahlmann et al. (2006) report."""
-        return _cell_terms(cls.num_cells(shape))
-
-    def cells_of(self, inputs: EffectInputs) -> Tensor:
-        """Return the cells of the chosen pixels, shape (M, G), int64."""
-        return self._cells_at(inputs.pixel, inputs.camera.width)
-
-    def cells_of_image(self, height: int, width: int) -> Tensor:
-        """Return the cells of all pixels of an image, shape (H W, G), int64."""
-        return self._cells_at(torch.arange(height * width), width)
-
-    def _cells_at(self, pixel: Tensor, width: int) -> Tensor:
-        row = torch.div(pixel, width, rounding_mode="floor")
-        return self.cells(self.shape, row, torch.remainder(pixel, width))
-
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the sum of the values of a pixel's cells, shape (M,), metres."""
-        return coefficients[self.cells_of(inputs)].sum(-1)
-
-    def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return how often each pixel lies in each cell, shape (M, number of cells): large."""
-        cells = self.cells_of(inputs)
-        one_hot = torch.zeros(len(cells), self.num_cells(self.shape), dtype=torch.float64)
-        return one_hot.scatter_add_(1, cells, torch.ones_like(cells, dtype=torch.float64))
-
-    def on_delay(self, state: FrameState) -> None:
-        """Delay every pixel by its values."""
-        height, width = state.radial_distance.shape
-        add_delay(state, self.coefficients[self.cells_of_image(height, width)].sum(-1))
-
-
-def drawn_values(count: int, rms: float, seed: int) -> Tensor:
-    """Draw `count` normal values (metres) with standard deviation `rms` from their own seed."""
-    generator = torch.Generator().manual_seed(seed)
-    return rms * torch.randn(count, generator=generator, dtype=torch.float64)
-
-
-@lru_cache(maxsize=4)
-def _cell_terms(count: int) -> tuple[Coefficient, ...]:
-    """Return the coefficients of so many cells; a map is built many times, of thousands of them."""
-    return tuple(Coefficient(f"cell_{number}", "m", 0.01) for number in range(count))

@@ -1,7 +1,7 @@
 """What an effect may use of a recording or of a frame being simulated, and what it needs."""
 
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -112,6 +112,11 @@ class EffectInputs:
     def phase(self) -> Tensor:
         """Phase of the predicted distance, not wrapped, shape (M,), radians."""
         return phase_from_radial_distance(self.radial_distance, self.known_frequency)
+
+    @cached_property
+    def turn(self) -> Tensor:
+        """Phasor of length one at the phase, shape (M,), complex."""
+        return torch.polar(torch.ones_like(self.phase), self.phase)
 
     @property
     def known_frequency(self) -> float:
@@ -275,6 +280,12 @@ def facts_from_state(state: FrameState) -> FrameFacts:
         approach=None if state.approach is None else state.approach[None],
         **conditions,
     )
+
+
+def joined(facts: Sequence[FrameFacts]) -> FrameFacts:
+    """Return the facts of successive frames as those of all of them."""
+    known = {each.name: [getattr(one, each.name) for one in facts] for each in fields(FrameFacts)}
+    return FrameFacts(**{name: None if v[0] is None else torch.cat(v) for name, v in known.items()})
 
 
 # What an effect can need to know before it can be tested, and whether it is known.

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import INTEGRATION_TIME, EffectInputs
+from tofcorr.simulation.effects.base import Coefficient, FrameEffect
+from tofcorr.simulation.effects.inputs import INTEGRATION_TIME, EffectInputs, FrameFacts, known
 
 # Integration times whose logarithms differ by less (no unit) are one setting. Set by hand: settings
 # differ by far more than 0.1 %, rounding in a file by far less.
@@ -21,7 +21,7 @@ class IntegrationTimeShape(Options):
     degree: int = 3
 
 
-class IntegrationTimeEffect(LinearDelay):
+class IntegrationTimeEffect(FrameEffect):
     r"""A shift with the logarithm of the integration time.
 
     .. math:: \Delta d = \sum_{k=1}^{K} a_k \ln^k (\tau / \tau_0)
@@ -35,7 +35,7 @@ class IntegrationTimeEffect(LinearDelay):
     source = "Kahlmann et al. 2006; Lindner and Kolb 2007"
     remedy = "three or more integration times at the same poses, in random order"
     needs = (INTEGRATION_TIME,)
-    of_frame = True
+    linear = True
     shape_type: ClassVar[type[Options]] = IntegrationTimeShape
 
     @classmethod
@@ -54,11 +54,8 @@ class IntegrationTimeEffect(LinearDelay):
         """Return the coefficients of the powers of the logarithm."""
         return tuple(Coefficient(f"log_{k}", "m", 0.03 / k) for k in range(1, shape.degree + 1))
 
-    def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return the powers of the logarithm, shape (M, K)."""
-        times = inputs.facts.integration_time
-        if times is None:
-            raise ValueError("The integration time is unknown; integration_time needs it.")
-        logarithm = (times * 1e6 / self.shape.reference_us).log()
-        powers = torch.stack([logarithm**k for k in range(1, self.shape.degree + 1)], dim=-1)
-        return inputs.of_frame(powers)
+    def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
+        """Return the polynomial of the logarithm, shape (F,), metres."""
+        logarithm = (known(facts, "integration_time") * 1e6 / self.shape.reference_us).log()
+        powers = [logarithm**k for k in range(1, self.shape.degree + 1)]
+        return torch.stack(powers, dim=-1) @ coefficients

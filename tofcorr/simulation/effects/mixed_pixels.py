@@ -1,13 +1,13 @@
 """Pixels whose footprint spans an edge."""
 
-from collections.abc import Callable
 from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, add_delay
 from tofcorr.simulation.effects.image_filters import blur
 from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs, inputs_from_state
 from tofcorr.simulation.effects.numerics import phase_difference
@@ -57,28 +57,24 @@ class MixedPixelsEffect(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the mixed phase and of the edges, shape (M,), metres."""
-        shape = self.shape
-        own = inputs.signal()
-        mixed = own
-        for share, sigma in zip(coefficients, shape.sigma_px, strict=False):
+        own = mixed = inputs.signal()
+        for share, sigma in zip(coefficients, self.shape.sigma_px, strict=False):
             mixed = mixed + share * (inputs.from_signal(blur, sigma) - own)
         phase = phase_difference(mixed, own)
         return inputs.metres_per_radian * phase + _at_edges(inputs, coefficients)
 
     def on_signal(self, state: FrameState) -> None:
         """Mix the signals of neighbours."""
-        shape = self.shape
         mixed = state.signal
-        for share, sigma in zip(self.coefficients, shape.sigma_px, strict=False):
+        for share, sigma in zip(self.coefficients, self.shape.sigma_px, strict=False):
             if share != 0:
                 mixed = mixed + share * (blur(state.signal, sigma) - state.signal)
         state.signal = mixed
 
     def on_delay(self, state: FrameState) -> None:
         """Add the errors at edges."""
-        if bool((self.coefficients[-len(_EDGES) :] != 0).any()):
-            shift = _at_edges(inputs_from_state(state), self.coefficients)
-            state.delay = state.delay + shift.reshape(state.radial_distance.shape)
+        if bool(self.coefficients[-len(_EDGES) :].any()):
+            add_delay(state, _at_edges(inputs_from_state(state), self.coefficients))
 
 
 def _at_edges(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
@@ -88,9 +84,8 @@ def _at_edges(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         edges = edges * inputs.brightness_varies(_EDGE_PX)[:, None]
     contrast, present, shared = edges.unbind(-1)
     square, edge, edge_near, astride, astride_near = coefficients[-len(_EDGES) :].unbind(0)
-    by_distance = edge_near * present + astride_near * shared
-    at_all = square * contrast + edge * present + astride * shared
-    return at_all + by_distance / inputs.radial_distance
+    near = (edge_near * present + astride_near * shared) / inputs.radial_distance
+    return square * contrast + edge * present + astride * shared + near
 
 
 def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
@@ -105,22 +100,12 @@ def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
     contrast = _squared_slope(blur(logarithm, _EDGE_PX))
     sharp = _squared_slope(logarithm)
     present = sharp / (sharp + _EDGE_SLOPE**2)
-    high, low = _of_neighbours(bounded, torch.maximum), _of_neighbours(bounded, torch.minimum)
+    # The extremes of 3 x 3 pixels.
+    high, low = (sign * max_pool2d(sign * bounded[:, None], 3, 1, 1)[:, 0] for sign in (1, -1))
     bright = (bounded - low) / (high - low).clamp(min=1e-12)
     jump = (high / low).log() ** 2
     shared = 4 * bright * (1 - bright) * jump / (jump + 4 * _EDGE_SLOPE**2)
     return torch.stack([contrast, present, shared]).movedim(0, -1)
-
-
-def _of_neighbours(images: Tensor, extreme: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """Return the extreme of 3 x 3 pixels around each pixel of images (B, H, W)."""
-    for axis in (1, 2):
-        count = images.shape[axis]
-        pairs = extreme(images.narrow(axis, 0, count - 1), images.narrow(axis, 1, count - 1))
-        inner = extreme(pairs.narrow(axis, 0, count - 2), pairs.narrow(axis, 1, count - 2))
-        ends = pairs.narrow(axis, 0, 1), pairs.narrow(axis, count - 2, 1)
-        images = torch.cat([ends[0], inner, ends[1]], axis)
-    return images
 
 
 def _squared_slope(images: Tensor) -> Tensor:

@@ -5,11 +5,15 @@ from torch import Tensor
 
 from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import FREQUENCY, VELOCITY, EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.inputs import (
+    FREQUENCY,
+    VELOCITY,
+    EffectInputs,
+    inputs_from_state,
+    known,
+)
 from tofcorr.simulation.effects.numerics import phase_difference
 from tofcorr.simulation.hooks import FrameState
-
-_QUARTER = torch.pi / 2
 
 
 class MotionEffect(CatalogueEffect):
@@ -45,21 +49,17 @@ class MotionEffect(CatalogueEffect):
         number = torch.arange(4, dtype=torch.float64)[:, None]
         moved = radial_speed(inputs) * (number * coefficients[0] + _first(inputs, coefficients))
         phase = inputs.phase + phase_from_radial_distance(moved, inputs.known_frequency)
-        taps = torch.cos(phase + number * _QUARTER)
+        taps = torch.cos(phase + number * torch.pi / 2)
         seen = torch.complex(taps[0] - taps[2], taps[3] - taps[1])
-        still = torch.polar(torch.ones_like(inputs.phase), inputs.phase)
-        return inputs.metres_per_radian * phase_difference(seen, still)
+        return inputs.metres_per_radian * phase_difference(seen, inputs.turn)
 
     def on_signal(self, state: FrameState) -> None:
         """Give each sample its own distance."""
         if state.tool_twist is None:
             return
-        inputs, shape = inputs_from_state(state), state.radial_distance.shape
-        speed, first = radial_speed(inputs), _first(inputs, self.coefficients)
-        interval = self.coefficients[0]
-        delays = torch.stack(
-            [(speed * (number * interval + first)).reshape(shape) for number in range(4)]
-        )
+        inputs, number = inputs_from_state(state), torch.arange(4, dtype=torch.float64)[:, None]
+        late = number * self.coefficients[0] + _first(inputs, self.coefficients)
+        delays = (radial_speed(inputs) * late).reshape(4, *state.radial_distance.shape)
         state.tap_delay = delays if state.tap_delay is None else state.tap_delay + delays
 
 
@@ -71,12 +71,9 @@ def _first(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
 
 def radial_speed(inputs: EffectInputs) -> Tensor:
     """Return how fast the distance along each ray grows, shape (M,), m/s."""
-    facts = inputs.facts
-    if facts.tool_twist is None:
-        raise ValueError("The tool's velocity is unknown; motion needs it.")
+    facts, twist = inputs.facts, known(inputs.facts, "tool_twist")
     rotation = facts.world_from_tool[:, :3, :3]
-    linear = (rotation @ facts.tool_twist[:, :3, None])[..., 0]
-    angular = (rotation @ facts.tool_twist[:, 3:, None])[..., 0]
+    linear, angular = ((rotation @ part[..., None])[..., 0] for part in twist.split(3, dim=1))
     arm = inputs.points_world - inputs.of_frame(facts.world_from_tool[:, :3, 3])
     # Velocity of the point of the tool frame that coincides with the seen point of the target.
     # The target is at rest.

@@ -124,18 +124,6 @@ _LEAST_COSINE = 0.05
 Area = tuple[tuple[float, float], tuple[float, float]]
 
 
-class _LitSurface(NamedTuple):
-    """A surface at right angles to the target.
-
-    Attributes:
-        extent: Width of the field of view on the target, metres.
-        wall: Its position across, metres.
-    """
-
-    extent: float
-    wall: float
-
-
 def light_by_surfaces(seen: Seen, area: Area, turn: float) -> Tensor:
     """Return the light by each surface at reflectivity one, relative to the direct light.
 
@@ -147,55 +135,39 @@ def light_by_surfaces(seen: Seen, area: Area, turn: float) -> Tensor:
     Returns:
         Complex, shape (F, N, 8), in the order of `SIDES` and `BEYOND`.
     """
-    direct = seen.distance**2 / seen.cosine.clamp(min=_LEAST_COSINE)
-    surfaces = [
-        _light(_surface(area, axis, sign, beyond), _turned(seen, axis, sign), direct, turn)
-        for (_, axis, sign), beyond in itertools.product(SIDES, BEYOND.values())
-    ]
+    low, high = area
+    extent = max(high[0] - low[0], high[1] - low[1])
+    surfaces = []
+    for (_, axis, sign), beyond in itertools.product(SIDES, BEYOND.values()):
+        edge = high[axis] if sign > 0 else -low[axis]
+        # Points and cameras across the surface, along it, and up.
+        order, flip = [axis, 1 - axis], seen.xy.new_tensor([sign, 1.0])
+        camera = torch.cat([seen.camera[:, order] * flip, seen.camera[:, 2:]], dim=1)
+        turned = seen._replace(xy=seen.xy[..., order] * flip, camera=camera)
+        surfaces.append(_light(turned, extent, edge + beyond * extent, turn))
     return torch.stack(surfaces, dim=-1)
 
 
-def _surface(area: Area, axis: int, sign: float, beyond: float) -> _LitSurface:
-    """Place a surface beyond the edge of the area seen."""
-    low, high = area
-    extent = max(high[0] - low[0], high[1] - low[1])
-    edge = high[axis] if sign > 0 else -low[axis]
-    return _LitSurface(extent, edge + beyond * extent)
-
-
-def _turned(seen: Seen, axis: int, sign: float) -> Seen:
-    """Return points and cameras across a surface, along it, and up."""
-    order = [axis, 1 - axis]
-    flip = seen.xy.new_tensor([sign, 1.0])
-    camera = torch.cat([seen.camera[:, order] * flip, seen.camera[:, 2:]], dim=1)
-    return seen._replace(xy=seen.xy[..., order] * flip, camera=camera)
-
-
-def _light(surface: _LitSurface, seen: Seen, direct: Tensor, turn: float) -> Tensor:
-    """Return the light by one surface over the direct light, complex, shape (F, N).
+def _light(seen: Seen, extent: float, wall: float, turn: float) -> Tensor:
+    """Return the light by a surface at right angles to the target, complex, shape (F, N).
 
     Args:
-        surface: The surface.
         seen: Points and cameras across it, along it, and up.
-        direct: Inverse of the direct light, shape (F, N), m^2.
+        extent: Width of the field of view on the target, metres.
+        wall: Its position across, metres.
         turn: Radians a metre of distance.
     """
-    extent = surface.extent
     up, depth, aside = (extent * seen.xy.new_tensor(row) for row in (_BEFORE, _DEPTH, _ASIDE))
-    lit = (surface.wall - seen.camera[:, 0]).clamp(min=0.0)[:, None, None, None]
-    away = (surface.wall - seen.xy[..., 0])[..., None, None]
+    lit = (wall - seen.camera[:, 0]).clamp(min=0.0)[:, None, None, None]
+    away = (wall - seen.xy[..., 0])[..., None, None]
     along = seen.xy[..., 1, None] + aside - seen.camera[:, 1, None, None]
     height = (seen.camera[:, 2, None] - up)[:, None, None]
     first = (lit**2 + along[..., None] ** 2 + height**2).sqrt().clamp(min=_NEAREST)
     second = (away**2 + aside[:, None] ** 2 + up**2).sqrt().clamp(min=_NEAREST)
     # Three cosines, and the fall of the light on both parts of the path.
-    strength = (
-        (_WIDTH * extent / torch.pi)
-        * (depth * up)
-        * lit
-        * away
-        / (first**3 * second.square().square())
-    )
+    cosines = depth * up * lit * away
+    strength = (_WIDTH * extent / torch.pi) * cosines / (first**3 * second.square().square())
+    direct = seen.distance**2 / seen.cosine.clamp(min=_LEAST_COSINE)
     extra = first + second - seen.distance[..., None, None]
     light = torch.polar(strength * direct[..., None, None], turn / 2 * extra)
     return light.sum((-1, -2))

@@ -11,11 +11,14 @@ from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.image_filters import spilled
 from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
+from tofcorr.simulation.effects.numerics import phase_difference
 from tofcorr.simulation.hooks import FrameState
 
 # Quantile of amplitude per light that is taken as white (no unit). Set by hand: above dark
 # surfaces, below the noise of bright ones.
 _WHITE = 0.9
+# Quantile of the amplitudes that hardly a pixel exceeds (no unit).
+_BRIGHTEST = 0.999
 # A pixel may be clipped if its amplitude is at least this share of white's (no unit). Set by hand:
 # a clipped tap loses less than three quarters of the amplitude.
 _DARKEST_CLIPPED = 0.25
@@ -29,9 +32,7 @@ def light_of(inputs: EffectInputs) -> Tensor:
     than anything in the recording, pixels not much darker than white are assumed to be clipped
     white. Where the light itself is known, nothing is estimated.
     """
-    if inputs.light is not None:
-        return inputs.light
-    return inputs.remembered(_restored)
+    return inputs.remembered(_restored) if inputs.light is None else inputs.light
 
 
 def _restored(inputs: EffectInputs) -> Tensor:
@@ -41,13 +42,8 @@ def _restored(inputs: EffectInputs) -> Tensor:
     light = inputs.of_frame(seconds) * inputs.incidence_cosine / inputs.radial_distance**2
     dim = light <= light.median()
     white = light * _quantile((amplitude / light)[dim], _WHITE)
-    clipped = (white > brightest(amplitude)) & (amplitude > _DARKEST_CLIPPED * white)
+    clipped = (white > _quantile(amplitude, _BRIGHTEST)) & (amplitude > _DARKEST_CLIPPED * white)
     return torch.where(clipped, torch.maximum(amplitude, white), amplitude)
-
-
-def brightest(amplitude: Tensor) -> float:
-    """Return the amplitude that hardly a pixel exceeds."""
-    return _quantile(amplitude, 0.999)
 
 
 def _quantile(values: Tensor, share: float) -> float:
@@ -108,10 +104,9 @@ class SaturationEffect(CatalogueEffect):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the brightest tap of the recording, A + A / contrast, as the full level."""
-        extra = 0.0 if inputs.facts.ambient is None else _most(inputs.facts.ambient)
-        shape = SaturationShape()
-        most_counts = brightest(inputs.known_amplitude)
-        full = (1 + 1 / shape.contrast) * most_counts + extra
+        ambient, contrast = inputs.facts.ambient, SaturationShape().contrast
+        full = (1 + 1 / contrast) * _quantile(inputs.known_amplitude, _BRIGHTEST)
+        full += 0.0 if ambient is None else float(ambient.nan_to_num(0.0).max())
         return cls(SaturationShape(full_counts=max(full, 1e-6)))
 
     @classmethod
@@ -123,11 +118,12 @@ class SaturationEffect(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four bent taps, shape (M,), metres."""
-        bent = _differences(self._bend(self._taps(inputs), coefficients))
-        if _any_spill(coefficients):
-            bent = bent + torch.tensordot(coefficients[-_SPILLS:], self._spills_of(inputs), dims=1)
-        real, imaginary = self._turned(bent, inputs)
-        return inputs.metres_per_radian * torch.atan2(imaginary, real)
+        bent = _phasor(self._bend(self._taps(inputs), coefficients))
+        spills = coefficients[-_SPILLS:]
+        # Finding out how much spills takes as long as all bends.
+        if spills.requires_grad or bool(spills.any()):
+            bent = bent + self._spills_of(inputs) @ spills.to(bent.dtype)
+        return inputs.metres_per_radian * phase_difference(bent, inputs.turn)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the shift per unit of each coefficient at full strength, shape (M, K), metres.
@@ -136,15 +132,25 @@ class SaturationEffect(CatalogueEffect):
         h = 1, not the tangents that `slope` gives.
         """
         taps = self._taps(inputs)
+        lower = [*map(_phasor, self._bends(taps)), *(-self._spills_of(inputs)).unbind(-1)]
         chords = []
-        for number, bend in enumerate(self._lower(taps, inputs)):
+        for number, bend in enumerate(lower):
             strength = 1.0 if number else _SOFT_CHORD
-            real, imaginary = self._turned(_differences(taps) - strength * bend, inputs)
+            bent = _phasor(taps) - strength * bend
             # Four taps beyond the knee are all equal: what is left has no phase but rounding's.
-            left = torch.hypot(real, imaginary) > _LEAST_LEFT * taps.amax(0)
-            angle = torch.where(left, torch.atan2(imaginary, real), 0.0)
+            left = bent.abs() > _LEAST_LEFT * taps.amax(0)
+            angle = torch.where(left, phase_difference(bent, inputs.turn), 0.0)
             chords.append(angle * (inputs.metres_per_radian / strength))
         return torch.stack(chords, dim=-1)
+
+    def on_taps(self, state: FrameState) -> None:
+        """Bend the four taps."""
+        counts = state.taps / state.electrons_per_count
+        bent = self._bend(counts, self.coefficients)
+        for share, axis in zip(self.coefficients[-_SPILLS:], (-2, -1), strict=True):
+            if share != 0:
+                bent = bent + share * spilled(_over(counts, self.shape), axis)
+        state.taps = bent * state.electrons_per_count
 
     def _taps(self, inputs: EffectInputs) -> Tensor:
         """Return the four taps as they would be without a bend, shape (4, M), counts."""
@@ -152,33 +158,13 @@ class SaturationEffect(CatalogueEffect):
         background = amplitude / self.shape.contrast
         if inputs.facts.ambient is not None:
             background = background + inputs.of_frame(inputs.facts.ambient.nan_to_num(0.0))
-        return _four_taps(background, amplitude, _of_phase(inputs))
-
-    @staticmethod
-    def _turned(differences: Tensor, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
-        """Return real and imaginary part of a phasor (2, M), the phase taken off: (M,) each."""
-        straight, across = differences
-        cosine, sine = _of_phase(inputs)
-        return straight * cosine + across * sine, across * cosine - straight * sine
-
-    def on_taps(self, state: FrameState) -> None:
-        """Bend the four taps."""
-        counts = state.taps / state.electrons_per_count
-        bent = self._bend(counts, self.coefficients)
-        if _any_spill(self.coefficients):
-            shares = self.coefficients[-_SPILLS:]
-            bent = bent + torch.tensordot(shares, _spills(_over(counts, self.shape)), dims=1)
-        state.taps = bent * state.electrons_per_count
+        return _four_taps(background, amplitude * inputs.turn)
 
     def _bend(self, taps: Tensor, coefficients: Tensor) -> Tensor:
         bent = taps
         for strength, bend in zip(coefficients[:-_SPILLS], self._bends(taps), strict=True):
             bent = torch.addcmul(bent, -strength.to(bend), bend)
         return bent
-
-    def _lower(self, taps: Tensor, inputs: EffectInputs) -> list[Tensor]:
-        """Return by how much each coefficient of 1 lowers the differences of taps, (2, M) each."""
-        return [*map(_differences, self._bends(taps)), *-self._spills_of(inputs)]
 
     def _bends(self, taps: Tensor) -> Iterator[Tensor]:
         """Yield by how much a soft bend, then each knee, lowers the taps at a strength of 1."""
@@ -189,26 +175,26 @@ class SaturationEffect(CatalogueEffect):
             yield torch.nn.functional.softplus(taps - knee * full, beta=1 / soft)
 
     def _spills_of(self, inputs: EffectInputs) -> Tensor:
-        """Return the differences of what runs into the chosen pixels, shape (2, 2, M), counts."""
+        """Return the phasors of what runs into the chosen pixels, shape (M, 2), counts."""
         ambient = inputs.facts.ambient
         ambient = torch.zeros_like(inputs.facts.offset) if ambient is None else ambient
         found = inputs.from_images(
             _spilled, inputs.known_frequency, self.shape, of_frames=ambient.nan_to_num(0.0)
         )
-        return found.to(inputs.radial_distance.dtype).movedim(0, -1)
+        return found.to(inputs.turn)
 
 
 def _spilled(
     amplitude: Tensor, distance: Tensor, ambient: Tensor, frequency: float, shape: SaturationShape
 ) -> Tensor:
-    """Return the differences of what runs into each pixel of images, (B, H, W, 2, 2), counts."""
+    """Return the phasors of what runs into each pixel of images, (B, H, W, 2), counts."""
     background = amplitude / shape.contrast + ambient[:, None, None].to(amplitude.dtype)
     if not bool(_over(background + amplitude, shape).any()):  # No tap is brighter.
-        return amplitude.new_zeros(*amplitude.shape, _SPILLS, 2)
+        return amplitude.new_zeros(*amplitude.shape, _SPILLS)
     phase = phase_from_radial_distance(distance, frequency)
-    turn = torch.stack([torch.cos(phase), torch.sin(phase)])
-    over = _differences(_over(_four_taps(background, amplitude, turn), shape))
-    return _spills(over).movedim((0, 1), (-2, -1))
+    taps = _four_taps(background, torch.polar(amplitude, phase))
+    over = _phasor(_over(taps, shape))
+    return torch.stack([spilled(over, axis) for axis in (-2, -1)], dim=-1)
 
 
 def _over(taps: Tensor, shape: SaturationShape) -> Tensor:
@@ -216,38 +202,12 @@ def _over(taps: Tensor, shape: SaturationShape) -> Tensor:
     return (taps - shape.spill_knee * shape.full_counts).clamp(min=0.0)
 
 
-def _any_spill(coefficients: Tensor) -> bool:
-    """Return whether charge spills; finding out how much takes as long as all bends."""
-    shares = coefficients[-_SPILLS:]
-    return shares.requires_grad or bool(shares.any())
+def _four_taps(background: Tensor, signal: Tensor) -> Tensor:
+    """Return the four taps, shape (4, ...), of a phasor (...)."""
+    cosine, sine = signal.real, signal.imag
+    return background + torch.stack([cosine, -sine, -cosine, sine])
 
 
-def _spills(over: Tensor) -> Tensor:
-    """Return what runs along columns and along rows of images (..., H, W), (2, ..., H, W)."""
-    return torch.stack([spilled(over, axis) for axis in (-2, -1)])
-
-
-def _differences(taps: Tensor) -> Tensor:
-    """Return the differences of opposite taps (4, ...), shape (2, ...)."""
-    return torch.stack([taps[0] - taps[2], taps[3] - taps[1]])
-
-
-def _of_phase(inputs: EffectInputs) -> Tensor:
-    """Return cosine and sine of the phase, shape (2, M)."""
-    return inputs.remembered(_turn)
-
-
-def _turn(inputs: EffectInputs) -> Tensor:
-    return torch.stack([torch.cos(inputs.phase), torch.sin(inputs.phase)])
-
-
-def _four_taps(background: Tensor, amplitude: Tensor, turn: Tensor) -> Tensor:
-    """Return the four taps, shape (4, ...), of cosine and sine of the phase (2, ...)."""
-    cosine, sine = amplitude * turn
-    return torch.stack(
-        [background + cosine, background - sine, background - cosine, background + sine]
-    )
-
-
-def _most(values: Tensor) -> float:
-    return float(values.nan_to_num(0.0).max())
+def _phasor(taps: Tensor) -> Tensor:
+    """Return the phasor that the differences of opposite taps (4, ...) make, complex (...)."""
+    return torch.complex(taps[0] - taps[2], taps[3] - taps[1])

@@ -75,7 +75,7 @@ class WigglingEffect(SignalEffect):
 
     def shares(self, inputs: EffectInputs) -> Tensor:
         """Return sine and cosine of each number of periods: its wave, and that a quarter on."""
-        waves = torch.stack(self._waves(inputs.remembered(_turn), inputs), dim=-1)
+        waves = torch.stack(self._waves(inputs.turn, inputs), dim=-1)
         return torch.stack([waves, 1j * waves], dim=-1).flatten(1) / inputs.metres_per_radian
 
     def on_signal(self, state: FrameState) -> None:
@@ -107,10 +107,6 @@ class WigglingEffect(SignalEffect):
         low, high = math.log(self.shape.low_counts), math.log(self.shape.high_counts)
         ends = self.shape.low_counts, self.shape.high_counts
         return 2 * (inputs.amplitude.clamp(*ends).log() - low) / (high - low) - 1
-
-
-def _turn(inputs: EffectInputs) -> Tensor:
-    return torch.polar(torch.ones_like(inputs.phase), inputs.phase)
 
 
 def _add_harmonic(state: FrameState, order: int, phasor: Tensor) -> None:

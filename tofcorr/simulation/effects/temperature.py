@@ -1,0 +1,207 @@
+"""Shifts with the temperature of camera and room, which follow what was before."""
+
+import math
+from itertools import pairwise
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import Coefficient, FrameEffect
+from tofcorr.simulation.effects.inputs import (
+    ROOM_TEMPERATURE,
+    TIMESTAMP,
+    EffectInputs,
+    FrameFacts,
+    known,
+)
+
+# A pause of more mean intervals between frames than this counts as one that the camera was off in,
+# beyond them. Chosen: stations of a robot differ less, and a camera between them is left on.
+_ON_INTERVALS = 3.0
+# Largest number of pauses after which an unknown temperature is assumed. Set by hand: each adds a
+# coefficient.
+_MOST_PAUSES = 5
+
+
+class WarmUpShape(Options):
+    """Time constants, the mean time between frames, and the reference of the body temperature."""
+
+    rise_s: tuple[float, ...] = (60.0, 200.0, 600.0, 1800.0)
+    heat_s: tuple[float, ...] = (120.0, 600.0)
+    frame_interval_s: float = 10.0
+    body_reference_c: float | None = None
+
+
+class WarmUpEffect(FrameEffect):
+    r"""Drift with the time since power-on, and with the heat of the time that the camera ran.
+
+    .. math:: \Delta d_i = \sum_T k_T (1 - e^{-t_i / T})
+              + \sum_T h_T \sum_{j \le i} (1 - e^{-\delta_j / T}) e^{-(t_i - t_j) / T}
+              + b (\vartheta_i - \vartheta_{room,i} - \vartheta_0) / 10 K
+
+    The first sum is an uninterrupted warm-up. The second also cools down in pauses: the camera runs
+    for the time delta_j since the frame before, but for three mean intervals at most, so that it
+    does not matter how often it was recorded. The last term follows the body temperature if it is
+    recorded, relative to the room temperature if that is known too; the effect of the room itself
+    is `room_temperature`. About 15 mm within three frames (Abdo and Borgeat 2010).
+    """
+
+    name = "warm_up"
+    summary = "drift while the camera warms up and cools down between frames"
+    source = "Kahlmann et al. 2006; Abdo and Borgeat 2010"
+    remedy = (
+        "poses in random order with revisits, the first minutes included, body temperature logged"
+    )
+    needs = (TIMESTAMP,)
+    linear = True
+    shape_type: ClassVar[type[Options]] = WarmUpShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Take the mean frame interval; use the body temperature if every frame has one."""
+        times, body = inputs.facts.timestamp, _excess(inputs.facts)
+        interval = float(times.max() - times.min()) / max(len(times) - 1, 1)
+        reference = None
+        if body is not None and bool(torch.isfinite(body).all()):
+            reference = float(body.mean())
+        shape = WarmUpShape(frame_interval_s=max(interval, 1e-3), body_reference_c=reference)
+        return cls(shape)
+
+    @classmethod
+    def terms(cls, shape: WarmUpShape) -> tuple[Coefficient, ...]:
+        """Return one coefficient per time constant, and one of the body temperature if known."""
+        rise = [Coefficient(f"rise_{t:g}s", "m", 0.02) for t in shape.rise_s]
+        heat = [Coefficient(f"heat_{t:g}s", "m", 0.02) for t in shape.heat_s]
+        known = shape.body_reference_c is not None
+        body = [Coefficient("body_10k", "m", 0.02)] if known else []
+        return (*rise, *heat, *body)
+
+    def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
+        """Return the drift of each frame, shape (F,), metres."""
+        shape, times = self.shape, facts.timestamp
+        drifts = [1 - torch.exp(-times / constant) for constant in shape.rise_s]
+        drifts += heats(times, shape)
+        if shape.body_reference_c is not None:
+            known(facts, "body_temperature")
+            drifts.append((_excess(facts) - shape.body_reference_c) / 10.0)
+        return torch.stack(drifts, dim=-1) @ coefficients
+
+
+def heats(times: Tensor, shape: WarmUpShape) -> list[Tensor]:
+    """Return the heat at the times (F,) of frames for each time constant, 0 cold to 1 warm."""
+    age = times[:, None] - times[None, :]
+    past = age >= 0
+    order = times.argsort(stable=True)
+    since = (
+        times[order]
+        .diff(prepend=times[order][:1])
+        .clamp(max=_ON_INTERVALS * shape.frame_interval_s)
+    )
+    ran = torch.empty_like(times).index_copy(0, order, since)
+    return [
+        (torch.exp(-age.clamp(min=0) / constant) * past) @ -torch.expm1(-ran / constant)
+        for constant in shape.heat_s
+    ]
+
+
+def _excess(facts: FrameFacts) -> Tensor | None:
+    """Return body minus room temperature, or body temperature alone, (F,); None if unknown."""
+    body, room = facts.body_temperature, facts.room_temperature
+    if body is None or room is None or not bool(torch.isfinite(room).all()):
+        return body
+    return body - room
+
+
+class RoomTemperatureShape(Options):
+    """Temperature without shift, time constants of the lag, and times without known history."""
+
+    reference_c: float = 22.0
+    lags_s: tuple[float, ...] = (200.0, 800.0)
+    starts_s: tuple[float, ...] = (0.0,)
+
+
+class RoomTemperatureEffect(FrameEffect):
+    r"""A shift with the room temperature, immediate and lagged.
+
+    .. math:: \Delta d = a (\vartheta - \vartheta_0)
+              + \sum_T b_T \Big(\bar\vartheta_T - \vartheta_0
+              + \sum_{j: t_j \le t} s_j e^{-(t - t_j) / T}\Big) + q (\vartheta - \vartheta_0)^2
+
+    with first-order lagged temperatures of the time constants T in `lags_s`. The temperature before
+    the first frame and during long pauses is not recorded: after each of them, at t_j, the camera's
+    temperature deviates by s_j degrees. About 8 mm per degree (Kahlmann et al. 2006).
+    """
+
+    name = "room_temperature"
+    summary = "shift with the temperature of the room"
+    source = "Kahlmann et al. 2006"
+    remedy = "the same poses at room temperatures at least 3 degrees apart, logged"
+    needs = (ROOM_TEMPERATURE,)
+    shape_type: ClassVar[type[Options]] = RoomTemperatureShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Take the mean temperature as reference, and the times after the longest pauses."""
+        room, times = inputs.facts.room_temperature, inputs.facts.timestamp.sort().values
+        shape = RoomTemperatureShape(reference_c=22.0 if room is None else float(room.mean()))
+        pauses = times.diff()
+        longest = pauses.argsort(descending=True)[:_MOST_PAUSES].sort().values
+        after = [times[i + 1] for i in longest if pauses[i] > min(shape.lags_s)]
+        starts = tuple(float(time) for time in [times[0], *after])
+        return cls(shape.model_copy(update={"starts_s": starts}))
+
+    @classmethod
+    def terms(cls, shape: RoomTemperatureShape) -> tuple[Coefficient, ...]:
+        """Return the coefficients of immediate, lagged, squared and earlier temperature."""
+        lagged = [Coefficient(f"lagged_{lag:g}s_per_degree", "m/K", 0.008) for lag in shape.lags_s]
+        return (
+            Coefficient("per_degree", "m/K", 0.008),
+            *lagged,
+            Coefficient("square", "m/K^2", 0.001),
+            *(Coefficient(f"start_{i}", "K", 1.5) for i, _ in enumerate(shape.starts_s)),
+        )
+
+    def in_other_recordings(self) -> Self:
+        """Return the effect without the unknown temperatures before the first frame and pauses.
+
+        At those moments of another recording they once added 30 mm.
+        """
+        count = len(self.shape.starts_s)
+        shape = self.shape.model_copy(update={"starts_s": ()})
+        return type(self)(shape, self.coefficients[: len(self.coefficients) - count])
+
+    def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
+        """Return the shift of each frame, shape (F,), metres."""
+        times, room = facts.timestamp, known(facts, "room_temperature")
+        lags, starts = self.shape.lags_s, self.shape.starts_s
+        at_once, lagged, square, off = coefficients.split([1, len(lags), 1, len(starts)])
+        excess = room - self.shape.reference_c
+        shift = at_once * excess + square * excess**2
+        for strength, lag in zip(lagged, lags, strict=True):
+            followed = lagged_by(lag, times, excess)
+            for degrees, start in zip(off, starts, strict=True):
+                since = times - start
+                lingering = torch.exp(-since.clamp(min=0.0) / lag) * (since >= 0)
+                followed = followed + degrees * lingering
+            shift = shift + strength * followed
+        return shift
+
+
+def lagged_by(lag_s: float, times: Tensor, values: Tensor) -> Tensor:
+    """Return the first-order lag of values (F,); before the earliest time they are constant.
+
+    Between frames the values change linearly from v_0 to v. The solution of y' = (v(t) - y) / T is
+    y = v + (y_0 - v_0) e - (v - v_0) (1 - e) T / t with e = exp(-t / T).
+    """
+    order = torch.argsort(times, stable=True)
+    at, given = times[order].tolist(), values[order].tolist()
+    followed = given[:1]
+    for (start, end), (first, last) in zip(pairwise(at), pairwise(given), strict=True):
+        passed = (end - start) / lag_s
+        behind = -math.expm1(-passed) / passed if passed > 0 else 1.0
+        followed.append(last + (followed[-1] - first) * math.exp(-passed) - (last - first) * behind)
+    lagged = torch.empty_like(values)
+    lagged[order] = values.new_tensor(followed)
+    return lagged
