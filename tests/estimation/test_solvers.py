@@ -16,7 +16,6 @@ from torch import Tensor
 from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.solvers import (
-    Iteration,
     Solution,
     SolverOptions,
     initial_parameters,
@@ -149,16 +148,16 @@ def test_a_watcher_sees_every_iteration_and_can_interrupt(
     scene = make_scene(generator, EA)
     objective = MomentObjective(scene.moments())
     start = nearby(scene.truth, generator, 0.05)
-    seen: list[Iteration] = []
+    seen: list[Solution] = []
 
-    def watch(iteration: Iteration) -> bool:
+    def watch(iteration: Solution) -> bool:
         seen.append(iteration)
-        return iteration.number < 2
+        return iteration.iterations < 2
 
     solution = solver(objective, start, watcher=watch)
     assert solution.stopped == "interrupted"
-    assert [iteration.number for iteration in seen] == [0, 1, 2]
-    assert [iteration.loss for iteration in seen] == pytest.approx(solution.history)
+    assert [iteration.iterations for iteration in seen] == [0, 1, 2]
+    assert [iteration.loss for iteration in seen] == pytest.approx([*solution.history])
     assert torch.equal(seen[0].parameters.tool_from_camera, start.tool_from_camera)
     assert torch.equal(seen[-1].parameters.tool_from_camera, solution.parameters.tool_from_camera)
 
@@ -170,7 +169,7 @@ def test_going_on_from_an_interruption_ends_at_the_same_optimum(
     scene = make_scene(generator, EA)
     objective = MomentObjective(scene.moments())
     start = nearby(scene.truth, generator, 0.05)
-    half_way = solver(objective, start, watcher=lambda iteration: iteration.number < 2)
+    half_way = solver(objective, start, watcher=lambda iteration: iteration.iterations < 2)
     resumed = solver(objective, half_way.parameters)
     in_one_go = solver(objective, start)
     assert resumed.converged

@@ -7,7 +7,7 @@ import pytest
 import torch
 from simulated_walls import EA, simulated_wall
 
-from tofcorr.estimation.solvers import Iteration
+from tofcorr.estimation.solvers import Solution
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels import dataset as dataset_module
 from tofcorr.pixels.dataset import covered_domain, threads_at_once
@@ -29,7 +29,7 @@ def test_solver_and_pass_each_use_threads_as_they_should(
         of_pass.append(threads or threads_at_once())
         return in_threads(work, items, threads)  # type: ignore[arg-type]
 
-    def watcher(_: Iteration) -> None:
+    def watcher(_: Solution) -> None:
         of_solver.append(torch.get_num_threads())
 
     monkeypatch.setattr(dataset_module, "in_threads", watched)

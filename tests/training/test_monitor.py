@@ -10,7 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.solvers import Iteration
+from tofcorr.estimation.solvers import Solution
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset, covered_domain
@@ -47,10 +47,10 @@ class Run:
         self.dataset = Dataset((recording,))
         domain = covered_domain(self.dataset, TRAIN)
         options = TrainingOptions.from_mapping({"name": "EA", "model": EA}, "test")
-        self.iterations: list[Iteration] = []
+        self.iterations: list[Solution] = []
         monitor = RunMonitor()
 
-        def watch(iteration: Iteration) -> None:
+        def watch(iteration: Solution) -> None:
             monitor.iteration(iteration)
             self.iterations.append(iteration)
 

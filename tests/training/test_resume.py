@@ -11,7 +11,7 @@ from training.trained import CONFIG, FILES, Trained
 
 import tofcorr
 from tofcorr import CalibrationDataError, ConfigError, TrainingResult
-from tofcorr.estimation.solvers import Iteration
+from tofcorr.estimation.solvers import Solution
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.run import interruptible
 
@@ -20,9 +20,9 @@ def press_ctrl_c_at(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     """Send this process SIGINT when a watched solver has made so many iterations."""
     record = RunMonitor.iteration
 
-    def press(monitor: RunMonitor, iteration: Iteration) -> None:
+    def press(monitor: RunMonitor, iteration: Solution) -> None:
         record(monitor, iteration)
-        if iteration.number == number:
+        if iteration.iterations == number:
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(RunMonitor, "iteration", press)

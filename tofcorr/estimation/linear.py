@@ -31,12 +31,9 @@ from tofcorr.estimation.robust import f_tail
 RESOLVED = 1e-10
 """Share of the largest eigenvalue of a matrix of curvature, scaled to a unit diagonal, up to which
 another is rounding. float64 resolves 1e-16, and sums of products over pixels lose some digits."""
-# Share of a curvature that is added where it is the only one in its direction: without the one pose
-# that determines it, or beside an effect that nothing determines. Well above rounding: such a
-# direction scatters so much that nothing is concluded from it.
-_RIDGE = 1e-9
-# Share of its mean diagonal added to a matrix before it is factored: rounding of sums of products.
-_ROUNDING = 1e-12
+ROUNDING = 1e-12
+"""Share of a scaled curvature below which float64 resolves no direction of a single matrix; what is
+added before one is factored."""
 # Largest variance of an effect or of a prior, square metres or radians: 50 mm or mrad. Chosen: what
 # is larger is no error of a camera or a robot, but two effects of opposite signs.
 _LARGEST_VARIANCE = 0.05**2
@@ -111,7 +108,7 @@ class NormalEquations(NamedTuple):
 
 
 def solved(
-    matrix: Float[Tensor, "*B P P"], right: Float[Tensor, "*B P"], ridge: float = _ROUNDING
+    matrix: Float[Tensor, "*B P P"], right: Float[Tensor, "*B P"], ridge: float = ROUNDING
 ) -> Float[Tensor, "*B P"]:
     """Solve equations, each unknown scaled to its own curvature.
 
@@ -129,7 +126,7 @@ def solved(
 def inverse(matrix: Float[Tensor, "P P"]) -> Float[Tensor, "P P"]:
     """Return the inverse of a positive definite matrix, scaled to a unit diagonal before."""
     scale = matrix.diagonal().clamp(min=_TINY).rsqrt()
-    unit = matrix * scale[:, None] * scale + _ROUNDING * torch.eye(len(scale)).to(matrix)
+    unit = matrix * scale[:, None] * scale + ROUNDING * torch.eye(len(scale)).to(matrix)
     return torch.cholesky_inverse(torch.linalg.cholesky(unit)) * scale[:, None] * scale
 
 
@@ -198,8 +195,10 @@ def left_out_steps(
 
 def _without_each(whole: Curvature, each: Float[Tensor, "G P P"]) -> Float[Tensor, "G P P"]:
     """Return the inverse curvature without each pose, in the coordinates of the whole's basis."""
+    # A share well above rounding is added: a direction that one pose alone determines then scatters
+    # so much without it that nothing is concluded from it.
     one = torch.eye(each.shape[-1]).to(each)
-    return torch.linalg.inv((1 + _RIDGE) * one - whole.basis.T @ each @ whole.basis)
+    return torch.linalg.inv((1 + 10 * RESOLVED) * one - whole.basis.T @ each @ whole.basis)
 
 
 def robust_covariance(left_out: Float[Tensor, "G P"]) -> Float[Tensor, "P P"]:
@@ -481,7 +480,7 @@ def _parts(sums: GroupSums) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _with_prior(own: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
-    ridge = _ROUNDING * own.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None]
+    ridge = ROUNDING * own.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None]
     return own + (noise[:, None] * precision + ridge).diag_embed()
 
 

@@ -208,19 +208,6 @@ class Parameters:
         return slope_of_entries(self.tool_from_camera, self.coefficients, self.twist_size)
 
 
-def residual_variance(loss: float, hessian: Float[Tensor, "P P"], num_residuals: float) -> float:
-    """Return the mean weighted squared residual, on which standard errors are based.
-
-    Args:
-        loss: Sum of weighted squared residuals.
-        hessian: Half its Gauss-Newton Hessian, shape (P, P).
-        num_residuals: How many residuals it sums.
-    """
-    # The largest curvature is that of an unknown that moves every residual by about one metre.
-    least = LEAST_RESIDUAL**2 * float(hessian.diagonal().max())
-    return max(loss, least) / num_residuals
-
-
 @runtime_checkable
 class Objective(Protocol):
     """A sum of squared residuals as a function of the parameters."""

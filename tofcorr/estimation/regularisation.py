@@ -19,15 +19,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.estimation.linear import NormalEquations, solved
+from tofcorr.estimation.linear import RESOLVED, NormalEquations, solved
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, Prior, WithPrior
 from tofcorr.estimation.solvers import SolverOptions, minimise
 
 STRENGTHS = tuple(10.0**exponent for exponent in range(-10, 1))
 """The strengths that cross-validation tries, without unit. Set by hand."""
-# Share of each curvature added, so that directions that neither images nor penalty determine stay
-# near zero. Set by hand, well above rounding.
-_RIDGE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -143,7 +140,7 @@ def _held_out(
     )
     prior = smoothness(penalties, float(weights[~test].sum()), around)
     kept = kept.plus(None if prior is None else prior.equations(around))
-    return float(held_out.at(-solved(kept.hessian, kept.gradient, _RIDGE)).loss)
+    return float(held_out.at(-solved(kept.hessian, kept.gradient, RESOLVED)).loss)
 
 
 def time_constant(moments: ImageMoments, around: Parameters, time: Float[Tensor, "N"]) -> float:
@@ -175,7 +172,7 @@ def time_constant(moments: ImageMoments, around: Parameters, time: Float[Tensor,
         hessian = torch.cat([equations.hessian, row[None]])
         hessian = torch.cat([hessian, torch.cat([row, corner[None]])[:, None]], dim=1)
         gradient = torch.cat([equations.gradient, (decay @ each.gradient[:, column])[None]])
-        return float(equations.loss - gradient @ solved(hessian, gradient, _RIDGE))
+        return float(equations.loss - gradient @ solved(hessian, gradient, RESOLVED))
 
     low, high = duration / max(moments.num_images - 1, 1), 3 * duration
     grid = torch.linspace(math.log(low), math.log(high), 16).tolist()

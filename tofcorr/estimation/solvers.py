@@ -9,7 +9,7 @@ iterations. The Gauss-Newton steps are damped in proportion to the curvature of 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -18,24 +18,18 @@ from jaxtyping import Bool, Float
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from tofcorr.estimation.linear import Curvature, NormalEquations, solved
+from tofcorr.estimation.linear import ROUNDING, Curvature, NormalEquations, solved
 from tofcorr.estimation.moments import (
+    LEAST_RESIDUAL,
     ImageMoments,
     MomentObjective,
     Objective,
     Parameters,
-    residual_variance,
 )
 from tofcorr.geometry import se3
 from tofcorr.options import Options
 
 Stopped = Literal["converged", "iteration_limit", "line_search_failed", "not_finite", "interrupted"]
-# Share of the largest curvature up to which an unknown has none but rounding: unknowns are metres
-# and radians, and the weakest that any recording resolves is far above it.
-_NO_CURVATURE = 1e-24
-# Share of the largest curvature, each unknown scaled to its own, as which a smaller one counts
-# where steps are scaled: below it float64 resolves no direction.
-_LEAST_CURVATURE = 1e-12
 
 
 class SolverOptions(Options):
@@ -54,52 +48,54 @@ class SolverOptions(Options):
 
 
 @dataclass(frozen=True)
-class Iteration:
-    """One iteration as the monitor sees it.
-
-    Attributes:
-        number: Counted from 0, the start.
-        loss: Sum of weighted squared residuals.
-        step_left: Length of the step left to the optimum, in standard errors.
-        parameters: The current parameters.
-    """
-
-    number: int
-    loss: float
-    step_left: float
-    parameters: Parameters
-
-
-Watcher = Callable[[Iteration], bool | None]
-"""Called after each iteration; returning False interrupts the solver."""
-
-
-@dataclass(frozen=True)
 class Solution:
-    """The end of a fit.
+    """The state of a fit: after each iteration, and at its end.
 
     Attributes:
         parameters: The best point found; on failure the last good one.
-        loss: Its loss.
-        stopped: Why the solver stopped; only "converged" is convergence.
-        iterations: How many iterations it took.
+        history: The loss, the sum of weighted squared residuals, at the start and after each
+            iteration.
+        step_left: Length of the step left to the optimum, in standard errors.
+        stopped: Why the solver stopped; only "converged" is convergence. None: it has not yet.
         evaluations: How often the loss was evaluated.
-        message: The reason in one sentence.
-        history: Every iteration's loss.
     """
 
     parameters: Parameters
-    loss: float
-    stopped: Stopped
-    iterations: int
-    evaluations: int
-    message: str
-    history: list[float] = field(default_factory=list)
+    history: tuple[float, ...] = ()
+    step_left: float = math.inf
+    stopped: Stopped | None = None
+    evaluations: int = 0
+
+    @property
+    def loss(self) -> float:
+        """The latest loss."""
+        return self.history[-1] if self.history else math.inf
+
+    @property
+    def iterations(self) -> int:
+        """How many iterations it took; 0 at the start."""
+        return max(len(self.history) - 1, 0)
 
     @property
     def converged(self) -> bool:
         """Whether the optimum was reached."""
         return self.stopped == "converged"
+
+    @property
+    def message(self) -> str:
+        """The reason for stopping in one sentence."""
+        left = f"the step left is {self.step_left:.1e} standard errors."
+        return {
+            "converged": f"Converged: {left}",
+            "iteration_limit": f"Not converged: stopped at {self.iterations} iterations, {left}",
+            "line_search_failed": f"The line search failed; rolled back to the best point, {left}",
+            "not_finite": "The loss became NaN or infinite; rolled back to the last good point.",
+            "interrupted": f"Interrupted after {self.iterations} iterations, {left}",
+        }[self.stopped or "line_search_failed"]
+
+
+Watcher = Callable[[Solution], bool | None]
+"""Called after each iteration; returning False interrupts the solver."""
 
 
 def minimise(
@@ -120,13 +116,18 @@ def minimise(
         The best parameters and the reason for stopping. If the loss stops being finite, or the
         line search fails, they are the last good ones, and `stopped` says so.
     """
-    if not start.size:
-        loss, message = float(objective.loss(start)), "There is nothing to estimate."
-        return Solution(start, loss, "converged", 0, 1, message, [loss])
+    if not start.size:  # There is nothing to estimate.
+        return Solution(start, (float(objective.loss(start)),), 0.0, "converged", 1)
     options = options or SolverOptions()
     run = _Run(objective, start, options, watcher)
     {"lbfgs": _lbfgs, "levenberg_marquardt": _levenberg_marquardt}[options.kind](run)
-    return run.solution()
+    found = run.found
+    return replace(
+        found,
+        parameters=found.parameters.detached(),
+        stopped=found.stopped or "line_search_failed",
+        evaluations=run.evaluations,
+    )
 
 
 class _Run:
@@ -140,60 +141,44 @@ class _Run:
         watcher: Watcher | None,
     ) -> None:
         self.objective, self.options, self.watcher = objective, options, watcher
-        self.best, self.step_left, self.evaluations = start, math.inf, 0
-        self.history: list[float] = []
-        self.stopped: Stopped | None = None
+        self.found, self.evaluations = Solution(start), 0
 
     def reached(self, parameters: Parameters, loss: float, step_left: float) -> bool:
         """Take note of an iteration; return whether that is the end."""
-        self.best, self.step_left = parameters, step_left
-        self.history.append(loss)
-        number = len(self.history) - 1
-        iteration = Iteration(number, loss, step_left, parameters)
-        if self.watcher is not None and self.watcher(iteration) is False:
-            self.stopped = "interrupted"
+        self.found = Solution(parameters, (*self.found.history, loss), step_left)
+        stopped: Stopped | None = None
+        if self.watcher is not None and self.watcher(self.found) is False:
+            stopped = "interrupted"
         elif step_left <= self.options.tolerance:
-            self.stopped = "converged"
-        elif number >= self.options.max_iterations:
-            self.stopped = "iteration_limit"
-        return self.stopped is not None
+            stopped = "converged"
+        elif self.found.iterations >= self.options.max_iterations:
+            stopped = "iteration_limit"
+        self.found = replace(self.found, stopped=stopped)
+        return stopped is not None
 
-    def equations(self, parameters: Parameters) -> NormalEquations:
-        """Return the normal equations at a point."""
+    def equations(self, parameters: Parameters) -> NormalEquations | None:
+        """Return the normal equations at a point; None where they are not finite."""
         self.evaluations += 1
-        return self.objective.normal_equations(parameters)
+        found = self.objective.normal_equations(parameters)
+        return found if found.is_finite else None
+
+    def latest(self) -> NormalEquations | None:
+        """Return the normal equations at the best point; None where that is the end."""
+        if (equations := self.equations(self.found.parameters)) is None:
+            self.found = replace(self.found, stopped="not_finite")
+        return equations
 
     def variance(self, equations: NormalEquations, loss: float) -> float:
-        """Return the residual variance at a loss, on which standard errors are based."""
-        return residual_variance(loss, equations.hessian, self.objective.num_residuals)
-
-    def solution(self) -> Solution:
-        """Return the best point, and why the run stopped in one sentence."""
-        iterations, left = len(self.history) - 1, f"the step left is {self.step_left:.1e} standard"
-        stopped = self.stopped or "line_search_failed"
-        message = {
-            "converged": f"Converged: {left} errors.",
-            "iteration_limit": f"Not converged: stopped at {iterations} iterations, {left} errors.",
-            "line_search_failed": "The line search failed; rolled back to the best point, "
-            f"{left} errors.",
-            "not_finite": "The loss became NaN or infinite; rolled back to the last good point.",
-            "interrupted": f"Interrupted after {iterations} iterations, {left} errors.",
-        }[stopped]
-        return Solution(
-            parameters=self.best.detached(),
-            loss=self.history[-1] if self.history else math.inf,
-            stopped=stopped,
-            iterations=max(iterations, 0),
-            evaluations=self.evaluations,
-            message=message,
-            history=self.history,
-        )
+        """Return the mean weighted squared residual, on which standard errors are based."""
+        # The largest curvature is that of an unknown that moves every residual by about one metre.
+        least = LEAST_RESIDUAL**2 * float(equations.hessian.diagonal().max())
+        return max(loss, least) / self.objective.num_residuals
 
 
 def _lbfgs(run: _Run) -> None:
     """Minimise by L-BFGS; where a line search stalls, it starts again from there, three times."""
     for _ in range(4):
-        if run.stopped is None:
+        if run.found.stopped is None:
             _descend(run)
 
 
@@ -201,15 +186,14 @@ def _descend(run: _Run) -> None:
     """Run L-BFGS from the best point, whitened there."""
     from scipy.optimize import minimize  # A quarter of the time of torch to import.
 
-    origin, equations = run.best, run.equations(run.best)
-    if not equations.is_finite:
-        run.stopped = "not_finite"
+    origin, equations = run.found.parameters, run.latest()
+    if equations is None:
         return
     loss = float(equations.loss)
     variance = run.variance(equations, loss)
     white = whitening(equations.hessian / variance)
     gradient = white.T @ equations.gradient / variance
-    if not run.history and run.reached(origin, loss, float(gradient.norm())):
+    if not run.found.history and run.reached(origin, loss, float(gradient.norm())):
         return
     zero = np.zeros(origin.size)
     seen: list[tuple[np.ndarray, float, np.ndarray]] = [(zero, 0.0, gradient.numpy())]
@@ -241,27 +225,21 @@ def _descend(run: _Run) -> None:
 
 def _levenberg_marquardt(run: _Run) -> None:
     """Minimise by damped Gauss-Newton steps on the normal equations."""
-    here, equations, damping = run.best, run.equations(run.best), 1e-6
-    if not equations.is_finite:
-        run.stopped = "not_finite"
-        return
-    while True:
+    here, equations, damping = run.found.parameters, run.latest(), ROUNDING**0.5
+    while equations is not None:
         loss, gradient = float(equations.loss), equations.gradient
         decrease = float(gradient @ solved(equations.hessian, gradient))
         left = math.sqrt(max(decrease, 0.0) / run.variance(equations, loss))
         if run.reached(here, loss, left):
             return
+        origin, hessian, equations = here, equations.hessian, None
         # Beyond that, a step is too short to change the loss.
-        while damping < 1e12:
-            step = -solved(equations.hessian, gradient, damping)
-            trial = here.moved(step)
-            found = run.equations(trial)
-            if found.is_finite and bool(run.objective.change(here, step) <= 0):
-                break
+        while equations is None and damping * ROUNDING < 1:
+            step = -solved(hessian, gradient, damping)
+            here = origin.moved(step)
+            equations = run.equations(here) if run.objective.change(origin, step) <= 0 else None
             damping *= 10
-        else:
-            return
-        here, equations, damping = trial, found, max(damping / 10, 1e-15)
+        damping = max(damping / 100, torch.finfo(torch.float64).eps)
 
 
 def curved(hessian: Float[Tensor, "P P"]) -> Bool[Tensor, "P"]:
@@ -271,7 +249,8 @@ def curved(hessian: Float[Tensor, "P P"]) -> Bool[Tensor, "P"]:
     an unknown stays where it is: whatever is solved for it is rounding over almost zero.
     """
     diagonal = hessian.diagonal()
-    return diagonal > _NO_CURVATURE * diagonal.max()
+    # Unknowns are metres and radians: the weakest that any recording resolves is far above it.
+    return diagonal > ROUNDING**2 * diagonal.max()
 
 
 def whitening(hessian: Float[Tensor, "P P"]) -> Float[Tensor, "P P"]:
@@ -282,7 +261,7 @@ def whitening(hessian: Float[Tensor, "P P"]) -> Float[Tensor, "P P"]:
     used = curved(hessian)
     blank = torch.where(used[:, None] & used, hessian, 0.0) + torch.diag((~used).to(hessian))
     factored = Curvature(blank)
-    values = factored.values.clamp(min=_LEAST_CURVATURE * float(factored.values.max()))
+    values = factored.values.clamp(min=ROUNDING * float(factored.values.max()))
     whitened = factored.scale[:, None] * factored.vectors * values.rsqrt()
     return torch.where(used[:, None], whitened, 0.0)
 

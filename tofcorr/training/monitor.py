@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments, Parameters, residual_vectors
-from tofcorr.estimation.solvers import Iteration
+from tofcorr.estimation.solvers import Solution
 from tofcorr.geometry import se3
 from tofcorr.pixels.sample import sample_pixels
 from tofcorr.training.calibration import Calibration
@@ -38,10 +38,10 @@ class RunMonitor:
     """
 
     def __init__(self) -> None:
-        self.iterations: list[Iteration] = []
+        self.iterations: list[Solution] = []
         self._times: list[float] = []
 
-    def iteration(self, iteration: Iteration) -> None:
+    def iteration(self, iteration: Solution) -> None:
         """Record one iteration of the solver; never interrupts it."""
         self.iterations.append(iteration)
         self._times.append(time.time())
@@ -99,10 +99,10 @@ class RunMonitor:
 
         for iteration, when in zip(self.iterations, self._times, strict=True):
             step_left = math.log10(max(iteration.step_left, 1e-300))
-            yield "convergence/loss_m2", iteration.loss, iteration.number, when
-            yield "convergence/log10_step_left_se", step_left, iteration.number, when
+            yield "convergence/loss_m2", iteration.loss, iteration.iterations, when
+            yield "convergence/log10_step_left_se", step_left, iteration.iterations, when
             for tag, value in state(iteration.parameters).items():
-                yield tag, value, iteration.number, when
+                yield tag, value, iteration.iterations, when
         for tag, value in state(calibration.fit.solution.parameters).items():
             yield tag, value, last + 1, self._times[-1]
 

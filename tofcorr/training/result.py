@@ -20,7 +20,7 @@ from tofcorr.correction.state import (
 )
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.moments import Parameters
-from tofcorr.estimation.solvers import Iteration
+from tofcorr.estimation.solvers import Solution
 from tofcorr.files import StagedFolder, staged_file
 from tofcorr.fit.reference import REFERENCE_FILE, Reference, estimate_reference, save_reference
 from tofcorr.fit.result import Fit
@@ -151,7 +151,7 @@ class TrainingResult:
     report: Mapping[str, Any]
     calibration: Calibration
     options: TrainingOptions
-    iterations: tuple[Iteration, ...]
+    iterations: tuple[Solution, ...]
     force: bool = False
 
     @property

@@ -10,7 +10,7 @@ from types import FrameType
 from typing import Any
 
 from tofcorr.errors import ExportError
-from tofcorr.estimation.solvers import Iteration
+from tofcorr.estimation.solvers import Solution
 from tofcorr.files import StagedFolder, refuse_existing
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
@@ -152,7 +152,7 @@ def _train(
         with stage or nullcontext():
             monitor = RunMonitor()
 
-            def watch(iteration: Iteration) -> bool:
+            def watch(iteration: Solution) -> bool:
                 monitor.iteration(iteration)
                 return not interrupted
 
