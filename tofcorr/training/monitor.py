@@ -79,7 +79,7 @@ class RunMonitor:
         if not self.iterations:
             return
         moments, targets = calibration.fit.moments, calibration.data.targets[calibration.train]
-        start, last = self.iterations[0].parameters, self.iterations[-1].number
+        start, last = self.iterations[0].parameters, self.iterations[-1].iterations
 
         before = start.tool_from_camera
         # TensorBoard allows no ^ in a tag; c^1 of the column must not become c1.
