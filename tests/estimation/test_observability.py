@@ -12,12 +12,11 @@ import torch
 from simulated_walls import fitted, simulated_wall, true_hand_eye
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.moments import MomentObjective
 from tofcorr.estimation.uncertainty import (
     PRIOR_SIGMA,
-    Confounding,
     Direction,
     effective_variance,
-    information,
     observability,
 )
 from tofcorr.fit.result import Fit
@@ -75,9 +74,8 @@ def _warned(dataset: Dataset, result: Fit) -> str:
 )
 def test_the_name_of_a_direction_fits_into_a_sentence(names: tuple[str, ...], words: str) -> None:
     """A verdict read "t_z against c0 (corr +1.00), with c1 is known to 27 only"."""
-    pair = Confounding("t_z", "c0", 1.0) if len(names) > 1 else None
-    shares = dict.fromkeys(names, 0.5)
-    direction = Direction(sigma=0.027, shares=shares, pair=pair, is_undetermined=False)
+    shares, correlation = dict.fromkeys(names, 0.5), 1.0 if len(names) > 1 else None
+    direction = Direction(sigma=0.027, shares=shares, correlation=correlation)
     assert direction.in_words() == words
 
 
@@ -104,9 +102,13 @@ def test_without_tilt_four_directions_are_undetermined(
     fits: FitOf, warned: Callable[[str], str]
 ) -> None:
     undetermined = fits("no tilt").observability.undetermined
-    alone = {next(iter(direction.shares)) for direction in undetermined if direction.pair is None}
+    alone = {
+        next(iter(direction.shares)) for direction in undetermined if direction.correlation is None
+    }
     assert alone == {"t_x", "t_y", "w_z"}
-    paired = [set(direction.shares) for direction in undetermined if direction.pair is not None]
+    paired = [
+        set(direction.shares) for direction in undetermined if direction.correlation is not None
+    ]
     assert paired == [{"t_z", "c0"}]
     assert "hardly tilted" in warned("no tilt")
     assert "how much of a constant is c0 and how much t_z" in warned("no tilt")
@@ -135,9 +137,9 @@ def test_a_narrow_range_of_distances_is_named_and_confounds_the_constant(
     fits: FitOf, warned: Callable[[str], str]
 ) -> None:
     weakest = fits("narrow").observability.directions[0]
-    assert weakest.pair is not None
-    assert {weakest.pair.first, weakest.pair.second} == {"t_z", "c0"}
-    assert abs(weakest.pair.correlation) > 0.98
+    assert {*list(weakest.shares)[:2]} == {"t_z", "c0"}
+    assert weakest.correlation is not None
+    assert abs(weakest.correlation) > 0.98
     assert "range of distances is narrow" in warned("narrow")
 
 
@@ -184,7 +186,7 @@ def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
     result = fits("good")
     best = result.solution.parameters
     variance = effective_variance(result.moments, best)
-    precision = information(result.moments, best, variance)
+    precision = MomentObjective(result.moments).normal_equations(best).hessian / variance
     spread = torch.linalg.inv(
         precision + torch.eye(best.size, dtype=torch.float64) / PRIOR_SIGMA**2
     )

@@ -75,7 +75,7 @@ def test_the_report_keeps_its_contract(trained: Trained) -> None:
     report = trained.report()
     assert (report["format"], report["version"]) == ("tofcorr-report", 1)
     assert (report["model"], report["stopped"]) == ("EA", "converged")
-    assert report["iterations"] == trained.result.iterations[-1].number > 0
+    assert report["iterations"] == trained.result.iterations[-1].iterations > 0
     assert list(report["error_mm"]) == ["before", "hand_eye_only", "after"]
     for halves in report["error_mm"].values():
         assert list(halves) == ["train", "test"]

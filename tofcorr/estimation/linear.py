@@ -75,13 +75,16 @@ class NormalEquations(NamedTuple):
         """Return the sum over the units."""
         return NormalEquations(*(part.sum(dim=0) for part in self))
 
+    def of(self, units: Tensor) -> "NormalEquations":
+        """Return those of some units, given as a mask or by number."""
+        return NormalEquations(*(part[units] for part in self))
+
     def by_pose(self, pose: Int[Tensor, "N"] | None) -> "NormalEquations":
         """Return the sums over the units (N,) of each pose; None: every unit is its own."""
         if pose is None:
             return self
-        count = int(pose.max()) + 1
-        parts = (part.new_zeros(count, *part.shape[1:]).index_add_(0, pose, part) for part in self)
-        return NormalEquations(*parts)
+        once = torch.nn.functional.one_hot(pose).T.to(self.loss)
+        return NormalEquations(*(torch.tensordot(once, part, dims=1) for part in self))
 
     def plus(self, prior: "NormalEquations | None") -> "NormalEquations":
         """Return the equations with those of a prior on all unknowns, or on the first of them."""
@@ -146,13 +149,10 @@ class Curvature:
         self.scale = matrix.diagonal(dim1=-2, dim2=-1).clamp(min=_TINY).rsqrt()
         unit = matrix * self.scale[..., :, None] * self.scale[..., None, :]
         self.values, self.vectors = torch.linalg.eigh(unit)
-        self.resolved: Bool[Tensor, "*B P"] = self.values > RESOLVED * self._largest
+        largest = self.values.amax(dim=-1, keepdim=True)
+        self.resolved: Bool[Tensor, "*B P"] = self.values > RESOLVED * largest
         kept = torch.where(self.resolved, self.values, torch.inf).rsqrt()
         self.basis = self.scale[..., :, None] * self.vectors * kept[..., None, :]
-
-    @property
-    def _largest(self) -> Float[Tensor, "*B P"]:
-        return self.values.amax(dim=-1, keepdim=True).expand(self.values.shape)
 
     @property
     def inverse(self) -> Float[Tensor, "*B P P"]:
@@ -161,14 +161,9 @@ class Curvature:
 
     @property
     def root(self) -> Float[Tensor, "*B P P"]:
-        """F with F F^T the matrix without rounding."""
+        """F with F F^T the matrix without rounding: exactly singular where that was all."""
         root = self.vectors * torch.where(self.resolved, self.values, 0.0).sqrt()[..., None, :]
         return root / self.scale[..., :, None]
-
-    @property
-    def matrix(self) -> Float[Tensor, "*B P P"]:
-        """The matrix without rounding: exactly singular where that was all."""
-        return self.root @ self.root.mT
 
     @property
     def condition(self) -> float:

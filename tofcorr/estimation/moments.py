@@ -15,7 +15,7 @@ with :math:`\delta` the step from a guess, and :math:`s^2` the effective varianc
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -122,28 +122,6 @@ def concatenate(parts: Sequence[ImageMoments]) -> ImageMoments:
     return replace(parts[0], **joined)
 
 
-def stack(parts: Iterable[ImageMoments], num_images: int) -> ImageMoments:
-    """Join the moments of successive batches of one pass, `num_images` in all.
-
-    Each is copied into memory allocated beforehand. Otherwise the small results would lie between
-    the large temporary arrays of each batch, and the heap would grow with every batch.
-
-    Raises:
-        ValueError: There is nothing to join.
-    """
-    whole: ImageMoments | None = None
-    filled = 0
-    for part in parts:
-        if whole is None:
-            whole = part._each(lambda one: one.new_empty(num_images, *one.shape[1:]))
-        for name in _PER_IMAGE:
-            getattr(whole, name)[filled : filled + part.num_images] = getattr(part, name)
-        filled += part.num_images
-    if whole is None:
-        raise ValueError("There are no moments to join: no frame was read.")
-    return whole
-
-
 HAND_EYE_SYMBOLS = ["t_x", "t_y", "t_z", "w_x", "w_y", "w_z"]
 """Names of the twist's entries: translation in metres, then rotation in radians, camera axes."""
 LEAST_RESIDUAL = 1e-5
@@ -193,11 +171,8 @@ class Parameters:
 
     def detached(self) -> "Parameters":
         """Return the parameters without a gradient."""
-        return replace(
-            self,
-            tool_from_camera=self.tool_from_camera.detach(),
-            coefficients=self.coefficients.detach(),
-        )
+        transform, coefficients = self.tool_from_camera.detach(), self.coefficients.detach()
+        return replace(self, tool_from_camera=transform, coefficients=coefficients)
 
     def by_entries(self) -> Float[Tensor, "4 S"]:
         """Return the matrix A whose rows a plane (m_i, e_i) sums to its residual vector."""
@@ -282,13 +257,11 @@ class MomentObjective:
         A step changes a by d, and the loss by d^T (2 Q a + Q d). Q a is rounded in the same way
         whatever the step, so that its rounding adds no noise to a line search.
         """
-        known = self._slope
-        if known is None or known[0] is not origin:
+        if self._slope is None or self._slope[0] is not origin:
             with torch.no_grad():
-                known = origin, self._joint @ origin.by_entries().flatten()
-            self._slope = known
+                self._slope = origin, self._joint @ origin.by_entries().flatten()
         change = _change_of_entries(origin, step).flatten()
-        return change @ (2 * known[1] + self._joint @ change)
+        return change @ (2 * self._slope[1] + self._joint @ change)
 
     def image_equations(
         self, parameters: Parameters, further: Float[Tensor, "N S F"] | None = None
@@ -305,9 +278,8 @@ class MomentObjective:
         if further is not None:
             jacobian = torch.cat([jacobian, further], dim=2)
         weighted = self.moments.gram @ jacobian
-        loss = torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
         gradient = (p[:, None, :] @ weighted)[:, 0]
-        return NormalEquations(loss, gradient, jacobian.mT @ weighted)
+        return NormalEquations(self.image_losses(parameters), gradient, jacobian.mT @ weighted)
 
     def normal_equations(self, parameters: Parameters) -> NormalEquations:
         """Return loss, gradient and Gauss-Newton Hessian, summed over the images."""
@@ -378,23 +350,18 @@ class Prior:
         variance: The effective variance of a residual, which puts both parts on one scale, in
             the unit of the loss.
         names: The direction of each row, in words.
-        target: Prior mean of L times the step from the guess, shape (F,); None: zero.
+        target: Prior mean of L times the step from the guess, shape (F,), or one number.
     """
 
     centre: Parameters
     factor: Float[Tensor, "F P"]
     variance: float
     names: list[str]
-    target: Float[Tensor, "F"] | None = None
-
-    @property
-    def mean(self) -> Float[Tensor, "F"]:
-        """The prior mean, zero where there is no target."""
-        return self.factor.new_zeros(len(self.factor)) if self.target is None else self.target
+    target: Float[Tensor, "F"] | float = 0.0
 
     def deviation(self, parameters: Parameters) -> Float[Tensor, "F"]:
         """Return L times the step from the guess, less its target, shape (F,); differentiable."""
-        return self.factor @ self.centre.step_to(parameters) - self.mean
+        return self.factor @ self.centre.step_to(parameters) - self.target
 
     def _jacobian(self, parameters: Parameters) -> Float[Tensor, "F P"]:
         """Return the derivative of the deviation by a step, shape (F, P)."""
@@ -411,20 +378,20 @@ class Prior:
     def rescaled(self, variance: float) -> "Prior":
         """Return the same prior on the scale of another effective variance of a residual."""
         grown = math.sqrt(self.variance / variance)
-        return replace(
-            self, factor=self.factor * grown, variance=variance, target=self.mean * grown
-        )
+        factor, target = self.factor * grown, self.target * grown
+        return replace(self, factor=factor, variance=variance, target=target)
 
     def joined(self, other: "Prior") -> "Prior":
         """Return this prior together with one that is about coefficients alone."""
         other = other.rescaled(self.variance)
         own = other.factor[:, self.centre.twist_size :]
         apart = own @ (other.centre.coefficients - self.centre.coefficients)
+        here = self.factor.new_zeros(len(self.factor)) + self.target
         return replace(
             self,
             factor=torch.cat([self.factor, other.factor]),
             names=[*self.names, *other.names],
-            target=torch.cat([self.mean, other.mean + apart]),
+            target=torch.cat([here, other.target + apart]),
         )
 
     def equations(self, parameters: Parameters) -> NormalEquations:

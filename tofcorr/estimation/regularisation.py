@@ -63,11 +63,7 @@ def smoothness(
         total_weight: Sum of the weights of the pixels fitted.
         centre: Any parameters; only their number of unknowns matters.
     """
-    rows = [
-        float(penalty.strength) ** 0.5 * penalty.factor
-        for penalty in penalties
-        if float(penalty.strength) > 0
-    ]
+    rows = [float(one.strength) ** 0.5 * one.factor for one in penalties if float(one.strength)]
     if not rows:
         return None
     return Prior(
@@ -135,9 +131,7 @@ def _held_out(
     """Return the loss of some images under the fit to all others."""
     test = torch.zeros(len(weights), dtype=torch.bool)
     test[torch.as_tensor(fold, dtype=torch.long)] = True
-    kept, held_out = (
-        NormalEquations(*(part[which].sum(0) for part in equations)) for which in (~test, test)
-    )
+    kept, held_out = (equations.of(which).total() for which in (~test, test))
     prior = smoothness(penalties, float(weights[~test].sum()), around)
     kept = kept.plus(None if prior is None else prior.equations(around))
     return float(held_out.at(-solved(kept.hessian, kept.gradient, RESOLVED)).loss)
@@ -169,13 +163,13 @@ def time_constant(moments: ImageMoments, around: Parameters, time: Float[Tensor,
         decay = decay - decay.mean()
         row = decay @ each.hessian[:, column]
         corner = decay.square() @ each.hessian[:, column, column]
-        hessian = torch.cat([equations.hessian, row[None]])
-        hessian = torch.cat([hessian, torch.cat([row, corner[None]])[:, None]], dim=1)
+        hessian = torch.nn.functional.pad(equations.hessian, (0, 1, 0, 1))
+        hessian[-1] = hessian[:, -1] = torch.cat([row, corner[None]])
         gradient = torch.cat([equations.gradient, (decay @ each.gradient[:, column])[None]])
         return float(equations.loss - gradient @ solved(hessian, gradient, RESOLVED))
 
     low, high = duration / max(moments.num_images - 1, 1), 3 * duration
     grid = torch.linspace(math.log(low), math.log(high), 16).tolist()
-    best = min(range(len(grid)), key=lambda k: loss(grid[k]))
-    bounds = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    best = min(range(1, len(grid) - 1), key=lambda k: loss(grid[k]))
+    bounds = grid[best - 1], grid[best + 1]
     return math.exp(minimize_scalar(loss, bounds=bounds, method="bounded").x)

@@ -112,31 +112,6 @@ def jackknife_covariance(
     return Covariance(matrix, shift, int((~curvature.resolved).sum()))
 
 
-@dataclass(frozen=True)
-class Bootstrap:
-    """The results of resampled recordings.
-
-    Attributes:
-        steps: Steps from the optimum of all images to the optimum of each resample, as
-            `Parameters.moved` takes them, shape (B, P).
-        last_step: Median length of the last Newton step, in standard deviations of the steps; the
-            distance left to the optimum is about its square.
-    """
-
-    steps: Float[Tensor, "B P"]
-    last_step: float
-
-    @property
-    def covariance(self) -> Float[Tensor, "P P"]:
-        """Covariance of the step, shape (P, P)."""
-        return torch.cov(self.steps.T)
-
-    def interval(self, level: float = 0.95) -> Float[Tensor, "2 P"]:
-        """Return lower and upper end of each unknown's percentile interval, shape (2, P)."""
-        tail = (1 - level) / 2
-        return self.steps.quantile(torch.tensor([tail, 1 - tail], dtype=torch.float64), dim=0)
-
-
 def draw_block_weights(
     groups: Int[Tensor, "N"], num_resamples: int, generator: torch.Generator
 ) -> Float[Tensor, "{num_resamples} N"]:
@@ -167,16 +142,20 @@ def bootstrap(
     optimum: Parameters,
     weights: Float[Tensor, "B N"],
     prior: Prior | None = None,
-) -> Bootstrap:
+) -> Float[Tensor, "B P"]:
     """Fit resampled recordings, all at once: two Newton steps each.
 
-    Each step squares the remaining distance to the optimum; `Bootstrap.last_step` measures it.
+    The second step squares the distance to the optimum that the first one left, in standard errors.
 
     Args:
         moments: Moments of the images fitted.
         optimum: The parameters at the optimum of all images.
         weights: How often each image counts in each resample, shape (B, N).
         prior: A prior that was part of the loss; every resample keeps it.
+
+    Returns:
+        Steps from the optimum of all images to that of each resample, as `Parameters.moved` takes
+        them.
     """
     objective, twist_size = MomentObjective(moments), optimum.twist_size
     held = None if prior is None else prior.equations(optimum)
@@ -199,13 +178,10 @@ def bootstrap(
         if held is not None:
             found = found.plus(held._replace(gradient=held.gradient + steps[chunk] @ held.hessian))
         last[chunk] = -solved(found.hessian, found.gradient)
-    together = steps + last
-    if twist_size:
-        twist = se3.log(se3.exp(steps[:, :6]) @ se3.exp(last[:, :6]))
-        together = torch.cat([twist, together[:, 6:]], dim=1)
-    spread = together.square().mean(dim=0).sqrt()
-    share = last / torch.where(spread > 0, spread, 1.0)
-    return Bootstrap(together, float(share.norm(dim=1).median()))
+    if not twist_size:
+        return steps + last
+    twist = se3.log(se3.exp(steps[:, :6]) @ se3.exp(last[:, :6]))
+    return torch.cat([twist, steps[:, 6:] + last[:, 6:]], dim=1)
 
 
 def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
@@ -232,34 +208,10 @@ def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
     return max(float(scores.square().sum()) / freedom, least) if freedom > 0 else least
 
 
-def information(
-    moments: ImageMoments, optimum: Parameters, variance: float, walls: Walls | None = None
-) -> Float[Tensor, "P P"]:
-    """Return the precision of the unknowns that the images give, shape (P, P).
-
-    Curvature that is only rounding is removed, so that a singular direction is exactly singular.
-
-    Args:
-        moments: Moments of the images fitted.
-        optimum: The parameters at the optimum.
-        variance: The effective variance of a residual.
-        walls: Walls that were estimated as well: the precision is then the marginal one.
-    """
-    return Curvature(marginal_hessian(moments, optimum, walls)).matrix / variance
-
-
 def posterior_covariance(precision: Float[Tensor, "*batch P P"]) -> Float[Tensor, "*batch P P"]:
     """Return the covariance (..., P, P) that precision matrices give with the wide prior."""
     prior = torch.eye(precision.shape[-1], dtype=precision.dtype) / PRIOR_SIGMA**2
     return torch.linalg.inv(precision + prior)
-
-
-class Confounding(NamedTuple):
-    """Two parameters that the images hardly separate."""
-
-    first: str
-    second: str
-    correlation: float
 
 
 class Direction(NamedTuple):
@@ -269,25 +221,27 @@ class Direction(NamedTuple):
         sigma: Standard deviation along it, in metres or radians; near `PRIOR_SIGMA` when
             undetermined.
         shares: The unknowns of the largest components, largest first, with their components.
-        pair: The two unknowns of the largest components, and their correlation; None if the
-            direction is one unknown.
-        is_undetermined: Whether the images say less about it than a prior of 100 mm and 100 mrad.
+        correlation: Of the two unknowns of the largest components; None: it is one unknown.
     """
 
     sigma: float
     shares: dict[str, float]
-    pair: Confounding | None
-    is_undetermined: bool
+    correlation: float | None
+
+    @property
+    def is_undetermined(self) -> bool:
+        """Whether the images say less about it than a prior of 100 mm and 100 mrad."""
+        return self.sigma**2 > _MOST_KNOWN
 
     def in_words(self) -> str:
         """Return the direction's name, such as `c0 and t_z together (corr +0.99)`."""
         names = list(self.shares)
-        if self.pair is None:
+        if self.correlation is None:
             return names[0]
         first_two = "" if len(names) == 2 else " of the first two"
         return (
             f"{', '.join(names[:-1])} and {names[-1]} together "
-            f"(corr{first_two} {self.pair.correlation:+.2f})"
+            f"(corr{first_two} {self.correlation:+.2f})"
         )
 
 
@@ -296,7 +250,7 @@ class Observability(NamedTuple):
 
     Attributes:
         directions: Every direction, the weakest first.
-        confounded: Pairs of strong correlation, strongest first.
+        confounded: Correlations of pairs that the images hardly separate, strongest first.
         condition: Condition number of the scaled normal equations.
         covariance: Of all unknowns, with the wide prior, shape (P, P).
         vectors: The directions as unit vectors in the columns, shape (P, P).
@@ -305,7 +259,7 @@ class Observability(NamedTuple):
     """
 
     directions: list[Direction]
-    confounded: list[Confounding]
+    confounded: dict[tuple[str, str], float]
     condition: float
     covariance: Tensor
     vectors: Tensor
@@ -321,12 +275,6 @@ class Observability(NamedTuple):
     def worst_sigma(self) -> float:
         """The weakest direction's sigma, metres or radians."""
         return self.directions[0].sigma
-
-
-def parameter_symbols(moments: ImageMoments, parameters: Parameters) -> list[str]:
-    """Return the names of the unknowns in the order of a step."""
-    hand_eye = HAND_EYE_SYMBOLS if parameters.hand_eye_is_free else []
-    return [*hand_eye, *moments.symbols]
 
 
 def observability(
@@ -347,24 +295,33 @@ def observability(
         prior: The smoothing penalties, if they were part of the loss; they count as information.
         walls: Walls that were estimated as well.
     """
-    names = parameter_symbols(moments, optimum)
+    names = [*HAND_EYE_SYMBOLS[: optimum.twist_size], *moments.symbols]
     variance = effective_variance(moments, optimum)
-    precision = information(moments, optimum, variance, walls)
+    # Curvature that is only rounding is removed: a singular direction is then exactly singular.
+    root = Curvature(marginal_hessian(moments, optimum, walls)).root
+    precision = root @ root.mT / variance
     if prior is not None:
         precision = precision + prior.equations(optimum).hessian / prior.variance
     posterior = posterior_covariance(precision)
+    spread = posterior.diagonal().clamp(min=0.0).sqrt()
+    # Rounding makes a variance negative where nothing determines its unknown: no correlation then.
+    correlation = (posterior / (spread[:, None] * spread)).nan_to_num(0.0, 0.0, 0.0)
     variances, vectors = torch.linalg.eigh(posterior)
     order = variances.argsort(descending=True)
     # Rounding may leave a variance below zero where the images fit exactly.
     variances, vectors = variances[order].clamp(min=0.0), vectors[:, order]
     undetermined = int((variances > _MOST_KNOWN).sum())
     vectors[:, :undetermined] = _sparse_basis(vectors[:, :undetermined])
-    directions = [
-        _direction(vectors[:, k], float(variances[k]), posterior, names) for k in range(len(names))
-    ]
+    left, right = torch.triu_indices(len(names), len(names), offset=1)
+    order = correlation[left, right].abs().argsort(descending=True)
+    pairs = {
+        (names[a], names[b]): float(correlation[a, b])
+        for a, b in zip(left[order].tolist(), right[order].tolist(), strict=True)
+        if abs(correlation[a, b]) >= threshold
+    }
     return Observability(
-        directions,
-        _strong_pairs(posterior, names, threshold),
+        [_direction(vectors[:, k], variances[k], correlation, names) for k in range(len(names))],
+        pairs,
         Curvature(precision).condition,
         posterior,
         vectors,
@@ -392,36 +349,17 @@ def _sparse_basis(basis: Float[Tensor, "P k"]) -> Float[Tensor, "P k"]:
 
 
 def _direction(
-    vector: Float[Tensor, "P"], variance: float, posterior: Float[Tensor, "P P"], names: list[str]
+    vector: Float[Tensor, "P"],
+    variance: Float[Tensor, ""],
+    correlation: Float[Tensor, "P P"],
+    names: list[str],
 ) -> Direction:
     size = vector.abs()
-    order = size.argsort(descending=True).tolist()
     # Components below a fifth of the largest are left out of its name.
-    named = [k for k in order if size[k] > 0.2 * size.max()]
-    pair = None
-    if len(named) > 1:
-        first, second = sorted(named[:2])
-        pair = Confounding(names[first], names[second], _correlation(posterior, first, second))
+    named = [k for k in size.argsort(descending=True).tolist() if size[k] > size.max() / 5]
     shares = {names[k]: float(vector[k]) for k in named}
-    return Direction(variance**0.5, shares, pair, variance > _MOST_KNOWN)
-
-
-def _correlation(covariance: Float[Tensor, "P P"], first: int, second: int) -> float:
-    # Rounding makes a variance negative where nothing determines its unknown: none is known then.
-    spread = max(float(covariance[first, first] * covariance[second, second]), 0.0) ** 0.5
-    return float(covariance[first, second]) / spread if spread > 0 else 0.0
-
-
-def _strong_pairs(
-    covariance: Float[Tensor, "P P"], names: list[str], threshold: float
-) -> list[Confounding]:
-    left, right = torch.triu_indices(len(names), len(names), offset=1).tolist()
-    pairs = [
-        Confounding(names[a], names[b], _correlation(covariance, a, b))
-        for a, b in zip(left, right, strict=True)
-    ]
-    strong = [pair for pair in pairs if abs(pair.correlation) >= threshold]
-    return sorted(strong, key=lambda pair: -abs(pair.correlation))
+    both = float(correlation[named[0], named[1]]) if len(named) > 1 else None
+    return Direction(float(variance) ** 0.5, shares, both)
 
 
 def prior_on_undetermined(found: Observability, guess: Parameters) -> Prior | None:
@@ -436,8 +374,9 @@ def prior_on_undetermined(found: Observability, guess: Parameters) -> Prior | No
     Returns:
         The prior; None if every direction is determined.
     """
-    if not (names := [direction.in_words() for direction in found.undetermined]):
-        return None
     rows = [k for k, direction in enumerate(found.directions) if direction.is_undetermined]
+    if not rows:
+        return None
     factor = found.vectors[:, rows].T.contiguous() / PRIOR_SIGMA
+    names = [found.directions[k].in_words() for k in rows]
     return Prior(guess, factor, found.variance, names)

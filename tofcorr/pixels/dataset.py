@@ -30,7 +30,7 @@ from tofcorr.data.recording import (
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import CHUNK_PIXELS, Design, MomentAccumulator
-from tofcorr.estimation.moments import ImageMoments, concatenate, stack
+from tofcorr.estimation.moments import ImageMoments, concatenate
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import Options
@@ -193,7 +193,7 @@ class Dataset:
 
         parts = in_threads(moments_of, images, None if device == "cpu" else 1)
         # A process may have no frame where there are more processes than frames.
-        mine = [(self._in_order_read(own), stack(parts, len(own)))] if len(own) else []
+        mine = [(self._in_order_read(own), concatenate([*parts]))] if len(own) else []
         everything = [part for share in everyones(mine) for part in share]
         numbers = np.concatenate([indices for indices, _ in everything])
         return concatenate([moments for _, moments in everything]).images(_order(numbers, wanted))

@@ -118,13 +118,13 @@ def bootstrap_summary(
         return None
     optimum = fit.optimum
     drawn = bootstrap(fit.moments, optimum, weights, fit.total_prior)
-    if not bool(drawn.steps.isfinite().all()):
+    if not bool(drawn.isfinite().all()):
         return None
     summary: dict[str, Any] = {"resamples": resamples, "poses": int(fit.poses.max()) + 1}
     if optimum.hand_eye_is_free:
         rotation = optimum.tool_from_camera[:3, :3]
-        translation = 1e3 * (drawn.steps[:, :3] @ rotation.T)
-        turn = torch.rad2deg(drawn.steps[:, 3:6] @ rotation.T)
+        translation = 1e3 * (drawn[:, :3] @ rotation.T)
+        turn = torch.rad2deg(drawn[:, 3:6] @ rotation.T)
         summary["translation_se_mm"] = translation.std(dim=0).tolist()
         summary["rotation_se_deg"] = turn.std(dim=0).tolist()
     return summary
@@ -252,7 +252,10 @@ def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
             }
             for direction in fit.observability.directions[:5]
         ],
-        "confounded": [pair._asdict() for pair in fit.observability.confounded],
+        "confounded": [
+            {"first": first, "second": second, "correlation": correlation}
+            for (first, second), correlation in fit.observability.confounded.items()
+        ],
         # JSON has no infinity.
         "condition": min(fit.observability.condition, 1e300),
         "prior": [] if fit.prior is None else fit.prior.names,
