@@ -11,7 +11,6 @@ renderer (`benchmarks/README.md`).
 
 import csv
 import json
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -164,7 +163,7 @@ def _each(*names: str) -> tuple[tuple[Form, ...], ...]:
     return tuple((FORM[name],) for name in names)
 
 
-WIDE_IMAGE = {"IMAGES": {(224, 172): 1.0}, "FRAMES": {40: 1.0}}
+WIDE_IMAGE = {"images": {(224, 172): 1.0}, "frames": {40: 1.0}}
 TEXTBOOK = _each("odd_harmonics", "driver_droop", "halves_and_pairs", "two_exponentials", "veil")
 PAIRS = tuple(
     (FORM[one], FORM[other])
@@ -174,7 +173,7 @@ PAIRS = tuple(
         ("clear_layer", "driver_droop"),
     )
 )
-FILTERS = {"SPATIAL_FILTER": {"mean of 3x3": 0.5, "gauss of 1.2 pixels": 0.5}}
+FILTERS = {"spatial_filter": {"mean of 3x3": 0.5, "gauss of 1.2 pixels": 0.5}}
 WIGGLING = _each("odd_harmonics")
 ROWS: dict[str, Row] = {
     "height": Row(
@@ -194,10 +193,10 @@ ROWS: dict[str, Row] = {
     ),
     "stray_wide": Row("stray light, 172x224", _each("spread", "veil", "ghost"), ranges=WIDE_IMAGE),
     "filtered": Row("noise of a filter, nothing missing", ranges=FILTERS, draws=4),
-    "robot": Row("robot 2 mm, nothing missing", ranges={"ROBOT_MM": Range(2.0, 2.0)}, draws=4),
+    "robot": Row("robot 2 mm, nothing missing", ranges={"robot_mm": Range(2.0, 2.0)}, draws=4),
     "board_poses": Row(
         "board poses 1 mm / 2 mrad, no robot, nothing missing",
-        ranges={"ROBOT_MM": Range(0.0, 0.0)},
+        ranges={"robot_mm": Range(0.0, 0.0)},
         fault=board_planes,
         draws=3,
     ),
@@ -208,20 +207,20 @@ ROWS: dict[str, Row] = {
     "no_amplitude_white": Row(
         "the same before a white wall",
         WIGGLING,
-        ranges={"TARGETS": {"white": 1.0}},
+        ranges={"targets": {"white": 1.0}},
         fault=without_amplitude,
     ),
     "wiggle_of_dark": Row("wiggling times amplitude", ((wiggle_of_dark,),), draws=3),
-    "frames_30": Row("30 frames", TEXTBOOK, ranges={"FRAMES": {30: 1.0}}),
+    "frames_30": Row("30 frames", TEXTBOOK, ranges={"frames": {30: 1.0}}),
     "warm_up": Row(
         "200 frames of warm-up",
         _each("two_exponentials", "line_with_pauses"),
-        ranges={"FRAMES": {200: 1.0}},
+        ranges={"frames": {200: 1.0}},
     ),
     "far": Row(
         "0.5 to 6 m",
         _each("odd_harmonics", "duty_cycle"),
-        ranges={"FARTHEST_TIMES": Range(12.0, 12.0)},
+        ranges={"farthest_times": Range(12.0, 12.0)},
     ),
     "two": Row("two effects", PAIRS),
     "wide_nothing": Row("172x224, nothing missing", ranges=WIDE_IMAGE),
@@ -332,18 +331,15 @@ def answers(draws: Sequence[Mapping[str, Any]]) -> str:
 def main(seed: int, rows: str, out: Path) -> None:
     """Diagnose the recordings of each row, write a line for each, and judge the answers."""
 
-    def make(name: str, number: int) -> dict[str, Any]:
-        with tempfile.TemporaryDirectory() as folder:
-            case = write_draw(seed, name, number, Path(folder) / "recording")
-            return judge(name, case, Path(folder) / "recording")
+    def make(name: str, number: int, folder: Path) -> dict[str, Any]:
+        return judge(name, write_draw(seed, name, number, folder), folder)
 
     counts = {name: row.draws for name, row in ROWS.items()}
     if rows:
         asked = counts_by_name(rows, 0, list(ROWS), "row")
         counts = {name: count or counts[name] for name, count in asked.items()}
     shown = []
-    wanted = ((name, number) for name, count in counts.items() for number in range(count))
-    for draw in kept_rows(out, wanted, make):
+    for draw in kept_rows(out, counts, make):
         shown.append(draw)
         click.echo(line(draw))
     click.echo(answers(shown))

@@ -23,6 +23,7 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.sealed.scores import share
+from benchmarks.timing import write
 from benchmarks.wrong_recordings.clean import drawn_simulator
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import Recording
@@ -218,8 +219,7 @@ def main(count: int, seed: int, out: Path | None) -> None:
                 left_out.append(f"draw {number}: {error}")
     click.echo(summary(lines))
     click.echo("\n".join([f"Draws left out: {len(left_out)}.", *left_out]))
-    if out is not None:
-        out.write_text(json.dumps(lines, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write(lines, out)
 
 
 if __name__ == "__main__":

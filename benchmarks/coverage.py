@@ -14,10 +14,12 @@ from pathlib import Path
 import click
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
+from benchmarks.timing import write
 from tofcorr.data.recording import Recording
-from tofcorr.fit.fitting import fit
+from tofcorr.fit.fitting import Fit, fit
 from tofcorr.geometry import se3
 from tofcorr.options import load_options
 from tofcorr.pixels.dataset import Dataset, covered_domain
@@ -26,7 +28,23 @@ from tofcorr.simulation.simulator import simulate
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.report import hand_eye_intervals
 
-AXES = ("x", "y", "z")
+NAMES = [f"{kind}_{axis}" for kind in "tw" for axis in "xyz"]
+
+
+def fitted(recording: Path, options: TrainingOptions) -> Fit:
+    """Fit all frames of a recording."""
+    data = Dataset((Recording.open(recording),))
+    frames = np.arange(data.num_frames)
+    return fit(data, frames, options, covered_domain(data, frames))
+
+
+def hand_eye_error(true: Tensor, found: Tensor) -> Tensor:
+    """Return place and turn (2, 3) of a hand-eye transform off the true one.
+
+    In camera axes, metres and radians.
+    """
+    turn = se3.log(se3.assemble(true[:3, :3].T @ found[:3, :3], torch.zeros(3).double()))[3:]
+    return torch.stack([true[:3, :3].T @ (found - true)[:3, 3], turn])
 
 
 def one_recording(
@@ -41,14 +59,11 @@ def one_recording(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording"
         simulate(simulator, path, torch.Generator().manual_seed(seed))
-        dataset = Dataset((Recording.open(path),))
-        frames = np.arange(dataset.num_frames)
-        result = fit(dataset, frames, training, covered_domain(dataset, frames))
+        result = fitted(path, training)
     truth = simulator.hand_eye.tool_from_camera()
-    best = result.solution.parameters.tool_from_camera
-    turn = se3.log(se3.assemble(best[:3, :3] @ truth[:3, :3].T, torch.zeros(3).double()))[3:]
-    error = torch.cat([best[:3, 3] - truth[:3, 3], turn])
-    return error.numpy(), torch.cat(hand_eye_intervals(result)).numpy()
+    error = hand_eye_error(truth, result.solution.parameters.tool_from_camera)
+    about_tool = (error @ truth[:3, :3].T).flatten()
+    return about_tool.numpy(), torch.cat(hand_eye_intervals(result)).numpy()
 
 
 def study(
@@ -57,8 +72,7 @@ def study(
     """Return coverage, bias and spread of the hand-eye transform over simulated recordings."""
     seeds = [seed * 1_000_003 + k for k in range(recordings)]
     results = [one_recording(simulator, training, one) for one in tqdm(seeds, leave=False)]
-    error = np.stack([result[0] for result in results])
-    half = np.stack([result[1] for result in results])
+    error, half = (np.stack(one) for one in zip(*results, strict=True))
     covered = (np.abs(error) <= half).mean(axis=0)
     scale = np.array([1e3] * 3 + [np.degrees(1.0)] * 3)
     return {
@@ -69,9 +83,7 @@ def study(
         "coverage": {
             "translation": float(covered[:3].mean()),
             "rotation": float(covered[3:].mean()),
-            "each": dict(
-                zip([f"{kind}_{a}" for kind in "tw" for a in AXES], covered.tolist(), strict=True)
-            ),
+            "each": dict(zip(NAMES, covered.tolist(), strict=True)),
         },
         "mean_error_mm_deg": (error.mean(axis=0) * scale).tolist(),
         "spread_mm_deg": (error.std(axis=0, ddof=1) * scale).tolist(),
@@ -88,16 +100,10 @@ def study(
 def main(simulator: str, config: str, recordings: int, seed: int, out: Path | None) -> None:
     """Measure the coverage of the hand-eye's 95 % intervals."""
     torch.set_num_threads(1)
-    result = study(
-        load_options(SimulatorOptions, simulator),
-        load_options(TrainingOptions, config),
-        recordings,
-        seed,
-    )
-    text = json.dumps(result, indent=1)
-    click.echo(text)
-    if out is not None:
-        out.write_text(text + "\n", encoding="utf-8")
+    camera, model = load_options(SimulatorOptions, simulator), load_options(TrainingOptions, config)
+    result = study(camera, model, recordings, seed)
+    click.echo(json.dumps(result, indent=1))
+    write(result, out)
 
 
 if __name__ == "__main__":

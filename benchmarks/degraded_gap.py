@@ -1,6 +1,6 @@
 """How far a found sensor closes the gap: degraded ideal frames against real ones, held out.
 
-    python -m benchmarks.degraded_gap RECORDING [--ideal IDEAL] [--config NAME] [--seeds 1 2 3]
+    python -m benchmarks.degraded_gap RECORDING [--ideal IDEAL] [--config NAME] [--seeds 1]
     python -m benchmarks.degraded_gap --simulated 5 [--seeds 1]
 
 Half of the poses are diagnosed; the sensor that this gives degrades ideal frames of the other half.
@@ -9,17 +9,17 @@ pixels missing, and one effect of a few millimetres. `<= 1.1`: degraded frames l
 times the stage with effects; `open`: more, but not significantly (one-sided, 5 %).
 """
 
-import argparse
 import math
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import click
 import numpy as np
 import torch
+from scipy.stats import norm
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
@@ -42,7 +42,6 @@ from tofcorr.diagnosis.sums.noise import (
 from tofcorr.diagnosis.sums.observations import Observations, distance_images, effect_inputs
 from tofcorr.diagnosis.sums.observations import observe as observe_pixels
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.robust import student_quantile
 from tofcorr.geometry.rays import radial_distance_from_z_depth, ray_directions
 from tofcorr.observables.dropouts import dropouts_of
 from tofcorr.observables.noise import noise_of
@@ -53,9 +52,6 @@ from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-
-# What degraded frames may leave at most, times the gap of the stage with effects.
-_MOST = 1.1
 
 EFFECTS: tuple[dict[str, Any], ...] = (
     {"name": "wiggling", "sin_4": 0.012, "cos_4": 0.006},
@@ -89,65 +85,39 @@ def halves(recording: Recording, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return first, second
 
 
-def subset(recording: Recording, frames: np.ndarray, path: Path) -> Recording:
-    """Write some frames of a recording as a recording of their own."""
-    with RecordingWriter.with_header_of(path, recording) as writer:
-        for number in frames.tolist():
-            images = _images(recording, number)
-            writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
-    return Recording.open(path, check_contents=False)
-
-
-def with_depth(recording: Recording, depth: Tensor, path: Path) -> Recording:
-    """Write a recording anew with other depth (F, H, W)."""
-    with RecordingWriter.with_header_of(path, recording) as writer:
-        for number, image in enumerate(depth.numpy()):
-            images = _images(recording, number) | {"depth": image}
-            writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
-    return Recording.open(path, check_contents=False)
-
-
-def _images(recording: Recording, number: int) -> dict[str, Any]:
+def written(
+    recording: Recording, frames: np.ndarray, path: Path, depth: Tensor | None = None
+) -> Recording:
+    """Write some frames of a recording as one of their own, with other depth (F, H, W) if given."""
     names = ("depth", "amplitude", "mask")
-    read = {name: recording.read(name, np.array([number])) for name in names}
-    return {name: None if image is None else image[0] for name, image in read.items()}
+    with RecordingWriter.with_header_of(path, recording) as writer:
+        for place, number in enumerate(frames.tolist()):
+            read = {name: recording.read(name, np.array([number])) for name in names}
+            images: dict[str, Any] = {k: None if one is None else one[0] for k, one in read.items()}
+            if depth is not None:
+                images["depth"] = depth[place].numpy()
+            writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
+    return Recording.open(path, check_contents=False)
 
 
-# Resamples of the poses behind an interval. The usual number for 95 %.
-_RESAMPLES = 400
+def excess_over(
+    observations: Observations, sigma: Tensor, floor_factor: float, counted: Tensor, depth: Tensor
+) -> Excess:
+    """Sum up measured minus simulated distances, less the noise.
 
-
-class FramesGap:
-    """Root mean square of measured minus simulated distances, less the noise."""
-
-    def __init__(
-        self, observations: Observations, sigma: Tensor, floor_factor: float, counted: Tensor
-    ) -> None:
-        self._observations = observations
-        self._counted = counted
-        self._sigma = sigma
-        self._floor_factor = floor_factor
-
-    def of(self, depth: Tensor) -> float:
-        """Return the gap to depth images (F, H, W) of the recording's kind, metres."""
-        return self._excess(depth).gap()
-
-    def interval(self, depth: Tensor, seed: int) -> tuple[float, float]:
-        """Return the 95 % interval of the gap: poses are drawn anew."""
-        generator = torch.Generator().manual_seed(seed)
-        resamples = resampled(self._observations.num_units, _RESAMPLES, generator)
-        gaps = self._excess(depth).gaps(resamples)
-        low, high = gaps.quantile(torch.tensor([0.025, 0.975], dtype=gaps.dtype)).tolist()
-        return low, high
-
-    def _excess(self, depth: Tensor) -> Excess:
-        observations, sigma = self._observations, self._sigma
-        simulated = radial_at(observations, depth)
-        known = simulated.isfinite() & (simulated > 0) & self._counted
-        residual = torch.where(known, observations.measured - simulated, 0.0)
-        trust = robust_weights(residual, sigma, common_of_neighbours(observations, residual))
-        share = trust * gap_weight(sigma) * known
-        return Excess.of(observations, residual, share, self._floor_factor * sigma)
+    Args:
+        observations: The M pixels.
+        sigma: Standard deviation of their noise, (M,), metres.
+        floor_factor: So much larger is the noise of a gap.
+        counted: Which count, (M,).
+        depth: The simulated images (F, H, W), of the recording's kind.
+    """
+    simulated = radial_at(observations, depth)
+    known = simulated.isfinite() & (simulated > 0) & counted
+    residual = torch.where(known, observations.measured - simulated, 0.0)
+    trust = robust_weights(residual, sigma, common_of_neighbours(observations, residual))
+    share = trust * gap_weight(sigma) * known
+    return Excess.of(observations, residual, share, floor_factor * sigma)
 
 
 def radial_at(observations: Observations, depth: Tensor) -> Tensor:
@@ -156,10 +126,6 @@ def radial_at(observations: Observations, depth: Tensor) -> Tensor:
     if recording.depth_kind == "z":
         depth = radial_distance_from_z_depth(depth, ray_directions(recording.camera))
     return depth.reshape(len(depth), -1)[observations.frame, observations.pixel].double()
-
-
-# Quantile of the normal distribution of a one-sided test at 5 %, standard errors. Derived.
-_ONE_SIDED = 1.645
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,20 +171,12 @@ class DegradedGap:
         """
         stage, floor = self.diagnosis.gap, self.diagnosis.gap.floor
         excess = self.degraded**2 - (most * self.with_effects) ** 2
-        errors = (
-            _error_of_square(self.degraded_interval),
-            most**2 * _error_of_square(stage.after.interval),
-            2 * FLOOR_ERROR * floor**2,
-            2 * FLOOR_ERROR * (most * floor) ** 2,
-        )
+        errors = [2 * FLOOR_ERROR * floor**2, 2 * FLOOR_ERROR * (most * floor) ** 2]
+        for factor, (low, high) in ((1, self.degraded_interval), (most**2, stage.after.interval)):
+            errors.append(factor * (high**2 - low**2) / (2 * float(norm.ppf(0.975))))
         if excess <= 0:
             return True
-        return None if excess <= _ONE_SIDED * math.hypot(*errors) else False
-
-    @property
-    def ratio(self) -> float:
-        """What remains, over what the stage with effects states; 1: it holds at new poses."""
-        return self.degraded / max(self.with_effects, 1e-9)
+        return None if excess <= norm.ppf(0.95) * math.hypot(*errors) else False
 
 
 def degraded_gap(
@@ -227,6 +185,7 @@ def degraded_gap(
     *,
     ideal: Recording | None = None,
     seed: int = 0,
+    resamples: int = 400,
 ) -> DegradedGap:
     """Diagnose half of the poses, degrade ideal frames of the other half, and compare.
 
@@ -236,6 +195,7 @@ def degraded_gap(
         ideal: Ideal frames at all poses of `real`, in its order; None: the planes of `real`, seen
             with the hand-eye transform that the diagnosed half gives.
         seed: Of the halves and of all draws.
+        resamples: Of the poses, behind the interval.
 
     Raises:
         CalibrationDataError: `ideal` has other frames, or half of the poses is too few.
@@ -250,30 +210,38 @@ def degraded_gap(
     shown, held = halves(real, seed)
     with TemporaryDirectory() as folder:
         scratch = Path(folder)
-        diagnosed = subset(real, shown, scratch / "shown")
-        found = diagnose(diagnosed, None, options)
-        rest = subset(real, held, scratch / "held")
+        found = diagnose(written(real, shown, scratch / "shown"), None, options)
+        rest = written(real, held, scratch / "held")
         observations = observe_pixels(rest, options.most_pixels)
         study, named = found.evidence.study, found.evidence.named
         pose = solution_of(study, named)[0]
-        depth = _ideal_depth(observations, pose) if ideal is None else _read(ideal, held)
-        mounted = replace(rest, tool_from_camera=pose.numpy()) if ideal is None else rest
-        perfect = with_depth(mounted, depth, scratch / "ideal")
+        slant = ray_directions(real.camera)[..., 2] if real.depth_kind == "z" else torch.ones(1)
+        if ideal is None:
+            # On the target that is the plane; off it only the real camera knows what is there.
+            depth = (distance_images(observations, pose, slice(None)) * slant).float()
+            mounted = replace(rest, tool_from_camera=pose.numpy())
+        else:
+            exact = ideal.read("depth" if ideal.true_depth is None else "true_depth", held)
+            depth, mounted = torch.as_tensor(exact), rest
+        perfect = written(mounted, np.arange(len(held)), scratch / "ideal", depth)
         sensor = sensor_of(study, named, found.simulator, found.observables)
         model = SensorModel(sensor)
         degraded = degrade(model, perfect, scratch / "degraded", seed=seed).recording
-        expected = _expected(model, real, observations, depth, pose, held)
+        light = light_images(model, observations, effect_inputs(observations, pose))
+        distance = expected_images(model, real, torch.from_numpy(held), depth / slant, light)
         noise = estimate_noise(observations, pose)
         sigma = noise.at(brightness_of(observations), observations.frame)
-        factor = found.gap.floor / study.fit.floor
-        covered = _covered(model, observations, depth)
-        gap = FramesGap(observations, sigma, factor, covered)
-        remains = gap.of(expected)
+        covered = model.base.covers(radial_at(observations, depth), observations.amplitude)
+        counted = (observations, sigma, found.gap.floor / study.fit.floor, covered)
+        remains = excess_over(*counted, distance * slant)
+        generator = torch.Generator().manual_seed(seed)
+        gaps = remains.gaps(resampled(observations.num_units, resamples, generator))
+        low, high = gaps.quantile(torch.tensor([0.025, 0.975], dtype=gaps.dtype)).tolist()
         both = [observe(each) for each in (rest, degraded)]
         return DegradedGap(
-            ideal=gap.of(depth),
-            degraded=remains,
-            degraded_interval=gap.interval(expected, seed),
+            ideal=excess_over(*counted, depth).gap(),
+            degraded=remains.gap(),
+            degraded_interval=(low, high),
             with_effects=found.gap.after,
             noise=(noise_of(both[0]).temporal_m, noise_of(both[1]).temporal_m),
             dropouts=(dropouts_of(both[0]).share, dropouts_of(both[1]).share),
@@ -284,57 +252,9 @@ def degraded_gap(
         )
 
 
-def _error_of_square(interval: tuple[float, float]) -> float:
-    return (interval[1] ** 2 - interval[0] ** 2) / (2 * student_quantile(0.975, math.inf))
-
-
-def _read(recording: Recording, frames: np.ndarray) -> Tensor:
-    source = "depth" if recording.true_depth is None else "true_depth"
-    depth = recording.read(source, frames)
-    assert depth is not None
-    return torch.from_numpy(depth)
-
-
-def _ideal_depth(observations: Observations, tool_from_camera: Tensor) -> Tensor:
-    """Return what an ideal camera would have measured, (F, H, W), float32.
-
-    On the target that is the plane; off it only the real camera knows what is there.
-    """
-    radial = distance_images(observations, tool_from_camera, slice(None))
-    if observations.recording.depth_kind == "z":
-        radial = radial * ray_directions(observations.recording.camera)[..., 2]
-    return radial.float()
-
-
-def _expected(
-    model: SensorModel,
-    real: Recording,
-    observations: Observations,
-    depth: Tensor,
-    tool_from_camera: Tensor,
-    held: np.ndarray,
-) -> Tensor:
-    """Return the expected measurement of ideal frames, shape (F, H, W), of the recording's kind."""
-    inputs = effect_inputs(observations, tool_from_camera)
-    slant = ray_directions(real.camera)[..., 2] if real.depth_kind == "z" else torch.ones(1)
-    radial = expected_images(
-        model,
-        real,
-        torch.from_numpy(held),
-        depth / slant,
-        light_images(model, observations, inputs),
-    )
-    return radial * slant
-
-
-def _covered(model: SensorModel, observations: Observations, depth: Tensor) -> Tensor:
-    """Return which chosen pixels are within the ranges that a sensor was measured in, (M,)."""
-    return model.base.covers(radial_at(observations, depth), observations.amplitude)
-
-
-def line(name: str, found: DegradedGap) -> str:
+def line(name: str, found: DegradedGap, most: float = 1.1) -> str:
     """Return a row of the table."""
-    within = {True: "yes", None: "open", False: "no"}[found.within(_MOST)]
+    within = {True: "yes", None: "open", False: "no"}[found.within(most)]
     low, high = (1e3 * end for end in found.degraded_interval)
     return (
         f"{name:>22} {found.poses:5d} {1e3 * found.ideal:7.2f} {1e3 * found.with_effects:8.2f} "
@@ -345,33 +265,33 @@ def line(name: str, found: DegradedGap) -> str:
     )
 
 
-def main() -> None:
-    """Print one row for every recording and seed."""
-    parser = argparse.ArgumentParser(description="How far a found sensor closes the gap.")
-    parser.add_argument("recording", nargs="?", type=Path)
-    parser.add_argument("--ideal", type=Path)
-    parser.add_argument("--config", default="default")
-    parser.add_argument("--simulated", type=int, default=0)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
-    given = parser.parse_args()
-    print(
+@click.command()
+@click.argument("recording", required=False, type=click.Path(path_type=Path))
+@click.option("--ideal", type=click.Path(path_type=Path), help="Ideal frames of its poses.")
+@click.option("--config", default="default", show_default=True, help="Of the diagnosis.")
+@click.option("--simulated", "cameras", default=0, help="Simulated cameras beside it.")
+@click.option("--seeds", multiple=True, type=int, default=[1], help="May be repeated.")
+def main(
+    recording: Path | None, ideal: Path | None, config: str, cameras: int, seeds: tuple[int, ...]
+) -> None:
+    """Print how far a found sensor closes the gap: a row for every recording and seed."""
+    click.echo(
         f"{'camera':>22} poses   ideal  effects  degraded  95 % interval  <= 1.1    noise, mm      "
         "missing pixels  covered  named\n"
         f"{'':>22}  held      mm       mm        mm                            real degr.     "
         "real     degr."
     )
-    ideal = None if given.ideal is None else Recording.open(given.ideal)
-    for seed in given.seeds:
-        if given.recording is not None:
-            real = Recording.open(given.recording)
-            found = degraded_gap(real, given.config, ideal=ideal, seed=seed)
-            print(line(f"{given.recording.name}, seed {seed}", found), flush=True)
-        for number in range(given.simulated):
-            with tempfile.TemporaryDirectory() as folder:
+    perfect = None if ideal is None else Recording.open(ideal)
+    for seed in seeds:
+        if recording is not None:
+            found = degraded_gap(Recording.open(recording), config, ideal=perfect, seed=seed)
+            click.echo(line(f"{recording.name}, seed {seed}", found))
+        for number in range(cameras):
+            with TemporaryDirectory() as folder:
                 real = simulated(number, seed, Path(folder) / "real")
-                found = degraded_gap(real, given.config, seed=seed)
+                found = degraded_gap(real, config, seed=seed)
             name = str(EFFECTS[number % len(EFFECTS)]["name"])
-            print(line(f"{name}, seed {seed}", found), flush=True)
+            click.echo(line(f"{name}, seed {seed}", found))
 
 
 if __name__ == "__main__":

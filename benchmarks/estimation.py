@@ -3,42 +3,42 @@
 python -m benchmarks.estimation [--repeats 5] [--json FILE]
 """
 
-import argparse
-import json
-import platform
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
+import click
 import numpy as np
 import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
 from benchmarks.scene import camera_of, frames_in_memory, write_vga
-from tofcorr.data.recording import FrameBatch
+from benchmarks.timing import JSON, machine, spread, timed, write
+from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.solvers import Solution, initial_parameters, minimise
 from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights, jackknife_covariance
+from tofcorr.fit.problem import build_model
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.options import load_options
+from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.options import TrainingOptions
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "train"
 NUM_FOLDS = 6
 NUM_RESAMPLES = 1000
 
 
 def model_options(name: str) -> ErrorModelOptions:
     """Return the terms of a shipped model."""
-    return load_options(TrainingOptions, CONFIGS / f"{name}.yaml").model
+    return resolve_options(TrainingOptions, name).model
 
 
 def ours(
@@ -66,19 +66,6 @@ def folds_and_bootstrap(batch: FrameBatch, domain: Domain, generator: torch.Gene
         if name == "ea":
             weights = draw_block_weights(torch.arange(count), NUM_RESAMPLES, generator)
             bootstrap(moments, whole.parameters, weights)
-
-
-def timed(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
-    """Time each job in turn, round after round, so that all see the same machine."""
-    seconds: dict[str, list[float]] = {name: [] for name in work}
-    for job in work.values():
-        job()
-    for _ in range(repeats):
-        for name, job in work.items():
-            start = time.perf_counter()
-            job()
-            seconds[name].append(time.perf_counter() - start)
-    return seconds
 
 
 def scipy_fit(
@@ -132,7 +119,7 @@ def _body_derivative(twist: np.ndarray) -> np.ndarray:
     return torch.autograd.functional.jacobian(body, x).numpy()  # type: ignore[union-attr]
 
 
-def compare(repeats: int) -> dict[str, object]:
+def compare(repeats: int) -> dict[str, Any]:
     """Run both on 62 frames of 50 x 64 pixels."""
     batch, domain = frames_in_memory(62, camera_of(50, 64), torch.Generator().manual_seed(1))
     rays, options = ray_directions(camera_of(50, 64)), model_options("ea")
@@ -141,111 +128,73 @@ def compare(repeats: int) -> dict[str, object]:
     loss, transform, note = scipy_fit(batch, error, rays, start)
     apart = 1e3 * float((solution.parameters.tool_from_camera - transform)[:3, 3].norm())
     off = abs(loss / solution.loss - 1)
-    resampling = torch.Generator().manual_seed(2)
-    seconds = timed(
-        {
-            "tofcorr": lambda: ours(batch, domain, options),
-            "scipy lm, analytic jacobian": lambda: scipy_fit(batch, error, rays, start),
-            "tofcorr, 6 folds x 3 models + 1000 resamples": lambda: folds_and_bootstrap(
-                batch, domain, resampling
-            ),
-        },
-        repeats,
-    )
+    draws = torch.Generator().manual_seed(2)
+    jobs = {
+        "tofcorr": lambda: ours(batch, domain, options),
+        "scipy lm, analytic jacobian": lambda: scipy_fit(batch, error, rays, start),
+        "tofcorr, 6 folds x 3 models + 1000 resamples": lambda: folds_and_bootstrap(
+            batch, domain, draws
+        ),
+    }
+    seconds = {name: np.array(times) for name, times in timed(jobs, repeats).items()}
     base = np.median(seconds["tofcorr"])
     rows = {
-        name: {
-            "ms": _spread([1e3 * spent for spent in times]),
-            "ratio": _spread([float(spent / base) for spent in times]),
-        }
+        name: {"ms": spread(1e3 * times), "ratio": spread(times / base)}
         for name, times in seconds.items()
     }
     agreement = f"loss {off:.1e} relative, hand-eye {apart:.1e} mm apart; {note}"
     return {"pixels": int(batch.valid.sum()), "rows": rows, "agreement": agreement}
 
 
-SCALE_PROGRAM = """
-import json, sys, time
-import torch, numpy as np
-from benchmarks.estimation import model_options
-from tofcorr.data.recording import Recording
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.dataset import covered_domain
-from tofcorr.fit.problem import build_model
-def status(key):  # the kernel's own count: getrusage would hand on the peak of the parent process
-    with open("/proc/self/status") as lines:
-        return next(int(line.split()[1]) for line in lines if line.startswith(key))
-baseline = status("VmRSS")
-start = time.perf_counter()
-dataset = Dataset((Recording.open(sys.argv[1]),))
-frames = np.arange(int(sys.argv[2]))
-_, design = build_model(dataset, model_options("ea"), covered_domain(dataset, frames))
-moments = dataset.moments(design, frames)
-seconds = time.perf_counter() - start
-peak = status("VmHWM")
-print(json.dumps({"seconds": seconds, "pixels": float(moments.count.sum()),
-                  "above_baseline_mb": (peak - baseline) / 1024}))
-"""
-
-
 def scale(num_frames: int, repeats: int) -> dict[str, object]:
     """Read VGA frames from disk: pixels a second, memory, and growth with the frames."""
+    sizes = (num_frames // 2, num_frames)
+    context = get_context("spawn")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "vga"
         write_vga(path, num_frames)
-        runs: dict[int, list[dict[str, float]]] = {num_frames // 2: [], num_frames: []}
         # The two sizes take turns, each in a process of its own, so that both see the same machine.
-        for _ in range(repeats):
-            for frames, done in runs.items():
-                done.append(_read_and_sum(path, frames))
-    half, whole = runs.values()
-    seconds = [run["seconds"] for run in whole]
-    growth = [b["seconds"] / a["seconds"] for a, b in zip(half, whole, strict=True)]
-    speeds = [run["pixels"] / run["seconds"] / 1e6 for run in whole]
+        with ProcessPoolExecutor(1, context, max_tasks_per_child=1) as pool:
+            runs = list(pool.map(read_and_sum, [path] * 2 * repeats, sizes * repeats))
+    half, whole = np.array(runs[::2]), np.array(runs[1::2])
     return {
         "frames": num_frames,
-        "million_pixels_a_second": _spread(speeds),
-        "seconds": _spread(seconds),
-        "above_baseline_mb": max(run["above_baseline_mb"] for run in whole),
-        "twice_the_frames_takes": _spread(growth),
+        "million_pixels_a_second": spread(whole[:, 1] / whole[:, 0] / 1e6),
+        "seconds": spread(whole[:, 0]),
+        "above_baseline_mb": float(whole[:, 2].max()),
+        "twice_the_frames_takes": spread(whole[:, 0] / half[:, 0]),
     }
 
 
-def _read_and_sum(recording: Path, frames: int) -> dict[str, float]:
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", SCALE_PROGRAM, str(recording), str(frames)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return json.loads(done.stdout)
+def read_and_sum(path: Path, num_frames: int) -> tuple[float, float, float]:
+    """Return seconds and pixels of a pass over a recording, and the memory it took, MiB."""
+    baseline, start = _status("VmRSS"), time.perf_counter()
+    dataset, frames = Dataset((Recording.open(path),)), np.arange(num_frames)
+    _, design = build_model(dataset, model_options("ea"), covered_domain(dataset, frames))
+    pixels = float(dataset.moments(design, frames).count.sum())
+    return time.perf_counter() - start, pixels, (_status("VmHWM") - baseline) / 1024
 
 
-def _spread(values: list[float]) -> list[float]:
-    """Return minimum, median and maximum."""
-    return [float(f(values)) for f in (np.min, np.median, np.max)]
+def _status(key: str) -> int:
+    """The kernel's own count, KiB: getrusage would hand on the peak of the parent process."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(key))
 
 
-def main() -> None:
-    """Run, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--scale-frames", type=int, default=200)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    result = compare(arguments.repeats)
-    result["scale"] = scale(arguments.scale_frames, arguments.repeats)
-    result["machine"] = (
-        f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
-    )
-    print(f"62 x 50 x 64 pixels, EA ({result['machine']})")
-    for name, row in result["rows"].items():  # type: ignore[union-attr]
+@click.command()
+@click.option("--repeats", default=5, show_default=True)
+@click.option("--scale-frames", default=200, show_default=True, help="VGA frames read from disk.")
+@JSON
+def main(repeats: int, scale_frames: int, out: Path | None) -> None:
+    """Compare the speed of SciPy and tofcorr on the same arrays."""
+    result = compare(repeats) | {"scale": scale(scale_frames, repeats), "machine": machine()}
+    click.echo(f"62 x 50 x 64 pixels, EA ({result['machine']})")
+    for name, row in result["rows"].items():
         low, middle, high = row["ratio"]
-        print(f"{name:<46}{row['ms'][1]:9.1f} ms  x{middle:7.2f} [{low:.2f}, {high:.2f}]")
-    print(result["agreement"])
-    print(f"vga, from disk ([min, median, max]): {result['scale']}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        click.echo(f"{name:<46}{row['ms'][1]:9.1f} ms  x{middle:7.2f} [{low:.2f}, {high:.2f}]")
+    click.echo(result["agreement"])
+    click.echo(f"vga, from disk ([min, median, max]): {result['scale']}")
+    write(result, out)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ simulator too, and the real ones of `$TOFCORR_REAL_DATA`. They are looked at as 
 first.
 """
 
-import json
 import tempfile
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,10 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
+from benchmarks.sealed.scores import table
+from benchmarks.timing import write
 from benchmarks.wrong_recordings.clean import clean_recordings
-from benchmarks.wrong_recordings.outcomes import COMMANDS, Clean, looked_at_once, outcome
+from benchmarks.wrong_recordings.outcomes import COMMANDS, KINDS, WRONG, Clean, outcome
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import FURTHER, TABLE, UNLISTED, Fault
 from tofcorr.options import resolve_options
@@ -39,11 +41,10 @@ def faulty(
         wrong = one.folder.with_name(f"{number}_{draw}")
         generator = np.random.default_rng([seed, number, draw])
         fault(Parts.read(one.folder), generator).write(wrong)
-        with looked_at_once():
-            found += [
-                outcome(command, wrong, one) | {"fault": name, "command": command, "draw": draw}
-                for command in commands
-            ]
+        found += [
+            outcome(command, wrong, one) | {"fault": name, "command": command, "draw": draw}
+            for command in commands
+        ]
     return found
 
 
@@ -61,35 +62,25 @@ def clean_demos(draws: int, seed: int, folder: Path) -> list[Clean]:
 
 def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
     """Return the table of the faults and the counts of the clean recordings."""
-    kinds = [
-        "stopped",
-        "do not use",
-        "headline",
-        "within its errors",
-        "confident and wrong",
-        "traceback",
-    ]
-    lines = ["| fault | command | " + " | ".join(kinds) + " | exit | what is said |"]
-    lines.append("|---|---|" + "---:|" * 7 + "---|")
+    rows = []
     for name, command in dict.fromkeys((one["fault"], one["command"]) for one in faults):
         own = [one for one in faults if (one["fault"], one["command"]) == (name, command)]
-        counts = [str(sum(one["outcome"] == kind for one in own) or "") for kind in kinds]
-        cells = [name, command, *counts, str(own[0]["exit"]), own[0]["sentence"][:160]]
-        lines.append(f"| {' | '.join(cells)} |")
-    stops = sum(one["stopped"] for one in clean)
-    headlines = sum(one["headline"] is not None for one in clean)
-    wrong = sum(one["outcome"] in ("confident and wrong", "traceback") for one in faults)
-    lines.append(
+        found = Counter(one["outcome"] for one in own)
+        counts = [found[kind] or "" for kind in KINDS]
+        rows.append((name, command, *counts, own[0]["exit"], own[0]["sentence"][:160]))
+    wrong = sum(one["outcome"] in WRONG for one in faults)
+    doubted = [f"{one['name']}: {one['headline']}" for one in clean if one["headline"] is not None]
+    lines = [
+        table(("fault", "command", *KINDS, "exit", "what is said"), rows),
         f"\n{len(faults)} commands on faulty recordings: confident wrong numbers or tracebacks "
-        f"{wrong}.\n"
-        f"{len(clean)} clean recordings: false stops {stops}, false headlines {headlines}."
-    )
+        f"{wrong}.",
+        f"{len(clean)} clean recordings: false stops {sum(one['stopped'] for one in clean)}, "
+        f"false headlines {len(doubted)}.",
+        *doubted,
+    ]
     if clean:
         cpu = np.array([one["cpu_s"] for one in clean])
-        lines += [f"{one['name']}: {one['headline']}" for one in clean if one["headline"]]
-        lines.append(
-            f"CPU time of a look: median {np.median(cpu):.3f} s, largest {cpu.max():.3f} s."
-        )
+        lines += [f"CPU time of a look: median {np.median(cpu):.3f} s, largest {cpu.max():.3f} s."]
     return "\n".join(lines)
 
 
@@ -115,7 +106,7 @@ def main(
     """Make every fault, give it to the commands, and print the table."""
     every = TABLE if only_table else TABLE | FURTHER | UNLISTED
     chosen = {name: f for name, f in every.items() if not only or only in name}
-    asked = COMMANDS if commands == "all" else tuple(commands.split(","))
+    asked = tuple(COMMANDS) if commands == "all" else tuple(commands.split(","))
     faults: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         demos = clean_demos(draws, seed, Path(folder))
@@ -123,9 +114,7 @@ def main(
             faults += faulty(name, fault, number, seed, demos, asked)
         let_through = clean_recordings(clean, shipped, seed, Path(folder))
     click.echo(summary(faults, let_through))
-    if out is not None:
-        text = json.dumps({"faults": faults, "clean": let_through}, indent=1)
-        out.write_text(text + "\n", encoding="utf-8")
+    write({"faults": faults, "clean": let_through}, out)
 
 
 if __name__ == "__main__":

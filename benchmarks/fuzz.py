@@ -460,17 +460,17 @@ def all_targets(folder: Path, seed: int) -> list[Target]:
     ]
 
 
-def recordings(made: tiny.Tiny) -> list[Target]:
+def recordings(made: Path) -> list[Target]:
     """The files of a recording, read with all others, and what commands do with it first."""
 
     def content(name: str) -> bytes:
-        return (made.full / name).read_bytes()
+        return (made / "full" / name).read_bytes()
 
-    opened = _within(made.full, Recording.open)
+    opened = _within(made / "full", Recording.open)
     yaml_, csv_ = (yaml.safe_load, _to_yaml), (_cells, _to_csv)
     arrays = [f"{name}.npy" for name in ("depth", "amplitude", "mask", "raw")]
-    whole = {use: _within(made.recording, use) for use in (_looked_at, _trained_on)}
-    depth = (made.recording / "depth.npy").read_bytes()
+    whole = {use: _within(made / "recording", use) for use in (_looked_at, _trained_on)}
+    depth = (made / "recording" / "depth.npy").read_bytes()
     save = _saved(lambda values, file: np.save(file, np.asarray(values)))
 
     def scaled(content: bytes) -> Any:  # noqa: ANN401 - a tensor in a list
@@ -506,17 +506,17 @@ def _read_lut(path: Path) -> list[Any]:
     return [np.array(one) for one in table(*(one.numpy() for one in FRAMES))]
 
 
-def archives(made: tiny.Tiny) -> list[Target]:
+def archives(made: Path) -> list[Target]:
     """The binary files that tofcorr writes itself: bytes, records, and values saved again."""
     readers: dict[Path, tuple[Callable[[Path], list[Any]], Any, Any]] = {
-        made.run / "state.pt": (_state, _tensors, torch.save),
-        made.module: (
+        made / "run" / "state.pt": (_state, _tensors, torch.save),
+        made / "module.pt": (
             lambda path: _called(tofcorr.DepthCorrection.load(path)),
             _tensors,
             torch.save,
         ),
-        made.run / "corrector.ts": (lambda path: _called(load_corrector(path)[0]), None, None),
-        made.lut: (_read_lut, _lut, _save_lut),
+        made / "run" / "corrector.ts": (lambda path: _called(load_corrector(path)[0]), None, None),
+        made / "corrector.npz": (_read_lut, _lut, _save_lut),
     }
     found = []
     for path, (read, load, save) in readers.items():
@@ -536,7 +536,7 @@ def archives(made: tiny.Tiny) -> list[Target]:
     return found
 
 
-def configurations(made: tiny.Tiny) -> list[Target]:
+def configurations(made: Path) -> list[Target]:
     """Configurations, sensors, and a simulator that runs."""
 
     def said(path: Path, found: Options, _: bool) -> None:
@@ -585,7 +585,7 @@ def configurations(made: tiny.Tiny) -> list[Target]:
             found.append(
                 Target(f"{kind}_{name}.yaml", content, read, yaml.safe_load, _to_yaml, said, 2)
             )
-    sensor = yaml.safe_load(made.sensor.read_text(encoding="utf-8"))
+    sensor = yaml.safe_load((made / "sensor.yaml").read_text(encoding="utf-8"))
     sensor["camera"] |= {"width": 12, "height": 10}
 
     def sensor_said(path: Path, found: tofcorr.SensorModel, _: bool) -> None:

@@ -21,10 +21,9 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 import numpy as np
@@ -40,59 +39,30 @@ TRIALS = {
     f"arm_p{mount}": [f"L3CX_{wall}_P{mount}" for wall in ("R1", "R2", "W1", "W2")]
     for mount in (1, 2)
 }
-FORMATS = {
-    "c": "c",
-    "lut": "npz",
-    "urdf": "xacro",
-    "tf": "yaml",
-    "easy_handeye": "yaml",
-    "opencv": "yml",
-}
-
-
-class Tolerance(NamedTuple):
-    """How far a number may move.
-
-    Attributes:
-        pattern: Of its key.
-        relative: Share of the larger of both.
-        absolute: In the key's own unit.
-        reason: Why so far.
-    """
-
-    pattern: str
-    relative: float
-    absolute: float
-    reason: str
-
+FORMATS = ("c.c", "lut.npz", "urdf.xacro", "tf.yaml", "easy_handeye.yaml", "opencv.yml")
 
 IGNORED = ("*seconds*", "*versions*", "*created*", "*sha256*", "*path*", "*recordings*", "*wall_s*")
 """Keys that differ from run to run of one program."""
 
-TOLERANCES = (
-    Tolerance("*p_value*", 0.0, 0.02, "resampled: six of 300 draws may fall on the other side"),
-    Tolerance("*score*", 0.05, 0.05, "measured in draws whose directions rounding turns"),
-    Tolerance("*gain*", 1e-3, 0.011, "written with two decimals"),
-    Tolerance("*probabilit*", 0.0, 0.01, "resampled, as p-values"),
-    Tolerance("*ci*", 5e-3, 5e-3, "quantiles of resamples lie between two neighbouring draws"),
-    Tolerance("*iterations*", 0.0, 20.0, "a solver may take other steps to the same optimum"),
-    Tolerance("*undetermined*", 0.0, 1.0, "directions at the limit of rounding"),
-    Tolerance("*noise*", 5e-3, 1e-6, "two estimators of one noise model agree to the third digit"),
-    Tolerance("*floor*", 5e-3, 1e-3, "follows the noise model"),
-    Tolerance("*_se*", 2e-3, 1e-7, "weights follow the noise model"),
-    Tolerance("*_mm*", 1e-3, 1e-3, "a micrometre: a thousandth of what any user can use"),
-    Tolerance("*share*", 1e-3, 1e-3, "of squares that are known to this"),
-    Tolerance("*", 1e-3, 1e-6, "sums in another order; solvers stop at 1e-4 of a standard error"),
-)
-"""The first pattern that a key matches counts."""
+TOLERANCES: dict[str, tuple[float, float]] = {
+    "*p_value*": (0.0, 0.02),  # resampled: six of 300 draws may fall on the other side
+    "*score*": (0.05, 0.05),  # measured in draws whose directions rounding turns
+    "*gain*": (1e-3, 0.011),  # written with two decimals
+    "*probabilit*": (0.0, 0.01),  # resampled, as p-values
+    "*ci*": (5e-3, 5e-3),  # quantiles of resamples lie between two neighbouring draws
+    "*iterations*": (0.0, 20.0),  # a solver may take other steps to the same optimum
+    "*undetermined*": (0.0, 1.0),  # directions at the limit of rounding
+    "*noise*": (5e-3, 1e-6),  # two estimators of one noise model agree to the third digit
+    "*floor*": (5e-3, 1e-3),  # follows the noise model
+    "*_se*": (2e-3, 1e-7),  # weights follow the noise model
+    "*_mm*": (1e-3, 1e-3),  # a micrometre: a thousandth of what any user can use
+    "*share*": (1e-3, 1e-3),  # of squares that are known to this
+    "*": (1e-3, 1e-6),  # sums in another order; solvers stop at 1e-4 of a standard error
+}
+"""How far a number may move, by the first pattern that its key matches.
 
-
-class Input(NamedTuple):
-    """One recording and the commands it is given to, in order; `{...}` are folders."""
-
-    name: str
-    commands: tuple[str, ...]
-
+As a share of the larger of both, and in the key's own unit.
+"""
 
 _TRAIN = "train --config {model} --recording {recording} --out {out}/run"
 _COMMON = ("inspect {recording}", _TRAIN, "diagnose --recording {recording} --out {out}/diagnosis")
@@ -102,8 +72,8 @@ _MORE = {
         "check --run {out}/run --recording {recording} --out {out}/check.json",
         "correct --model {out}/run/corrector.ts --recording {recording} --out {out}/corrected",
         *(
-            f"export --run {{out}}/run --format {n} --out {{out}}/export_{n}.{e}"
-            for n, e in FORMATS.items()
+            f"export --run {{out}}/run --format {f.split('.')[0]} --out {{out}}/export_{f}"
+            for f in FORMATS
         ),
     ),
     "set3": (
@@ -126,22 +96,19 @@ _IMPORTS = {
 }
 
 
-def _inputs(folder: Path) -> Iterator[Input]:
-    """Return every input whose data are there."""
+def _inputs() -> dict[str, tuple[str, ...]]:
+    """Return every input whose data are there, and its commands; `{...}` are folders."""
+    found: dict[str, tuple[str, ...]] = {}
     for name in SIMULATED:
         own = f"simulate --config {name} --out {{out}}/simulated"
-        yield Input(name, (own, *_COMMON, *_MORE.get(name, ())))
-    for tier, index in GENERATED:
-        yield Input(f"generated_{tier}{index}", _COMMON)
+        found[name] = (own, *_COMMON, *_MORE.get(name, ()))
+    found |= {f"generated_{tier}{index}": _COMMON for tier, index in GENERATED}
+    many = "diagnose --config many --recording {recording} --out {out}/diagnosis"
     for name, command in _IMPORTS.items():
-        if name not in {"bag", "images"} and "TOFCORR_REAL_DATA" not in os.environ:
-            continue
-        last = (
-            ()
-            if name.startswith("arm")
-            else ("diagnose --config many --recording {recording} --out {out}/diagnosis",)
-        )
-        yield Input(name, (command + " --out {out}/recording", *_COMMON[:2], *last))
+        if "TOFCORR_REAL_DATA" in os.environ or name in {"bag", "images"}:
+            last = () if name.startswith("arm") else (many,)
+            found[name] = (command + " --out {out}/recording", *_COMMON[:2], *last)
+    return found
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -164,9 +131,8 @@ def inputs_command(folder: Path) -> None:
     _write_ideal(folder / "set3", folder / "set3_ideal")
     for tier, index in GENERATED:
         entry = write_case(SEED, tier, index, folder / "generated")
-        shutil.move(
-            folder / "generated" / "recordings" / entry["id"], folder / f"generated_{tier}{index}"
-        )
+        made = folder / "generated" / "recordings" / entry["id"]
+        shutil.move(made, folder / f"generated_{tier}{index}")
     _write_drive(folder)
 
 
@@ -193,13 +159,10 @@ def _write_drive(folder: Path) -> None:
     drive = Drive(stops=30, width=48, height=36, rate=5.0).record()
     write_drive(drive, folder / "bag", "mcap")
     out = folder / "images"
-    (out / "depth").mkdir(parents=True)
-    (out / "ir").mkdir()
-    for time_s, depth, amplitude in zip(
-        drive.image_times, drive.depth_mm, drive.amplitude, strict=True
-    ):
-        Image.fromarray(depth).save(out / "depth" / f"{time_s:.6f}.png")
-        Image.fromarray(amplitude).save(out / "ir" / f"{time_s:.6f}.png")
+    for part, images in (("depth", drive.depth_mm), ("ir", drive.amplitude)):
+        (out / part).mkdir(parents=True)
+        for time_s, image in zip(drive.image_times, images, strict=True):
+            Image.fromarray(image).save(out / part / f"{time_s:.6f}.png")
     rotation = Rotation.from_matrix(drive.world_from_tool[:, :3, :3]).as_quat()
     rows = np.column_stack([drive.pose_times, drive.world_from_tool[:, :3, 3], rotation])
     np.savetxt(out / "poses.txt", rows, fmt="%.9f")
@@ -214,40 +177,37 @@ def _write_drive(folder: Path) -> None:
 @click.option("--command", "wanted", multiple=True, help="Only these commands (and `train`).")
 def run_command(folder: Path, out: Path, only: tuple[str, ...], wanted: tuple[str, ...]) -> None:
     """Give the recordings of FOLDER to the commands; OUT gets what they write."""
-    for one in _inputs(folder):
-        if only and one.name not in only:
+    for name, commands in _inputs().items():
+        if only and name not in only:
             continue
-        own = out / one.name
+        own = out / name
         shutil.rmtree(own, ignore_errors=True)
         own.mkdir(parents=True)
-        began, said = time.monotonic(), []
-        for command in one.commands:
+        began, said = time.monotonic(), ""
+        for command in commands:
             if not wanted or command.split()[0] in (*wanted, "train", "import"):
-                words = _filled(command, one.name, folder, own)
-                said.append(f"$ {command}\n{_call(words)}")
-        (own / "said.txt").write_text(
-            "\n".join(said).replace(str(own), "OUT").replace(str(folder), "IN")
-        )
+                said += f"$ {command}\n{_call(_filled(command, name, folder, own))}\n"
+        said = said.replace(str(own), "OUT").replace(str(folder), "IN")
+        (own / "said.txt").write_text(said.removesuffix("\n"))
         _correct_some(own)
-        click.echo(f"{one.name}: {time.monotonic() - began:.0f} s")
+        click.echo(f"{name}: {time.monotonic() - began:.0f} s")
 
 
 def _filled(command: str, name: str, folder: Path, own: Path) -> list[str]:
     """Return the words of a command with its folders filled in."""
-    imported = own / "recording"
     real = Path(os.environ.get("TOFCORR_REAL_DATA", "."))
+    trials = [str(real / "wall_trials_l3cx" / trial) for trial in TRIALS.get(name, ())]
+    places = {
+        "recording": own / "recording" if name in _IMPORTS else folder / name,
+        "model": {"kinect": "ea_log", "generated_E1": "eb"}.get(name, "ea"),
+        "view": "{view}",
+        "out": own,
+        "inputs": folder,
+        "real": real,
+    }
     words: list[str] = []
     for word in command.split():
-        if word == "{arm}":
-            words += [str(real / "wall_trials_l3cx" / trial) for trial in TRIALS[name]]
-            continue
-        recording = imported if name in _IMPORTS else folder / name
-        model = {"kinect": "ea_log", "generated_E1": "eb"}.get(name, "ea")
-        words.append(
-            word.format(
-                recording=recording, out=own, inputs=folder, real=real, model=model, view="{view}"
-            )
-        )
+        words += trials if word == "{arm}" else [word.format(**places)]
     if words[0] == "train" and name.startswith("arm"):
         words += ["--set", "model.terms=[{kind: distance_polynomial, degree: 1}]"]
     return words
@@ -266,9 +226,7 @@ def _call(words: list[str]) -> str:
         except Exception as error:  # noqa: BLE001 - whatever a command ends with is its answer.
             code = 2
             print(f"{type(error).__name__}: {error}")
-            if "Tofcorr" not in str(type(error).__mro__) and "Click" not in str(
-                type(error).__mro__
-            ):
+            if not re.search("Tofcorr|Click", str(type(error).__mro__)):
                 traceback.print_exc()
     return f"{heard.getvalue()}exit {code or 0}"
 
@@ -282,12 +240,9 @@ def _correct_some(own: Path) -> None:
     corrector = torch.jit.load(str(own / "run" / "corrector.ts"))
     camera = yaml.safe_load((own / "run" / "calibration.yaml").read_text())["camera"]
     random = np.random.default_rng(SEED)
-    depth, amplitude = (
-        torch.tensor(
-            random.uniform(low, high, (3, camera["height"], camera["width"])), dtype=torch.float32
-        )
-        for low, high in ((0.3, 4.0), (0.0, 3000.0))
-    )
+    shape = (3, camera["height"], camera["width"])
+    drawn = [random.uniform(*ends, shape) for ends in ((0.3, 4.0), (0.0, 3000.0))]
+    depth, amplitude = (torch.tensor(values, dtype=torch.float32) for values in drawn)
     with contextlib.suppress(RuntimeError, torch.jit.Error):  # A model of conditions asks for more.
         corrected, valid = corrector(depth, amplitude)
         np.savez(own / "corrected.npz", corrected_mm=1e3 * corrected.numpy(), valid=valid.numpy())
@@ -306,11 +261,9 @@ def compare_command(before: Path, after: Path, only: tuple[str, ...], rows: int)
     for name in names:
         one, other = _values(before / name), _values(after / name)
         answered = {key.split(":")[0] for key in other}
-        for key in sorted(one.keys() | other.keys()):
-            if key.split(":")[0] not in answered:  # A command that was left out of the run.
-                continue
-            if any(fnmatch(key, pattern) for pattern in IGNORED):
-                continue
+        # A command that was left out of the run answers nothing.
+        keys = sorted(key for key in one.keys() | other.keys() if key.split(":")[0] in answered)
+        for key in (k for k in keys if not any(fnmatch(k, pattern) for pattern in IGNORED)):
             a, b = one.get(key, "(missing)"), other.get(key, "(missing)")
             if isinstance(a, float) and isinstance(b, float):
                 numbers.append((_off(key, a, b), f"{name}/{key}", a, b))
@@ -333,8 +286,9 @@ def _off(key: str, a: float, b: float) -> float:
     """Return how far two numbers are apart, in units of the tolerance of their key."""
     if a == b or (math.isnan(a) and math.isnan(b)):
         return 0.0
-    own = next(one for one in TOLERANCES if fnmatch(key.lower(), one.pattern))
-    off = abs(a - b) / (own.absolute + own.relative * max(abs(a), abs(b)))
+    limits = (own for pattern, own in TOLERANCES.items() if fnmatch(key.lower(), pattern))
+    relative, absolute = next(limits)
+    off = abs(a - b) / (absolute + relative * max(abs(a), abs(b)))
     return math.inf if math.isnan(off) else off
 
 
@@ -350,20 +304,15 @@ def _values(folder: Path) -> dict[str, Any]:
         elif path.suffix == ".json":
             _flatten(key, json.loads(path.read_text()), found)
         elif path.suffix in {".yaml", ".yml"}:
-            _flatten(
-                key,
-                yaml.safe_load(
-                    re.sub(r"^%YAML.*|!!opencv-matrix", "", path.read_text(), flags=re.MULTILINE)
-                ),
-                found,
-            )
+            text = re.sub(r"^%YAML.*|!!opencv-matrix", "", path.read_text(), flags=re.MULTILINE)
+            _flatten(key, yaml.safe_load(text), found)
         elif path.suffix in {".txt", ".md", ".csv", ".xacro"}:
             _flatten_text(key, path.read_text(), found)
         elif path.suffix in {".npy", ".npz"}:
             loaded = np.load(path)
-            arrays = loaded if path.suffix == ".npz" else {"": loaded}
-            for name in arrays:
-                _flatten_array(f"{key}{name}", arrays[name], found)
+            arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+            for name, values in arrays.items():
+                _flatten_array(f"{key}{name}", values, found)
     return found
 
 
@@ -389,9 +338,8 @@ def _flatten(key: str, value: object, found: dict[str, Any]) -> None:
 
 def _name(part: object) -> str:
     """Return what an entry of a list is about: entries may change places where they are equal."""
-    if not isinstance(part, dict):
-        return ""
-    return " ".join(str(part[k]) for k in ("effect", "cause", "covariate", "kind") if k in part)
+    words = part if isinstance(part, dict) else {}
+    return " ".join(str(words[k]) for k in ("effect", "cause", "covariate", "kind") if k in words)
 
 
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
@@ -414,10 +362,8 @@ def _flatten_array(key: str, values: np.ndarray, found: dict[str, Any]) -> None:
     if values.dtype.kind not in "fiub":
         return
     numbers = values.astype(float).ravel()
-    seen = np.isfinite(numbers)
-    wave = np.cos(np.arange(numbers.size))
-    found[f"{key}.finite"] = float(seen.sum())
-    found[f"{key}.size"] = float(numbers.size)
+    seen, wave = np.isfinite(numbers), np.cos(np.arange(numbers.size))
+    found |= {f"{key}.finite": float(seen.sum()), f"{key}.size": float(numbers.size)}
     if seen.any():
         found[f"{key}.rms"] = float(np.sqrt(np.mean(numbers[seen] ** 2)))
         found[f"{key}.wave"] = float(np.mean((numbers * wave)[seen]))

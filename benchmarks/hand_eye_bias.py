@@ -9,84 +9,58 @@ with the scatter of poses as its interval and with the noise's whole shift besid
 the shift was taken off, with its own interval.
 """
 
+import math
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
 
 import click
 import numpy as np
 import torch
 from tqdm import tqdm
 
+from benchmarks.coverage import fitted, hand_eye_error
 from benchmarks.levels import small_images
 from benchmarks.renewed.recording import record, write_recording
 from benchmarks.renewed.world import draw_world
 from benchmarks.sealed.scores import share, table
-from tofcorr.data.recording import Recording
-from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.robust import student_quantile
-from tofcorr.fit.fitting import fit
-from tofcorr.fit.noise_shift import NoiseShift
-from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.options import TrainingOptions
 
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")
 
 
-class Found(NamedTuple):
-    """Errors, half-widths and the noise's shift of one recording, (6,) each, metres and radians."""
+def one_recording(seed: int, number: int) -> np.ndarray:
+    """Draw and fit one recording.
 
-    at_least_loss: np.ndarray
-    error: np.ndarray
-    by_scatter: np.ndarray
-    with_shift: np.ndarray
-    stated: np.ndarray
-    shift: np.ndarray
-
-
-def one_recording(seed: int, number: int) -> Found:
-    """Draw and fit one recording."""
+    Returns:
+        (6, 6), metres and radians of each component: error at the least loss; error with the shift
+        taken off; half-widths by the scatter of poses, by that and the shift, and as stated; and
+        the noise's shift.
+    """
     rng = np.random.default_rng([seed, 1, number])
     with small_images("nothing"), tempfile.TemporaryDirectory() as folder:
         world = draw_world(rng, None)
         write_recording(Path(folder) / "recording", record(rng, world, [])[0])
-        data = Dataset((Recording.open(Path(folder) / "recording"),))
-        frames, options = np.arange(data.num_frames), resolve_options(TrainingOptions, "ea")
-        found = fit(data, frames, options, covered_domain(data, frames))
+        found = fitted(Path(folder) / "recording", resolve_options(TrainingOptions, "ea"))
     true = torch.as_tensor(world.tool_from_camera)
     quantile = student_quantile(0.975, found.covariance.degrees_of_freedom)
-    shift = found.noise_shift or NoiseShift(torch.zeros(6).double(), removed=False)
+    shift = found.noise_shift.twist if found.noise_shift else torch.zeros(6).double()
     scatter = found.covariance.matrix[:6, :6]
-    by_scatter, with_shift, stated = (
-        quantile * matrix.diagonal().clamp(min=0).sqrt().numpy()
-        for matrix in (
-            scatter,
-            scatter + torch.outer(shift.twist, shift.twist),
-            found.hand_eye_covariance,
-        )
-    )
-    return Found(
-        at_least_loss=_error(true, found.optimum),
-        error=_error(true, found.solution.parameters),
-        by_scatter=by_scatter,
-        with_shift=with_shift,
-        stated=stated,
-        shift=shift.twist.numpy(),
-    )
+    errors = [
+        hand_eye_error(true, one.tool_from_camera).flatten()
+        for one in (found.optimum, found.solution.parameters)
+    ]
+    half_widths = [
+        quantile * matrix.diagonal().clamp(min=0).sqrt()
+        for matrix in (scatter, scatter + torch.outer(shift, shift), found.hand_eye_covariance)
+    ]
+    return torch.stack([*errors, *half_widths, shift]).numpy()
 
 
-def _error(true: torch.Tensor, found: Parameters) -> np.ndarray:
-    """Return the error of a hand-eye transform in camera axes, (6,), metres and radians."""
-    best = found.tool_from_camera
-    turn = se3.log(se3.assemble(true[:3, :3].T @ best[:3, :3], torch.zeros(3).double()))[3:]
-    return torch.cat([true[:3, :3].T @ (best - true)[:3, 3], turn]).numpy()
-
-
-def tables(rows: list[Found]) -> str:
+def tables(rows: list[np.ndarray]) -> str:
     """Return coverage of each component, and how much of the error along z the noise makes."""
-    least, error, *halves, shift = (np.stack(part) for part in zip(*rows, strict=True))
+    least, error, *halves, shift = np.stack(rows, axis=1)
     names = ("least loss, scatter of poses", "least loss, and the shift", "shift taken off")
     lines = []
     for name, off, half in zip(names, (least, least, error), halves, strict=True):
@@ -96,18 +70,15 @@ def tables(rows: list[Found]) -> str:
         lines.append((name, len(rows), *texts))
     before, after = 1e3 * least[:, 2], 1e3 * error[:, 2]
     alike = np.corrcoef(before, 1e3 * shift[:, 2])[0, 1]
+    rms = [math.sqrt(np.mean(one**2)) for one in (before, after)]
     wider = [np.median(half[:, 2] / halves[0][:, 2]) for half in halves[1:]]
     return (
         f"{table(('95 % intervals by', 'n', *AXES, 'all'), lines)}\n\n"
         f"z: the noise's shift and the error correlate by {alike:.2f}; median error "
         f"{np.median(np.abs(before)):.2f} mm at the least loss, {np.median(np.abs(after)):.2f} mm "
-        f"with the shift taken off; root mean square {_rms(before):.1f} and {_rms(after):.1f} mm; "
+        f"with the shift taken off; root mean square {rms[0]:.1f} and {rms[1]:.1f} mm; "
         f"intervals {wider[0]:.2f} and {wider[1]:.2f} times those of the scatter (median)"
     )
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})

@@ -9,7 +9,6 @@ true gaps are those of `benchmarks.sealed.remains`; the oracle's gap before, wit
 stands beside them.
 """
 
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -18,7 +17,6 @@ from typing import Any
 
 import click
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks.renewed import ranges
 from benchmarks.renewed.cases import Case, agree, make_case, turn
@@ -47,7 +45,7 @@ GAPS = ("before", "after", "closed")
 def small_images(kind: str) -> AbstractContextManager[None]:
     """Draw small images and few frames; everything else is as in the renewed check."""
     frames = FRAMES["nothing" if kind == "nothing" else "effect"]
-    return ranges.drawn_from(IMAGES=IMAGES, FRAMES=frames)
+    return ranges.drawn_from(images=IMAGES, frames=frames)
 
 
 def write_case(seed: int, kind: str, number: int, folder: Path) -> Case:
@@ -56,7 +54,7 @@ def write_case(seed: int, kind: str, number: int, folder: Path) -> Case:
     letters = sum(sum(map(ord, form.effect + form.name)) for form in forms)
     rng = np.random.default_rng([seed, *([0, number, letters] if forms else [1, number])])
     with small_images(kind):
-        case = make_case(rng, forms, OUTSIDE_MM if kind == "outside" else ranges.SIZES_MM)
+        case = make_case(rng, forms, OUTSIDE_MM if kind == "outside" else ranges.RANGES["sizes_mm"])
     write_recording(folder, case.recorded)
     return case
 
@@ -240,17 +238,14 @@ def main(seed: int, cases: str, out: Path) -> None:
     """Diagnose small recordings, write a line for each, and print levels and coverage."""
     from tofcorr.errors import TofcorrError
 
-    def make(kind: str, number: int) -> dict[str, Any]:
-        with tempfile.TemporaryDirectory() as folder:
-            case = write_case(seed, kind, number, Path(folder) / "recording")
-            try:
-                return judge(case, Path(folder) / "recording")
-            except TofcorrError as error:
-                return {"refused": str(error)}
+    def make(kind: str, number: int, folder: Path) -> dict[str, Any]:
+        case = write_case(seed, kind, number, folder)
+        try:
+            return judge(case, folder)
+        except TofcorrError as error:
+            return {"refused": str(error)}
 
-    counts = counts_by_name(cases, 1, list(KINDS), "kind")
-    wanted = [(kind, number) for kind, count in counts.items() for number in range(count)]
-    rows = list(tqdm(kept_rows(out, wanted, make), total=len(wanted), unit=""))
+    rows = list(kept_rows(out, counts_by_name(cases, 1, list(KINDS), "kind"), make))
     for row in rows:
         if "refused" in row:
             click.echo(f"{row['kind']} {row['number']} is refused: {row['refused']}")

@@ -6,21 +6,19 @@ It runs as many threads as torch.
 python -m benchmarks.runtime [--repeats 30] [--json FILE]
 """
 
-import argparse
-import json
-import platform
 import tempfile
-import time
 from collections.abc import Callable, Iterable
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
+import click
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchmarks.estimation import model_options
 from benchmarks.scene import camera_of
+from benchmarks.timing import JSON, machine, spread, timed, write
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.c import export_c, load_c
 from tofcorr.correction.export.pt2 import export_pt2, load_pt2
@@ -101,17 +99,13 @@ def compare(
     }
     script, package = torch.jit.load(folder / "corrector.ts"), load_pt2(folder / "corrector.pt2")
     generator = torch.Generator().manual_seed(0)
-    frames = [
-        (
-            0.6 + 1.3 * torch.rand(height, width, generator=generator),
-            20 + 800 * torch.rand(height, width, generator=generator),
-        )
-        for _ in range(num_frames)
-    ]
+    draws = torch.rand(num_frames, 2, height, width, generator=generator)
+    frames = [(0.6 + 1.3 * depth, 20 + 800 * amplitude) for depth, amplitude in draws]
     arrays = [(depth.numpy(), amplitude.numpy()) for depth, amplitude in frames]
     out, in_numpy = torch.empty_like(frames[0][0]), numpy_corrector(state)
     for job in (script, *compiled.values()):
-        _same(job(*frames[0])[0], torch.from_numpy(in_numpy(*arrays[0])[0]))
+        expected = torch.from_numpy(in_numpy(*arrays[0])[0])
+        torch.testing.assert_close(job(*frames[0])[0], expected, rtol=0, atol=1e-6, equal_nan=True)
     jobs: dict[str, Callable[[], object]] = {
         "torch.add": _stream(lambda depth, amplitude: torch.add(depth, amplitude, out=out), frames),
         "corrector.ts": _stream(script, frames),
@@ -119,14 +113,8 @@ def compare(
         **{name: _stream(job, frames) for name, job in compiled.items()},
         "numpy": _stream(in_numpy, arrays),
     }
-    seconds: dict[str, list[float]] = {name: [] for name in jobs}
     with torch.no_grad():
-        for round_number in range(repeats + 3):
-            for name, job in jobs.items():
-                spent = _in_a_row(job, 8)
-                if round_number >= 3:
-                    seconds[name].append(spent)
-    return seconds
+        return timed(jobs, repeats, warm_up=3, in_a_row=8)
 
 
 def _stream(job: Callable[..., object], frames: Iterable[tuple]) -> Callable[[], object]:
@@ -140,58 +128,40 @@ def on_gpu(batch: int, repeats: int) -> dict[str, float]:
     corrector = DepthCorrector.from_state(calibration(480, 640)).cuda()
     depth = 0.6 + 1.3 * torch.rand(batch, 480, 640, device="cuda")
     amplitude = 20 + 800 * torch.rand(batch, 480, 640, device="cuda")
-    corrector(depth, amplitude)
-    torch.cuda.synchronize()
-    start = time.perf_counter()
-    for _ in range(repeats):
-        corrector(depth, amplitude)
-    torch.cuda.synchronize()
-    spent = (time.perf_counter() - start) / repeats
+
+    def job() -> None:
+        for _ in range(repeats):
+            corrector(depth, amplitude)
+        torch.cuda.synchronize()
+
+    spent = timed({"cuda": job}, 1)["cuda"][0] / repeats
     useful_bytes = depth.numel() * (4 + 4 + 4 + 1)
     return {"frames_a_second": batch / spent, "useful_bytes_a_second": useful_bytes / spent}
 
 
-def _in_a_row(job: Callable[[], object], number: int) -> float:
-    """Time a steady stream of frames: the memory that other jobs gave back is taken anew first."""
-    job()
-    start = time.perf_counter()
-    for _ in range(number):
-        job()
-    return (time.perf_counter() - start) / number
-
-
-def _same(found: Tensor, expected: Tensor) -> None:
-    """Make sure that the peers do the same before anyone is timed."""
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6, equal_nan=True)
-
-
-def main() -> None:
-    """Run, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    machine = f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
-    result: dict[str, object] = {"machine": machine}
-    print(f"times one torch.add of the same frames: median [min, max] ({machine})")
+@click.command()
+@click.option("--repeats", default=30, show_default=True)
+@JSON
+def main(repeats: int, out: Path | None) -> None:
+    """Compare the speed of the runtime corrector with torch.add and NumPy."""
+    result: dict[str, Any] = {"machine": machine()}
+    click.echo(f"times one torch.add of the same frames: median [min, max] ({machine()})")
     for height, width, num_frames in CASES:
         with tempfile.TemporaryDirectory() as folder:
-            seconds = compare(height, width, arguments.repeats, Path(folder), num_frames)
+            seconds = compare(height, width, repeats, Path(folder), num_frames)
         base = float(np.median(seconds["torch.add"]))
         what = "a stream" if num_frames > 1 else "one frame again and again"
         line = [f"{height:>5} x {width:<5} {what:<26} add {1e3 * base:.3f} ms"]
-        for name in ("corrector.ts", "corrector.pt2", ".c", ".c any", "numpy"):
-            low, middle, high = (f(seconds[name]) / base for f in (np.min, np.median, np.max))
+        for name in list(seconds)[1:]:
+            low, middle, high = (time / base for time in spread(seconds[name]))
             line.append(f"{name} {middle:5.1f} [{low:.1f}, {high:.1f}]")
-        print("   ".join(line))
+        click.echo("   ".join(line))
         result[f"{height}x{width}, {what}"] = {
-            name: [1e3 * float(f(times)) for f in (np.min, np.median, np.max)]
-            for name, times in seconds.items()
+            name: [1e3 * time for time in spread(times)] for name, times in seconds.items()
         }
     result["gpu"] = on_gpu(64, 20) if torch.cuda.is_available() else "not measured: no CUDA here"
-    print(f"GPU: {result['gpu']}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    click.echo(f"GPU: {result['gpu']}")
+    write(result, out)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """The smallest recording that everything can be done with, and what is made from it."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,58 +26,40 @@ CONFIG: dict[str, Any] = {
 """What differs from the shipped simulator `demo`."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tiny:
-    """Valid files of the formats that tofcorr reads and writes itself.
-
-    Attributes:
-        recording: With amplitude, mask and truth.
-        full: Its first frames, with every optional array.
-        run: What `tofcorr train` made of it.
-        module: A file of `DepthCorrection.save`.
-        lut: A look-up table.
-        sensor: A `sensor.yaml`.
-    """
-
-    recording: Path
-    full: Path
-    run: Path
-    module: Path
-    lut: Path
-    sensor: Path
-
-
 def simulator(seed: int) -> dict[str, Any]:
     """Return the keys and values of the simulator of a tiny recording."""
     return resolve_options(SimulatorOptions, "demo").to_mapping() | CONFIG | {"seed": seed}
 
 
-def make(folder: Path, seed: int) -> Tiny:
-    """Write all of it into a folder; what is there already is taken."""
-    made = Tiny(
-        recording=folder / "recording",
-        full=folder / "full",
-        run=folder / "run",
-        module=folder / "module.pt",
-        lut=folder / "corrector.npz",
-        sensor=folder / "sensor.yaml",
-    )
-    if made.sensor.exists():
-        return made
-    recording = simulate(SimulatorOptions.from_mapping(simulator(seed), "tiny"), made.recording)
-    _write_full(recording, made.full, seed)
-    options = resolve_options(TrainingOptions, "ea", ("figures=false", "advice=0"))
-    train(made.recording, options, out=made.run, force=True)
-    module = tofcorr.DepthCorrection.load(made.run)
-    module.save(made.module)
-    module.export("lut", made.lut)
-    tofcorr.SensorModel.load("kinect_v2").save(made.sensor)
-    return made
+def make(folder: Path, seed: int) -> Path:
+    """Write valid files of the formats that tofcorr reads and writes itself into a folder.
+
+    Files that are there already are taken.
+
+    Args:
+        folder: It gets `recording`, with amplitude, mask and truth; `full`, its first frames with
+            every optional array; `run`, what `tofcorr train` made of it; `module.pt`, a file of
+            `DepthCorrection.save`; `corrector.npz`, a look-up table; and `sensor.yaml`.
+        seed: Of all draws.
+
+    Returns:
+        The folder.
+    """
+    if (folder / "sensor.yaml").exists():
+        return folder
+    options = SimulatorOptions.from_mapping(simulator(seed), "tiny")
+    _write_full(simulate(options, folder / "recording"), folder / "full", seed)
+    training = resolve_options(TrainingOptions, "ea", ("figures=false", "advice=0"))
+    train(folder / "recording", training, out=folder / "run", force=True)
+    module = tofcorr.DepthCorrection.load(folder / "run")
+    module.save(folder / "module.pt")
+    module.export("lut", folder / "corrector.npz")
+    tofcorr.SensorModel.load("kinect_v2").save(folder / "sensor.yaml")
+    return folder
 
 
 def _write_full(recording: Recording, path: Path, seed: int) -> None:
     generator = np.random.default_rng(seed)
-    shape = (6, recording.camera.height, recording.camera.width)
     depth = np.array(recording.depth[:6])
     write_recording(
         path,
@@ -87,8 +68,8 @@ def _write_full(recording: Recording, path: Path, seed: int) -> None:
         rows=list(recording.frames.rows())[:6],
         depth=depth,
         amplitude=None if recording.amplitude is None else np.array(recording.amplitude[:6]),
-        mask=(generator.uniform(size=shape) > 0.2).astype(np.uint8),
-        raw=generator.normal(size=(6, 4, *shape[1:])).astype(np.float32),
+        mask=(generator.uniform(size=depth.shape) > 0.2).astype(np.uint8),
+        raw=generator.normal(size=(6, 4, *depth.shape[1:])).astype(np.float32),
         modulation_frequency=20e6,
         saturation_amplitude=60_000.0,
         tool_from_camera=recording.tool_from_camera,

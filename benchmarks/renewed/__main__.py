@@ -9,19 +9,21 @@ from benchmarks.sealed.answers import Entry, Outcome
 from benchmarks.sealed.command import Check
 from benchmarks.sealed.remains import covered
 from benchmarks.sealed.scores import (
-    ANY,
     LEAST_MM,
+    NEW_NAME,
     Score,
     at_least,
     at_most,
     detected,
     mean_score,
     named,
+    names_something_new,
     right,
     right_or_unknown,
     scores_table,
     set_sizes,
     share_score,
+    shares_of,
     silent,
     table,
     unknown,
@@ -53,13 +55,11 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
     cases, nulls = findable(outcomes), [one for one in outcomes if one.tier == "N"]
     parts = {flag: [one for one in cases if one.case["textbook"] is flag] for flag in (True, False)}
     outside = [one for one in outcomes if one.tier == "O" and one.must_find]
-    many = [one for one in cases if _poses(one) >= MANY]
+    many, wide = [one for one in cases if _poses(one) >= MANY], (right_or_unknown, at_least(0.9))
     scores = [
         *_one_effect("findable", cases),
         *_one_effect("textbook form", parts[True]),
-        share_score(
-            "other form", "in the set or unknown", parts[False], right_or_unknown, at_least(0.9)
-        ),
+        *shares_of("other form", parts[False], {"in the set or unknown": wide}),
         *_said("other form", parts[False], 0.08),
         *_one_effect("25 poses or more", many),
         *_said("outside", outside, 0.08),
@@ -77,19 +77,20 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
 
 def _one_effect(title: str, cases: Sequence[Outcome]) -> list[Score]:
     return [
-        share_score(title, "in the set", cases, right, at_least(0.9)),
+        *shares_of(title, cases, {"in the set": (right, at_least(0.9))}),
         mean_score(title, "size of the set", set_sizes(cases), at_most(1.8)),
         *_said(title, cases, 0.05),
     ]
 
 
 def _said(title: str, cases: Sequence[Outcome], most_wrong: float) -> list[Score]:
-    return [
-        share_score(title, "a single wrong name", cases, wrong, at_most(most_wrong)),
-        share_score(title, "something named", cases, named),
-        share_score(title, "called unknown", cases, unknown),
-        share_score(title, "neither", cases, silent),
-    ]
+    judges = {
+        "a single wrong name": (wrong, at_most(most_wrong)),
+        "something named": (named,),
+        "called unknown": (unknown,),
+        "neither": (silent,),
+    }
+    return shares_of(title, cases, judges)
 
 
 def _nothing(title: str, cases: Sequence[Outcome]) -> list[Score]:
@@ -98,33 +99,26 @@ def _nothing(title: str, cases: Sequence[Outcome]) -> list[Score]:
         "unknown": (unknown, LEVEL),
         "detected": (detected, at_most(0.1)),
     }
-    return [share_score(title, what, cases, judge, to) for what, (judge, to) in judges.items()]
+    return shares_of(title, cases, judges)
 
 
 def _coverage(title: str, cases: Sequence[Outcome], out: Path) -> list[Score]:
     held = [covered(one, out) for one in cases]
-    return [
-        share_score(title, f"{name}_ci holds the truth", held, _entry(name), COVERAGE)
+    judges = {
+        f"{name}_ci holds the truth": (lambda held, name=name: held.get(name), COVERAGE)
         for name in ("before", "after", "closed")
-    ]
-
-
-def _entry(name: str) -> Callable[[dict[str, bool]], bool | None]:
-    return lambda held: held.get(name)
+    }
+    return shares_of(title, held, judges)
 
 
 def _real(cases: Sequence[Outcome]) -> list[Score]:
     """Real recordings: what is named of what was added, beside what they show as they are."""
-    added = [one for one in cases if one.role == "added"]
-    own = {name for one in cases if one.role == "plain" for name in one.said.effects}
-    judges: dict[str, Callable[[Outcome], bool]] = {
-        "added effect in the set": right,
-        "added effect in the set or unknown": right_or_unknown,
-        "named though neither added nor seen before": lambda one: bool(
-            set(one.said.effects) - one.truths - own
-        ),
+    judges = {
+        "added effect in the set": (right,),
+        "added effect in the set or unknown": (right_or_unknown,),
+        NEW_NAME: (names_something_new(cases),),
     }
-    return [share_score("real", what, added, judge, ANY) for what, judge in judges.items()]
+    return shares_of("real", [one for one in cases if one.role == "added"], judges)
 
 
 def by_form(cases: Sequence[Outcome]) -> str:
@@ -136,13 +130,11 @@ def by_form(cases: Sequence[Outcome]) -> str:
         key = one.truth, not one.case["textbook"], one.case["form"]
         groups.setdefault(key, []).append(one)
     rows = [(effect, form, some) for (effect, _, form), some in sorted(groups.items())]
-    return table(
-        ("effect", "form", "n", *judges),
-        [
-            (effect, form, len(some), *(sum(map(judge, some)) for judge in judges.values()))
-            for effect, form, some in [*rows, ("all", "", list(cases))]
-        ],
-    )
+    lines = [
+        (effect, form, len(some), *(sum(map(judge, some)) for judge in judges.values()))
+        for effect, form, some in [*rows, ("all", "", list(cases))]
+    ]
+    return table(("effect", "form", "n", *judges), lines)
 
 
 DESIGNS: dict[str, Callable[[dict], str]] = {
@@ -183,14 +175,14 @@ def _bin(value: float, edges: Sequence[float]) -> str:
 
 main = Check(
     "Check `tofcorr diagnose` on recordings that nobody tuned it on.",
-    "tiers",
+    "tier",
     dict.fromkeys(TIERS, "") | {"K": "TOFCORR_REAL_DATA"},
     generate,
     score_all,
     cases=59,
     config="simulate_anew: false\npage: false\n",
     with_remains=True,
-).group()
+).group
 
 if __name__ == "__main__":
     main()

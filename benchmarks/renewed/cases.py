@@ -63,7 +63,7 @@ class Case:
 def make_case(
     rng: np.random.Generator,
     forms: Sequence[Form] = (),
-    sizes: ranges.Range = ranges.SIZES_MM,
+    sizes: ranges.Range = ranges.RANGES["sizes_mm"],
     wanted: Mapping[str, Any] | None = None,
 ) -> Case:
     """Draw a world that shows all forms, and record it; `wanted` fixes more of its design."""

@@ -40,19 +40,6 @@ def small_motions(translation: Array, rotation: Array) -> Array:
     return transforms(rotations(rotation), translation)
 
 
-def quaternions(matrices: Array) -> Array:
-    """Unit quaternions x, y, z, w (N, 4) of rotations (N, 3, 3), by Bar-Itzhack's matrix."""
-    m = matrices
-    trace = np.trace(m, axis1=-2, axis2=-1)
-    k = np.empty((len(m), 4, 4))
-    k[:, :3, :3] = m + np.swapaxes(m, -1, -2) - trace[:, None, None] * np.eye(3)
-    skew = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], -1)
-    k[:, :3, 3] = k[:, 3, :3] = skew
-    k[:, 3, 3] = trace
-    result = np.linalg.eigh(k)[1][..., -1]
-    return result * np.where(result[:, 3:] < 0, -1.0, 1.0)
-
-
 @dataclass(frozen=True)
 class Camera:
     """A camera with OpenCV's five-coefficient lens model; `sensitivity` is in electrons."""
@@ -68,20 +55,14 @@ class Camera:
     @property
     def matrix(self) -> list[list[float]]:
         """The 3x3 intrinsic matrix as nested lists."""
-        return [
-            [self.focal[0], 0.0, self.centre[0]],
-            [0.0, self.focal[1], self.centre[1]],
-            [0.0, 0.0, 1.0],
-        ]
+        (u, v), (fx, fy) = self.centre, self.focal
+        return [[fx, 0.0, u], [0.0, fy, v], [0.0, 0.0, 1.0]]
 
     def slopes(self) -> tuple[Array, Array]:
         """Undistorted x/z and y/z (H, W) of every pixel, by Newton's method on the lens model."""
-        column, row = np.meshgrid(
-            np.arange(self.width, dtype=float), np.arange(self.height, dtype=float)
-        )
-        target = np.stack(
-            [(column - self.centre[0]) / self.focal[0], (row - self.centre[1]) / self.focal[1]]
-        )
+        column, row = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height))
+        (u, v), (fx, fy) = self.centre, self.focal
+        target = np.stack([(column - u) / fx, (row - v) / fy]).astype(np.float64)
         point, step = target.copy(), 1e-6
         for _ in range(8):
             here = self._distort(point)
@@ -102,12 +83,8 @@ class Camera:
         k1, k2, p1, p2, k3 = self.distortion
         square = x * x + y * y
         radial = 1 + square * (k1 + square * (k2 + square * k3))
-        return np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
-                y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
-            ]
-        )
+        across = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+        return np.stack([across, y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y])
 
 
 def directions(x: Array, y: Array) -> Array:

@@ -157,7 +157,7 @@ def _added(
     def size_at(strength: float) -> float:
         return float(np.sqrt(np.mean(field(strength)[view.on_target] ** 2)))
 
-    size = 1e-3 * (size_mm or ranges.SIZES_MM.draw(rng))
+    size = 1e-3 * (size_mm or ranges.draw("sizes_mm", rng))
     hook = Hook(form, change, strength_for(size_at, form.guess, size))
     factor = _measured(view, [hook])[1] / np.maximum(before[1], 1e-12)
     return form, field(hook.strength), np.where(view.on_target, factor, 1.0)

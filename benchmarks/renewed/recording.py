@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
-from benchmarks.renewed.geometry import Array, Camera, quaternions, small_motions, transforms
+from benchmarks.renewed.geometry import Array, Camera, small_motions, transforms
 from benchmarks.renewed.signal_chain import Hook, Measured, field_of, mask_of, measure
 from benchmarks.renewed.world import World
 
@@ -44,10 +45,8 @@ class Truth:
     def sizes_mm(self, recorded: Recorded) -> dict[str, float]:
         """RMS of each field over the pixels used."""
         used = recorded.mask & np.isfinite(recorded.depth)
-        return {
-            name: 1e3 * float(np.sqrt(np.mean(field[used] ** 2)))
-            for name, field in self.fields.items()
-        }
+        sizes = {k: np.sqrt(np.mean(field[used] ** 2)) for k, field in self.fields.items()}
+        return {name: 1e3 * float(size) for name, size in sizes.items()}
 
 
 def record(rng: np.random.Generator, world: World, hooks: Sequence[Hook]) -> tuple[Recorded, Truth]:
@@ -142,7 +141,8 @@ def _frames(recorded: Recorded, without: Collection[str]) -> str:
     normal = world.world_from_target[:3, 2]
     columns: dict[str, Any] = {"frame": np.arange(n), "timestamp_s": world.way.seconds}
     columns |= dict(zip(("tx", "ty", "tz"), poses[:, :3, 3].T, strict=True))
-    columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternions(poses[:, :3, :3]).T, strict=True))
+    quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
     columns |= {k: np.full(n, v) for k, v in zip(("nx", "ny", "nz"), normal, strict=True)}
     columns["d"] = np.full(n, -normal @ world.world_from_target[:3, 3])
     columns["target"] = list(world.surface.kind)
@@ -194,23 +194,13 @@ def read(folder: Path) -> Data:
         name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name != "target"
     }
     depth, stored = np.load(folder / "depth.npy").astype(float), folder / "amplitude.npy"
-    matrix = about["camera"].pop("K")
-    rays = Camera(
-        **about["camera"],
-        focal=(matrix[0][0], matrix[1][1]),
-        centre=(matrix[0][2], matrix[1][2]),
-        sensitivity=1.0,
-        counts_per_electron=1.0,
-    ).rays()
+    k = about["camera"].pop("K")
+    focal, centre = (k[0][0], k[1][1]), (k[0][2], k[1][2])
+    units: dict[str, Any] = {"sensitivity": 1.0, "counts_per_electron": 1.0}
+    rays = Camera(**about["camera"], focal=focal, centre=centre, **units).rays()
     per_range = rays[..., 2] if about["depth_kind"] == "z" else np.ones(rays.shape[:2])
-    x, y, z, w = np.stack([columns[name] for name in ("qx", "qy", "qz", "qw")])
-    rotation = np.stack(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    quaternion = np.stack([columns[name] for name in ("qx", "qy", "qz", "qw")], -1)
+    rotation = Rotation.from_quat(quaternion).as_matrix()
     amplitude = np.load(stored).astype(float) if stored.exists() else None
     limit = about["saturation_amplitude"]
     lit = amplitude < limit if amplitude is not None and limit is not None else True

@@ -50,18 +50,27 @@ def scene_of(room: Room, camera: np.ndarray) -> dict[str, Any]:
     """Mitsuba's description of a room, lit by a spot at the camera (target_from_camera, 4x4)."""
     import mitsuba as mi
 
-    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": room.albedo}}
+    diffuse = {"type": "diffuse", "reflectance": _grey(room.albedo)}
+    glossy = {
+        "type": "roughplastic",
+        "distribution": "ggx",
+        "alpha": room.gloss,
+        "diffuse_reflectance": _grey(room.albedo),
+    }
     parts: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "transient_path", "max_depth": 8, "rr_depth": 5},
-        "light": spot_at(camera),
+        "light": {  # the camera's own: a cone of 100 degrees that fades towards its rim
+            "type": "spot",
+            "to_world": mi.ScalarTransform4f(camera.tolist()),
+            "intensity": _grey(1.0),
+            "cutoff_angle": 50.0,
+            "beam_width": 38.0,
+        },
         "target": {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f().scale(REACH),
-            "bsdf": {
-                "type": "diffuse",
-                "reflectance": {"type": "rgb", "value": room.target_albedo},
-            },
+            "bsdf": {"type": "diffuse", "reflectance": _grey(room.target_albedo)},
         },
     }
     for name, axis, position, facing in _walls(room):
@@ -69,47 +78,20 @@ def scene_of(room: Room, camera: np.ndarray) -> dict[str, Any]:
         parts[name] = {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f(_placed(axis, position, facing).tolist()),
-            "bsdf": _glossy(room) if shiny else diffuse,
+            "bsdf": glossy if shiny else diffuse,
         }
     return parts
 
 
-def spot_at(camera: np.ndarray) -> dict[str, Any]:
-    """The camera's own light: a cone of 100 degrees that fades towards its rim."""
-    import mitsuba as mi
-
-    return {
-        "type": "spot",
-        "to_world": mi.ScalarTransform4f(camera.tolist()),
-        "intensity": {"type": "rgb", "value": 1.0},
-        "cutoff_angle": 50.0,
-        "beam_width": 38.0,
-    }
-
-
-def _glossy(room: Room) -> dict[str, Any]:
-    return {
-        "type": "roughplastic",
-        "distribution": "ggx",
-        "alpha": room.gloss,
-        "diffuse_reflectance": {"type": "rgb", "value": room.albedo},
-    }
+def _grey(value: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": value}
 
 
 def _walls(room: Room) -> list[tuple[str, int, float, float]]:
     """Name, axis, position and direction of the normal of every wall that is there."""
-    found: list[tuple[str, int, float, float]] = []
-    if room.floor is not None:
-        found.append(("floor", 1, room.floor, 1.0))
-    if room.ceiling is not None:
-        found.append(("ceiling", 1, room.ceiling, -1.0))
-    if room.side is not None:
-        found.append(("side", 0, room.side, -float(np.sign(room.side))))
-    if room.other_side is not None:
-        found.append(("other_side", 0, room.other_side, -float(np.sign(room.other_side))))
-    if room.back is not None:
-        found.append(("back", 2, room.back, -1.0))
-    return found
+    axes = {"floor": 1, "ceiling": 1, "side": 0, "other_side": 0, "back": 2}
+    there = [(name, axis, getattr(room, name)) for name, axis in axes.items()]
+    return [(name, axis, at, -float(np.sign(at))) for name, axis, at in there if at is not None]
 
 
 def _placed(axis: int, position: float, facing: float) -> np.ndarray:
@@ -298,9 +280,8 @@ def smooth(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndar
 
 
 def _terms(v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return np.stack(
-        [v**i * u**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=-1
-    )
+    powers = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
+    return np.stack([v**i * u**j for i, j in powers], axis=-1)
 
 
 COSINES = np.linspace(0.3, 1.0, 15)
@@ -361,18 +342,14 @@ def _slab(albedo: float, forward: float, where: np.ndarray) -> dict[str, Any]:
     return {
         "type": "scene",
         "integrator": {"type": "transient_prbvolpath", "max_depth": 200, "rr_depth": 60},
-        "light": {
-            "type": "point",
-            "position": where.tolist(),
-            "intensity": {"type": "rgb", "value": 1e6},
-        },
+        "light": {"type": "point", "position": where.tolist(), "intensity": _grey(1e6)},
         "slab": {
             "type": "cube",
             "to_world": wide,
             "bsdf": {"type": "null"},
             "interior": {
                 "type": "homogeneous",
-                "albedo": {"type": "rgb", "value": albedo},
+                "albedo": _grey(albedo),
                 "sigma_t": 1.0,
                 "phase": {"type": "hg", "g": forward},
             },

@@ -3,14 +3,16 @@
 An effect is a *form*: a change, of some strength, of one stage of the signal chain.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 import numpy as np
+from scipy import ndimage
 
 from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, directions, inverse
-from benchmarks.renewed.world import CONTRAST, NOMINAL_US, READ_NOISE, WHITE, Sensor, World
+from benchmarks.renewed.world import CONTRAST, NOMINAL_US, READ_NOISE, WHITE, World
 
 Stage = Literal["poses", "rays", "plane", "relief", "path", "light", "taps"]
 Change = Callable[[float, Any, Any], Any]
@@ -125,9 +127,8 @@ def see(world: World, hooks: Sequence[Hook] = (), slopes: Array | None = None) -
         slopes = np.stack(world.sensor.lens.slopes())
     slopes = changed("rays", hooks, view, slopes)
     plane = np.broadcast_to(world.world_from_target, (world.frames, 4, 4))
-    target_from_camera = (
-        inverse(changed("plane", hooks, view, plane)) @ poses @ world.tool_from_camera
-    )
+    plane = changed("plane", hooks, view, plane)
+    target_from_camera = inverse(plane) @ poses @ world.tool_from_camera
     toward = np.einsum("nij,hwj->nhwi", target_from_camera[:, :3, :3], directions(*slopes))
     view = _hit(replace(view, toward=toward, origin=target_from_camera[:, :3, 3]))
     if any(hook.form.stage == "relief" for hook in hooks):
@@ -190,11 +191,9 @@ def _footprint(view: View) -> Array:
     if set(surface.kind) == {"white"}:
         return surface.reflectivity(view.x, view.y)
     xs, ys = np.gradient(view.x, axis=(1, 2)), np.gradient(view.y, axis=(1, 2))
-    for u in (-0.25, 0.25):
-        for v in (-0.25, 0.25):
-            total += surface.reflectivity(
-                view.x + u * xs[0] + v * xs[1], view.y + u * ys[0] + v * ys[1]
-            )
+    for u, v in itertools.product((-0.25, 0.25), repeat=2):
+        x, y = view.x + u * xs[0] + v * xs[1], view.y + u * ys[0] + v * ys[1]
+        total += surface.reflectivity(x, y)
     return total / 4
 
 
@@ -270,16 +269,11 @@ def _noise(rng: np.random.Generator, taps: Array, world: World) -> Array:
     white = white * np.sqrt(np.maximum(taps, 0) + READ_NOISE**2)
     if sensor.spatial_filter != "none":
         white = _smooth(white, KERNELS[sensor.spatial_filter])
-    return _remembered(white, sensor, world.way.pose_id)
-
-
-def _remembered(noise: Array, sensor: Sensor, pose_id: np.ndarray) -> Array:
-    """Noise of which each frame keeps a share of the one before, within a pose."""
-    keep = sensor.temporal_filter
-    for i in range(1, noise.shape[1] if keep else 0):
+    keep, pose_id = sensor.temporal_filter, world.way.pose_id
+    for i in range(1, white.shape[1] if keep else 0):
         if pose_id[i] == pose_id[i - 1]:
-            noise[:, i] = keep * noise[:, i - 1] + np.sqrt(1 - keep**2) * noise[:, i]
-    return noise
+            white[:, i] = keep * white[:, i - 1] + np.sqrt(1 - keep**2) * white[:, i]
+    return white
 
 
 def _smooth(values: Array, kernel: Array) -> Array:
@@ -343,10 +337,8 @@ def field_of(changed: Measured, clean: Measured) -> Array:
 
 def coarse_points(world: World) -> Array:
     """Points on the target's plane (N, 9, 9, 3), in its frame, that an even grid of pixels sees."""
-    lens, slopes = world.sensor.lens, np.stack(world.sensor.lens.slopes())
-    rows, columns = (
-        np.linspace(0, n - 1, COARSE).round().astype(int) for n in (lens.height, lens.width)
-    )
+    slopes = np.stack(world.sensor.lens.slopes())
+    rows, columns = (np.linspace(0, n - 1, COARSE).round().astype(int) for n in slopes.shape[1:])
     view = see(world, slopes=slopes[:, rows[:, None], columns])
     return np.stack([view.x, view.y, np.zeros_like(view.x)], axis=-1)
 
@@ -366,14 +358,16 @@ def mask_of(
     """The mask (N, H, W) of measured depths with NaN where nothing returned."""
     if kind == "all that is seen":
         return seen.view.on_target
+    margin, found, within = 2, seen.view.on_target, np.ones_like(seen.view.within)
     if kind.startswith("RANSAC"):
         margin, rays = 0 if kind == UNERODED else 2, seen.view.world.sensor.lens.rays()
-        found = [
-            _plane_pixels(rng, rays * image[..., None], about, threshold)
-            for image, about in zip(depth, seen.view.on_target, strict=True)
-        ]
-        return np.stack([_eroded(image, margin) for image in found]) & seen.view.within
-    return np.stack([_eroded(image, 2) for image in seen.view.on_target])
+        pairs = zip(depth, found, strict=True)
+        planes = [_plane_pixels(rng, rays * d[..., None], near, threshold) for d, near in pairs]
+        found, within = np.stack(planes), seen.view.within
+    cross = ndimage.generate_binary_structure(2, 1)[None]  # neighbours along rows and columns
+    for _ in range(margin):
+        found = ndimage.binary_erosion(found, cross, border_value=1)
+    return found & within
 
 
 def _plane_pixels(
@@ -392,36 +386,17 @@ def _plane_pixels(
     for _ in range(TRIALS):
         a, b, c = few[rng.integers(SAMPLE, size=3)]
         normal = np.cross(b - a, c - a)
-        if not (length := np.linalg.norm(normal)):
-            continue
-        plane = normal / length, float(normal @ a / length)
-        count = int((np.abs(few @ plane[0] - plane[1]) < threshold).sum())
-        if count > most:
-            best, most = plane, count
-    normal, offset = _refined(cloud, *best, threshold)
+        if length := np.linalg.norm(normal):
+            plane = normal / length, float(normal @ a / length)
+            count = int((np.abs(few @ plane[0] - plane[1]) < threshold).sum())
+            best, most = (plane, count) if count > most else (best, most)
+    normal, offset = best
+    for _ in range(2):
+        near = cloud[np.abs(cloud @ normal - offset) < threshold]
+        if len(near) >= 10:
+            middle = near.mean(0)
+            normal = np.linalg.eigh((near - middle).T @ (near - middle))[1][:, 0]
+            offset = float(normal @ middle)
     off = np.abs(np.nan_to_num(points) @ normal - offset)
     scatter = 1.48 * np.median(off[known & (off < threshold)])
     return known & (off < max(threshold, NOISE_TIMES * scatter))
-
-
-def _refined(cloud: Array, normal: Array, offset: float, threshold: float) -> tuple[Array, float]:
-    for _ in range(2):
-        near = cloud[np.abs(cloud @ normal - offset) < threshold]
-        if len(near) < 10:
-            break
-        middle = near.mean(0)
-        normal = np.linalg.eigh((near - middle).T @ (near - middle))[1][:, 0]
-        offset = float(normal @ middle)
-    return normal, offset
-
-
-def _eroded(mask: np.ndarray, pixels: int) -> np.ndarray:
-    """The mask without its rim, counting neighbours along rows and columns."""
-    for _ in range(pixels):
-        inner = mask.copy()
-        inner[1:] &= mask[:-1]
-        inner[:-1] &= mask[1:]
-        inner[:, 1:] &= mask[:, :-1]
-        inner[:, :-1] &= mask[:, 1:]
-        mask = inner
-    return mask

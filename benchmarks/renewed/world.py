@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.renewed import ranges
 from benchmarks.renewed.geometry import (
     SPEED_OF_LIGHT,
     Array,
@@ -17,6 +16,7 @@ from benchmarks.renewed.geometry import (
     small_motions,
     transforms,
 )
+from benchmarks.renewed.ranges import RANGES, Range, draw
 from benchmarks.renewed.rendering import Room
 
 CONTRAST = 0.55  # modulated share of the returned light
@@ -191,8 +191,8 @@ class World:
 
 def draw_world(rng: np.random.Generator, wanted: Mapping[str, Any] | None = None) -> World:
     """Draw a camera, a robot, a target and a design; `wanted` fixes some of the design."""
-    near = ranges.NEAR_M.draw(rng)
-    far = min(near * ranges.FARTHEST_TIMES.draw(rng), ranges.FARTHEST_M)
+    near = draw("near_m", rng)
+    far = min(near * draw("farthest_times", rng), RANGES["farthest_m"])
     sensor = _draw_sensor(rng, near, far)
     pixels = sensor.lens.width * sensor.lens.height
     design = _draw_design(rng, pixels, near, far, wanted or {})
@@ -200,7 +200,7 @@ def draw_world(rng: np.random.Generator, wanted: Mapping[str, Any] | None = None
     way = _draw_way(rng, design, room)
     arm = np.array([0.0, 0.0, 0.09]) + rng.normal(0, 0.06, 3)
     mounting = small_motions(arm, rng.normal(0, [0.2, 0.2, 1.5]))
-    metres, radians = ranges.GUESS
+    metres, radians = RANGES["guess"]
     miss = small_motions(rng.normal(0, metres, 3), rng.normal(0, radians, 3))
     ahead = far + rng.uniform(0.25, 0.6)
     place = small_motions(np.array([ahead, *rng.uniform(-0.3, 0.3, 2)]), np.zeros(3))
@@ -244,19 +244,19 @@ def session_again(rng: np.random.Generator, world: World, **design: object) -> W
 
 def _draw_sensor(rng: np.random.Generator, near: float, far: float) -> Sensor:
     """Draw a camera that is exposed for distances from near to far."""
-    frequencies = tuple(1e6 * f for f in ranges.draw_of(ranges.FREQUENCIES_MHZ, rng))
-    electrons = _electrons(ranges.NOISE_MM.draw(rng) * 1e-3, frequencies)
-    outdoor = rng.uniform() < ranges.OUTDOOR
-    sun = ranges.SUN.draw(rng)
+    frequencies = tuple(1e6 * f for f in draw("frequencies_mhz", rng))
+    electrons = _electrons(draw("noise_mm", rng) * 1e-3, frequencies)
+    outdoor = rng.uniform() < RANGES["outdoor"]
+    sun = draw("sun", rng)
     return Sensor(
         lens=replace(_draw_lens(rng), sensitivity=electrons * float(np.sqrt(near * far)) ** 2),
         frequencies=frequencies,
         sun=sun * electrons if outdoor else 0.0,
-        tail=ranges.draw_of(ranges.TAILS, rng),
-        spatial_filter=ranges.draw_of(ranges.SPATIAL_FILTER, rng),
-        temporal_filter=ranges.draw_of(ranges.TEMPORAL_FILTER, rng),
-        rounding=1e-3 * ranges.draw_of(ranges.ROUNDING_MM, rng),
-        depth_kind=ranges.draw_of(ranges.DEPTH_KIND, rng),
+        tail=draw("tails", rng),
+        spatial_filter=draw("spatial_filter", rng),
+        temporal_filter=draw("temporal_filter", rng),
+        rounding=1e-3 * draw("rounding_mm", rng),
+        depth_kind=draw("depth_kind", rng),
         base=BaseErrors(
             middle=(near + far) / 2,
             half=(far - near) / 2,
@@ -268,9 +268,9 @@ def _draw_sensor(rng: np.random.Generator, near: float, far: float) -> Sensor:
 
 
 def _draw_lens(rng: np.random.Generator) -> Camera:
-    width, height = ranges.draw_of(ranges.IMAGES, rng)
-    focal = width * ranges.FOCAL_WIDTHS.draw(rng)
-    barrel = ranges.BARREL.draw(rng)
+    width, height = draw("images", rng)
+    focal = width * draw("focal_widths", rng)
+    barrel = draw("barrel", rng)
     off = rng.normal(0, 0.012 * width, 2)
     return Camera(
         width=width,
@@ -279,7 +279,7 @@ def _draw_lens(rng: np.random.Generator) -> Camera:
         centre=((width - 1) / 2 + off[0], (height - 1) / 2 + off[1]),
         distortion=(barrel, -0.3 * barrel, *rng.normal(0, 4e-4, 2), 0.0),
         sensitivity=1.0,
-        counts_per_electron=ranges.Range(0.005, 0.3, log=True).draw(rng),
+        counts_per_electron=Range(0.005, 0.3, log=True).draw(rng),
     )
 
 
@@ -299,27 +299,27 @@ def _draw_design(
     rng: np.random.Generator, pixels: int, near: float, far: float, wanted: Mapping[str, Any]
 ) -> Design:
     """Draw a design; `wanted` fixes what an effect cannot do without."""
-    frames = min(ranges.draw_of(ranges.FRAMES, rng), max(15, int(ranges.MOST_PIXELS / pixels)))
+    frames = min(draw("frames", rng), max(15, int(RANGES["most_pixels"] / pixels)))
     layout = {
         "frames": frames,
         "near": near,
         "far": far,
-        "tilt": np.deg2rad(ranges.TILT_DEG.draw(rng)),
-        "moving": bool(rng.uniform() < ranges.ON_THE_MOVE),
-        "repeated": ranges.draw_of(ranges.REPEATED, rng),
-        "repeats": ranges.draw_of(ranges.REPEATS, rng),
-        "robot": 1e-3 * ranges.ROBOT_MM.draw(rng),
-        "scene": ranges.draw_of(ranges.SCENES, rng),
-        "target": ranges.draw_of(ranges.TARGETS, rng),
-        "mask": ranges.draw_of(ranges.MASKS, rng),
+        "tilt": np.deg2rad(draw("tilt_deg", rng)),
+        "moving": bool(rng.uniform() < RANGES["on_the_move"]),
+        "repeated": draw("repeated", rng),
+        "repeats": draw("repeats", rng),
+        "robot": 1e-3 * draw("robot_mm", rng),
+        "scene": draw("scenes", rng),
+        "target": draw("targets", rng),
+        "mask": draw("masks", rng),
         "ransac": max(
-            ranges.RANSAC_SHARE.draw(rng) * np.sqrt(near * far), 1e-3 * ranges.LEAST_RANSAC_MM
+            draw("ransac_share", rng) * np.sqrt(near * far), 1e-3 * RANGES["least_ransac_mm"]
         ),
-        "exposure": ranges.draw_of(ranges.EXPOSURES, rng),
+        "exposure": draw("exposures", rng),
     }
     optional = ("integration_time_us", "body_temperature_c", "room_temperature_c", "ambient")
     needed = wanted.get("logged", ())
-    logged = [name for name in optional if rng.uniform() < ranges.LOGGED or name in needed]
+    logged = [name for name in optional if rng.uniform() < RANGES["logged"] or name in needed]
     layout |= {key: value for key, value in wanted.items() if key != "logged"}
     if layout["moving"] and layout["scene"] in INDOORS:
         layout["scene"] = "wall"  # a way without stops would lead through floor and walls
@@ -363,7 +363,7 @@ def _draw_surface(rng: np.random.Generator, design: Design, room: Room, way: Way
 def _draw_conditions(rng: np.random.Generator, design: Design, way: Way) -> Conditions:
     """Draw the conditions of a way."""
     t, n = way.seconds, design.frames
-    swing = ranges.ROOM_K.draw(rng)
+    swing = draw("room_k", rng)
     periods = rng.uniform(0.3, 2.5, 4) * max(t[-1], 60.0)
     waves = np.sin(2 * np.pi * t[:, None] / periods + rng.uniform(0, 2 * np.pi, 4)).sum(1)
     room = rng.uniform(17.0, 26.0) + swing * (waves - waves.min()) / max(np.ptp(waves), 1e-6)

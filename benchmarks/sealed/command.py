@@ -1,10 +1,12 @@
 """The command lines of the checks: generate, diagnose, remains, score, or all of it."""
 
+import itertools
 import json
 import os
+import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import click
 from tqdm import tqdm
 
 from benchmarks.sealed.answers import Entry, Outcome, open_answers, write_cases
-from benchmarks.sealed.running import Plan, diagnose, waiting
+from benchmarks.sealed.running import diagnose, waiting
 from benchmarks.sealed.scores import Score
 
 # Processes share the work; threads inside each would only wait for one another.
@@ -46,13 +48,12 @@ def counts_by_name(text: str, cases: int, known: Collection[str], what: str) -> 
     return counts
 
 
-@dataclass(frozen=True)
 class Check:
-    """The command line of a sealed check.
+    """The command line of a sealed check: its steps, and all of them.
 
-    Attributes:
+    Args:
         about: What it checks.
-        option: Name of the option that lists kinds of cases.
+        what: What a kind of cases is called; with an s the option that lists them.
         kinds: Those that there are, each with an environment variable that it needs, or "".
         write: Writes cases of a seed and yields the manifest's entries.
         scores_of: Scores outcomes: figures, and a text to print.
@@ -61,29 +62,62 @@ class Check:
         with_remains: Whether the true gaps of every report are measured.
     """
 
-    about: str
-    option: str
-    kinds: Mapping[str, str]
-    write: Callable[[int, dict[str, int], Path], Iterable[Entry]]
-    scores_of: Callable[[Sequence[Outcome], Path], tuple[list[Score], str]]
-    cases: int
-    config: str = ""
-    with_remains: bool = False
+    def __init__(
+        self,
+        about: str,
+        what: str,
+        kinds: Mapping[str, str],
+        write: Callable[[int, dict[str, int], Path], Iterable[Entry]],
+        scores_of: Callable[[Sequence[Outcome], Path], tuple[list[Score], str]],
+        *,
+        cases: int = 40,
+        config: str = "",
+        with_remains: bool = False,
+    ) -> None:
+        self._what, self._kinds, self._write, self._scores_of = what, kinds, write, scores_of
+        self._config = config
+        usual = ",".join(name for name, needed in kinds.items() if not needed)
+        path, least, many = click.Path(path_type=Path), click.IntRange(1), "Cases of each kind."
+        own = _option(f"--{what}s", "kinds", default=usual, help="X:400 asks for 400 of X.")
+        out = _option("--out", type=path, required=True, help="Folder of the whole check.")
+        jobs = _option("--jobs", "--workers", "jobs", type=least, default=2)
+        seed = _option("--seed", type=click.IntRange(0), required=True, help="Draws cases.")
+        limit = _option("--limit", "limit_s", default=300.0, help="Seconds for one recording.")
+        given = _option("--config", type=path, help="Handed to `tofcorr diagnose`.")
+        self._steps: dict[Callable[..., None], list[click.Parameter]] = {
+            self.generate: [
+                seed,
+                _option("--cases", type=least, default=cases, help=many),
+                own,
+                out,
+            ],
+            self.diagnose: [out, jobs, limit, given],
+            **({self.remains: [out, jobs]} if with_remains else {}),
+            self.score: [out, jobs],
+        }
+        every = list(dict.fromkeys(itertools.chain(*self._steps.values())))
+        self.group = click.Group(help=about, context_settings=HELP)
+        for step, taken in (self._steps | {self.all: every}).items():
+            self.group.add_command(
+                click.Command(step.__name__, None, step, taken, help=step.__doc__)
+            )
 
     def generate(self, seed: int, cases: int, kinds: str, out: Path) -> None:
         """Write recordings and, apart, sealed answers."""
-        counts = counts_by_name(kinds, cases, list(self.kinds), self.option.removesuffix("s"))
+        counts = counts_by_name(kinds, cases, list(self._kinds), self._what)
         for name in counts:
-            if (needed := self.kinds[name]) and needed not in os.environ:
+            if (needed := self._kinds[name]) and needed not in os.environ:
                 raise click.UsageError(f"{name} needs the folder of real recordings in ${needed}")
-        for _ in tqdm(write_cases(seed, self.write(seed, counts, out), out), "recordings", unit=""):
+        for _ in tqdm(
+            write_cases(seed, self._write(seed, counts, out), out), "recordings", unit=""
+        ):
             pass
 
     def diagnose(self, out: Path, jobs: int, limit_s: float, config: Path | None) -> None:
         """Run `tofcorr diagnose` on the recordings alone; go on where it was interrupted."""
         entries, failed = waiting(out), 0
-        plan = Plan(jobs, limit_s, config.read_text() if config else self.config)
-        with tqdm(diagnose(out, entries, plan), "diagnoses", len(entries), unit="") as runs:
+        text = config.read_text() if config else self._config
+        with tqdm(diagnose(out, entries, jobs, limit_s, text), "diagnoses", len(entries)) as runs:
             for code in runs:
                 failed += code != 0
                 runs.set_postfix(failed=failed)
@@ -104,46 +138,16 @@ class Check:
         run = [one for one in outcomes if one.said.failure != "not run"]
         if left := len(outcomes) - len(run):
             click.echo(f"{left} of {len(outcomes)} recordings are not diagnosed.", err=True)
-        scores, text = self.scores_of(run, out)
+        scores, text = self._scores_of(run, out)
         (out / "tables.md").write_text(text + "\n")
         kept = {"format": "tofcorr-sealed-scores", "scores": [asdict(one) for one in scores]}
         (out / "scores.json").write_text(json.dumps(kept, indent=1))
         click.echo(text)
 
-    def group(self) -> click.Group:
-        """The commands, each a step, and `all` of them."""
-        usual = ",".join(name for name, needed in self.kinds.items() if not needed)
-        path, at_least_one = click.Path(path_type=Path), click.IntRange(1)
-        limit, many = "Seconds for one recording.", "Cases of each kind."
-        kinds = f"Which {self.option}; X:400 asks for 400 of X."
-        options = {
-            "seed": _option("--seed", type=click.IntRange(0), required=True, help="Draws cases."),
-            "cases": _option("--cases", type=at_least_one, default=self.cases, help=many),
-            "kinds": _option(f"--{self.option}", "kinds", default=usual, help=kinds),
-            "out": _option("--out", type=path, required=True, help="Folder of the whole check."),
-            "jobs": _option("--jobs", "--workers", "jobs", type=at_least_one, default=2),
-            "limit_s": _option("--limit", "limit_s", default=300.0, help=limit),
-            "config": _option("--config", type=path, help="Handed to `tofcorr diagnose`."),
-        }
-        steps: dict[Callable[..., None], tuple[str, ...]] = {
-            self.generate: ("seed", "cases", "kinds", "out"),
-            self.diagnose: ("out", "jobs", "limit_s", "config"),
-            **({self.remains: ("out", "jobs")} if self.with_remains else {}),
-            self.score: ("out", "jobs"),
-        }
-
-        def everything(**given: object) -> None:
-            """Do all of it, one after the other."""
-            for step, taken in steps.items():
-                step(**{name: given[name] for name in taken})
-
-        commands = {step.__name__: (step, taken) for step, taken in steps.items()}
-        commands["all"] = (everything, tuple(options))
-        group = click.Group(help=self.about, context_settings=HELP)
-        for name, (step, taken) in commands.items():
-            params: list[click.Parameter] = [options[one] for one in taken]
-            group.add_command(click.Command(name, None, step, params, help=step.__doc__))
-        return group
+    def all(self, **given: object) -> None:
+        """Do all of it, one after the other."""
+        for step, taken in self._steps.items():
+            step(**{str(one.name): given[str(one.name)] for one in taken})
 
 
 def _option(*names: str, **values: Any) -> click.Option:  # noqa: ANN401 - click's own
@@ -151,15 +155,21 @@ def _option(*names: str, **values: Any) -> click.Option:  # noqa: ANN401 - click
 
 
 def kept_rows(
-    out: Path, wanted: Iterable[tuple[str, int]], make: Callable[[str, int], dict[str, Any]]
+    out: Path, counts: Mapping[str, int], make: Callable[[str, int, Path], dict[str, Any]]
 ) -> Iterator[dict[str, Any]]:
-    """Yield a row for each kind and number wanted; those in a file of JSON lines are not remade."""
+    """Yield as many rows of each kind as wanted; those in a file of JSON lines are not remade.
+
+    `make` is told kind, number, and a folder for the recording that is gone afterwards.
+    """
     rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     done = {(row["kind"], row["number"]): row for row in rows}
+    wanted = [(kind, number) for kind, count in counts.items() for number in range(count)]
     with out.open("a") as file:
-        for kind, number in wanted:
+        for kind, number in tqdm(wanted, unit="", disable=None):
             if (kind, number) not in done:
-                done[kind, number] = {"kind": kind, "number": number, **make(kind, number)}
+                with tempfile.TemporaryDirectory() as folder:
+                    made = make(kind, number, Path(folder) / "recording")
+                done[kind, number] = {"kind": kind, "number": number, **made}
                 file.write(json.dumps(done[kind, number]) + "\n")
                 file.flush()
             yield done[kind, number]

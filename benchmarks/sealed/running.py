@@ -15,7 +15,6 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,21 +25,14 @@ from benchmarks.renewed.recording import read
 from benchmarks.sealed.answers import Entry, digest, entries_of
 
 
-@dataclass(frozen=True)
-class Plan:
-    """How to run: processes, seconds for each recording, configuration."""
-
-    jobs: int = 2
-    limit_s: float = 300.0
-    config: str = ""
-
-
 def waiting(out: Path) -> list[Entry]:
     """Entries of the manifest that have no run record yet."""
     return [one for one in entries_of(out) if not (out / "runs" / f"{one['id']}.json").exists()]
 
 
-def diagnose(out: Path, entries: Sequence[Entry], plan: Plan) -> Iterator[int]:
+def diagnose(
+    out: Path, entries: Sequence[Entry], jobs: int = 2, limit_s: float = 300.0, config: str = ""
+) -> Iterator[int]:
     """Diagnose entries of the manifest; yield the exit code of each as it ends.
 
     `out/diagnoses/NAME` takes the report, `out/runs/NAME.json` the record: seconds, exit code,
@@ -51,8 +43,9 @@ def diagnose(out: Path, entries: Sequence[Entry], plan: Plan) -> Iterator[int]:
         (out / name).mkdir(exist_ok=True)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(plan.jobs, context) as pool:
-        for done in as_completed([pool.submit(_run_one, out, entry, plan) for entry in entries]):
+    with ProcessPoolExecutor(jobs, context) as pool:
+        runs = [pool.submit(run_one, out, entry, limit_s, config) for entry in entries]
+        for done in as_completed(runs):
             yield done.result()
 
 
@@ -78,9 +71,10 @@ def run(arguments: Sequence[str], limit_s: float) -> dict[str, Any]:
     return {"seconds": time.perf_counter() - start, "code": code, "message": message}
 
 
-def _run_one(out: Path, entry: Entry, plan: Plan) -> int:
+def run_one(out: Path, entry: Entry, limit_s: float = 300.0, config: str = "") -> int:
+    """Diagnose one recording; return the exit code."""
     name, report = entry["id"], out / "diagnoses" / entry["id"]
-    config = f"{plan.config}\n{entry.get('config', '')}\n"
+    config += f"\n{entry.get('config', '')}\n"
     if entry["exclude"]:
         config += f"leave_out: {json.dumps(entry['exclude'])}\n"
     file = out / "configs" / f"{name}.yaml"
@@ -88,9 +82,9 @@ def _run_one(out: Path, entry: Entry, plan: Plan) -> int:
     arguments = ["diagnose", "--recording", str(out / "recordings" / name), "--out", str(report)]
     arguments += ["--config", str(file)] if config.strip() else []
     arguments += ["--sim", str(out / "recordings" / entry["sim"])] if entry.get("sim") else []
-    record = run(arguments, plan.limit_s)
+    record = run(arguments, limit_s)
     if entry.get("held_out") and (report / "sensor.yaml").exists():
-        record["degrade"] = _degrade(out, entry, report / "sensor.yaml", plan)
+        record["degrade"] = _degrade(out, entry, report / "sensor.yaml", limit_s)
     written = report / "diagnosis.json"
     if record["code"] == 0 and not written.exists():
         record |= {"code": 1, "message": "exit code 0 but no diagnosis.json"}
@@ -101,7 +95,7 @@ def _run_one(out: Path, entry: Entry, plan: Plan) -> int:
     return record["code"]
 
 
-def _degrade(out: Path, entry: Entry, sensor: Path, plan: Plan) -> dict[str, Any]:
+def _degrade(out: Path, entry: Entry, sensor: Path, limit_s: float) -> dict[str, Any]:
     """Degrade ideal frames by the camera found, and return what came of the last.
 
     `degraded` are of another session, as it would measure them; `expected` the same and `own` those
@@ -122,7 +116,7 @@ def _degrade(out: Path, entry: Entry, sensor: Path, plan: Plan) -> dict[str, Any
             folder.parent.mkdir(exist_ok=True)
         recalibrated(out / "recordings" / frames, found["tool_from_camera"], ideal)
         told = ["--sensor", str(camera), "--recording", str(ideal), "--out", str(to)]
-        record = run(["degrade", *told], plan.limit_s)
+        record = run(["degrade", *told], limit_s)
     return record
 
 

@@ -1,9 +1,9 @@
 """Scores: shares with Wilson's interval, means, quantiles, areas; and what is judged of a case."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.stats import binomtest, norm
@@ -89,6 +89,11 @@ def share_score(
     return Score(tier, what, counted.value, counted.interval, counted.total, target)
 
 
+def shares_of(tier: str, cases: Sequence[Case], judges: Mapping[str, Sequence[Any]]) -> list[Score]:
+    """The shares of the same cases by several judgements, each with its target if it has one."""
+    return [share_score(tier, what, cases, *judge) for what, judge in judges.items()]
+
+
 def at_least(limit: float) -> Limits:
     """A lower target."""
     return limit, math.inf
@@ -101,10 +106,9 @@ def at_most(limit: float) -> Limits:
 
 def mean_score(tier: str, what: str, values: Sequence[float], target: Limits) -> Score:
     """A mean with normal limits."""
-    if not values:
-        return Score(tier, what, math.nan, (math.nan, math.nan), 0, target)
-    mean, error = float(np.mean(values)), float(np.std(values) / math.sqrt(len(values)))
-    return Score(tier, what, mean, (mean - 1.96 * error, mean + 1.96 * error), len(values), target)
+    mean = float(np.mean(values)) if values else math.nan
+    half = float(norm.ppf(0.975) * np.std(values) / math.sqrt(len(values))) if values else math.nan
+    return Score(tier, what, mean, (mean - half, mean + half), len(values), target)
 
 
 def quantile_score(
@@ -140,11 +144,9 @@ def macro_f1(cases: Sequence[Outcome]) -> float:
     scores = []
     for name in names:
         judged = [one for one in cases if name not in one.truths - one.must_find]
-        true, said = ([name in x for x in xs] for xs in (
-            [one.must_find for one in judged], [one.said.effects for one in judged]
-        ))  # fmt: skip
-        if any(true) or any(said):
-            scores.append(f1_score(true, said))
+        true = [name in one.must_find for one in judged]
+        said = [name in one.said.effects for one in judged]
+        scores += [f1_score(true, said)] if any(true) or any(said) else []
     return float(np.mean(scores)) if scores else math.nan
 
 
@@ -166,18 +168,16 @@ def known(names: Iterable[str]) -> frozenset[str]:
     return frozenset(PART_OF.get(name, name) for name in names)
 
 
-def _sets(one: Outcome) -> Iterator[frozenset[str]]:
-    return map(known, one.said.sets)
-
-
 def right(one: Outcome) -> bool:
     """Whether the true effect is in a set."""
-    return any(one.truth in members for members in _sets(one))
+    return any(one.truth in members for members in map(known, one.said.sets))
 
 
 def wrong(one: Outcome) -> bool:
     """Whether a set of one effect names one that is not there."""
-    return any(len(members) == 1 and not members & one.truths for members in _sets(one))
+    return any(
+        len(members) == 1 and not members & one.truths for members in map(known, one.said.sets)
+    )
 
 
 def named(one: Outcome) -> bool:
@@ -210,6 +210,15 @@ def detected(one: Outcome) -> bool:
     return one.said.detected
 
 
+NEW_NAME = "named though neither added nor seen before"
+
+
+def names_something_new(cases: Iterable[Outcome]) -> Callable[[Outcome], bool]:
+    """Whether an effect is named that is neither true nor named of the plain real images."""
+    own = {name for one in cases if one.role == "plain" for name in one.said.effects}
+    return lambda one: bool(set(one.said.effects) - one.truths - own)
+
+
 def set_sizes(cases: Iterable[Outcome]) -> list[float]:
     """Members of the first set of each case that has one."""
     return [float(len(one.said.sets[0])) for one in cases if one.said.sets]
@@ -223,17 +232,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def scores_table(scores: Iterable[Score]) -> str:
     """All figures as one table."""
-    rows = [
-        (
-            one.tier,
-            one.what,
-            f"{one.value:.2f} [{low:.2f}, {high:.2f}]",
-            one.count,
-            one.wanted,
-            one.met,
-        )
-        for one in scores
-        for low, high in [one.interval]
-        if one.count
-    ]
+    rows = []
+    for one in scores:
+        value = "{:.2f} [{:.2f}, {:.2f}]".format(one.value, *one.interval)
+        rows += [(one.tier, one.what, value, one.count, one.wanted, one.met)] if one.count else []
     return table(("recordings", "figure", "value", "n", "wanted", ""), rows)

@@ -7,6 +7,7 @@ from benchmarks.renewed.real import write_real
 from benchmarks.sealed.answers import Entry, Outcome
 from benchmarks.sealed.command import Check
 from benchmarks.sealed.scores import (
+    NEW_NAME,
     Score,
     area_score,
     at_least,
@@ -17,11 +18,13 @@ from benchmarks.sealed.scores import (
     mean_score,
     named,
     named_first,
+    names_something_new,
     quantile_score,
     right,
     scores_table,
     set_sizes,
     share_score,
+    shares_of,
     unknown,
     wrong,
 )
@@ -74,22 +77,22 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
 
 def _single(cases: Sequence[Outcome], outcomes: Sequence[Outcome]) -> list[Score]:
     """Tier A: one effect that can be found."""
+    said = [one for one in cases if named(one)]
     closed = [
-        one.said.report["gap_mm"]["closed_fraction"] / one.oracle.closed_fraction
-        for one in cases
-        if named(one)
+        one.said.report["gap_mm"]["closed_fraction"] / one.oracle.closed_fraction for one in said
     ]
     fresh = {one.answer["main"]: one for one in outcomes if one.role == "fresh"}
-    again = [(one, fresh[one.name]) for one in cases if one.name in fresh and named(one)]
+    again = [(one, fresh[one.name]) for one in said if one.name in fresh]
+    shrinkage = "shrinkage against the oracle, median"
     return [
-        share_score("A", "named first", cases, named_first, at_least(0.85)),
-        share_score("A", "in the set", cases, right, at_least(0.95)),
+        *shares_of("A", cases, {"named first": (named_first, at_least(0.85))}),
+        *shares_of("A", cases, {"in the set": (right, at_least(0.95))}),
         mean_score("A", "size of the set", set_sizes(cases), at_most(1.5)),
-        share_score("A", "something named", cases, named),
-        quantile_score("A", "shrinkage against the oracle, median", closed, 0.5, at_least(0.9)),
+        *shares_of("A", cases, {"something named": (named,)}),
+        quantile_score("A", shrinkage, closed, 0.5, at_least(0.9)),
         quantile_score("A", "the same, 10th percentile", closed, 0.1, at_least(0.6)),
-        share_score(
-            "A", "closed_ci holds what a fresh session shows", again, _holds, at_least(0.9)
+        *shares_of(
+            "A", again, {"closed_ci holds what a fresh session shows": (_holds, at_least(0.9))}
         ),
     ]
 
@@ -110,30 +113,22 @@ def _several(cases: Sequence[Outcome]) -> list[Score]:
     limits = bootstrap(cases, macro_f1)
     return [
         Score("B", "macro-F1", macro_f1(cases), limits, len(cases), at_least(0.75)),
-        share_score(
-            "B",
-            "in a set, of the effects findable",
-            wanted,
-            lambda pair: any(pair[1] in members for members in pair[0].said.sets),
-        ),
-        share_score("B", "precision", said, lambda pair: pair[1] in pair[0].truths),
+        *shares_of("B", wanted, {"in a set, of the effects findable": (lambda x: _covers(*x),)}),
+        *shares_of("B", said, {"precision": (lambda pair: pair[1] in pair[0].truths,)}),
     ]
 
 
 def _nothing(cases: Sequence[Outcome]) -> list[Score]:
     """Tier C: no effect, or one of 0.2 mm."""
-    nulls = [one for one in cases if not one.truths]
-    nearly = [one for one in cases if one.truths]
+    nulls = {
+        "named though nothing is there": (named, at_most(0.08)),
+        "called unknown": (unknown,),
+        "detected": (detected,),
+    }
+    nearly = {"a false name beside 0.2 mm": (lambda one: bool({*one.said.effects} - one.truths),)}
     return [
-        share_score("C", "named though nothing is there", nulls, named, at_most(0.08)),
-        share_score("C", "called unknown", nulls, unknown),
-        share_score("C", "detected", nulls, detected),
-        share_score(
-            "C",
-            "a false name beside 0.2 mm",
-            nearly,
-            lambda one: bool({*one.said.effects} - one.truths),
-        ),
+        *shares_of("C", [one for one in cases if not one.truths], nulls),
+        *shares_of("C", [one for one in cases if one.truths], nearly),
     ]
 
 
@@ -141,27 +136,29 @@ def _not_in_catalogue(tier: str, find: dict[str, list[Outcome]], target: float) 
     """Tiers D and E: effects that the catalogue does not have."""
     positives, negatives = ([one.said.abstains for one in find[name]] for name in (tier, "A"))
     what = "AUROC of abstention against tier A"
-    return [
-        area_score(tier, what, positives, negatives, at_least(target)),
-        share_score(tier, "called unknown", find[tier], unknown),
-        share_score(tier, "a wrong single name", find[tier], wrong),
-    ]
+    judges = {"called unknown": (unknown,), "a wrong single name": (wrong,)}
+    area = area_score(tier, what, positives, negatives, at_least(target))
+    return [area, *shares_of(tier, find[tier], judges)]
 
 
 def _confounded(cases: Sequence[Outcome], outcomes: Sequence[Outcome]) -> list[Score]:
     """Tier F: designs that confound effects, each with a sound session."""
     cured = {one.answer["main"]: one for one in outcomes if one.role == "cured"}
     must = [one for one in cases if one.must_find]
+
+    def resolved(one: Outcome) -> bool:
+        return one.name in cured and cured[one.name].said.sets == (one.truths,)
+
+    judges = {
+        "sets that a sound session resolves": (resolved,),
+        "advice that names the remedy": (_advises,),
+    }
     open_ = [one for one in must if one.said.sets and len(one.said.sets[0]) > 1]
     return [
-        share_score("F", "truth in the set", must, right, at_least(0.9)),
-        share_score("F", "a wrong single name", cases, wrong, at_most(0.05)),
-        share_score(
-            "F", "sets that a sound session resolves", open_,
-            lambda one: one.name in cured and cured[one.name].said.sets == (one.truths,),
-        ),
-        share_score("F", "advice that names the remedy", open_, _advises),
-    ]  # fmt: skip
+        *shares_of("F", must, {"truth in the set": (right, at_least(0.9))}),
+        *shares_of("F", cases, {"a wrong single name": (wrong, at_most(0.05))}),
+        *shares_of("F", open_, judges),
+    ]
 
 
 def _advises(one: Outcome) -> bool:
@@ -171,12 +168,14 @@ def _advises(one: Outcome) -> bool:
 
 def _missing(cases: Sequence[Outcome]) -> list[Score]:
     """Tier G: columns or files missing."""
-    blind = [one for one in cases if not one.case["judged"]]
+    blind = {
+        "says that the effect cannot be judged": (_says_unavailable,),
+        "a wrong single name": (wrong,),
+    }
     seen = [one for one in cases if one.case["judged"] and one.must_find]
     return [
-        share_score("G", "says that the effect cannot be judged", blind, _says_unavailable),
-        share_score("G", "a wrong single name", blind, wrong),
-        share_score("G", "in the set where it can be judged still", seen, right),
+        *shares_of("G", [one for one in cases if not one.case["judged"]], blind),
+        *shares_of("G", seen, {"in the set where it can be judged still": (right,)}),
     ]
 
 
@@ -189,69 +188,60 @@ def _others(main: dict[str, list[Outcome]], find: dict[str, list[Outcome]]) -> l
     """Tiers H, I and J: few frames, other noise, a base of another form."""
     few = {n: [one for one in find["H"] if one.case["design"]["frames"] == n] for n in (15, 30, 60)}
     nulls = [one for one in main["I"] if not one.truths]
-    kinds = {kind: [one for one in nulls if one.case["noise"] == kind] for kind in _kinds(nulls)}
+    kinds = {one.case["noise"]: [] for one in sorted(nulls, key=lambda one: one.case["noise"])}
+    for one in nulls:
+        kinds[one.case["noise"]].append(one)
     found = [one for one in find["J"] if len(one.truths) > 1]
+    own = {
+        "named though not there": (_falsely_named,),
+        "the base's own term in a set": (lambda one: _covers(one, one.case["base"]),),
+    }
+    beside = {
+        "the effect in a set": (lambda one: _covers(one, *(one.truths - {one.case["base"]})),)
+    }
     return [
         *(share_score("H", f"{n} frames: named", cases, named) for n, cases in few.items()),
         *(share_score("H", f"{n} frames: in the set", cases, right) for n, cases in few.items()),
         share_score("I", "named though nothing is there", nulls, named),
         *(share_score("I", f"the same, {kind}", cases, named) for kind, cases in kinds.items()),
         share_score("I", "in the set", [one for one in find["I"] if one.truths], right),
-        share_score("J", "named though not there", main["J"], lambda one: bool(_false(one))),
-        share_score("J", "the effect in a set", found, lambda one: _covers(one, _beside(one))),
-        share_score(
-            "J",
-            "the base's own term in a set",
-            main["J"],
-            lambda one: _covers(one, one.case["base"]),
-        ),
+        *shares_of("J", main["J"], own),
+        *shares_of("J", found, beside),
     ]
-
-
-def _kinds(cases: Sequence[Outcome]) -> list[str]:
-    return sorted({one.case["noise"] for one in cases})
-
-
-def _beside(one: Outcome) -> str:
-    (name,) = one.truths - {one.case["base"]}
-    return name
 
 
 def _covers(one: Outcome, name: str) -> bool:
     return any(name in members for members in one.said.sets)
 
 
-def _false(one: Outcome) -> set[str]:
-    """Names that are neither true nor what a base of the wrong form is rightly called."""
+def _falsely_named(one: Outcome) -> bool:
+    """Whether a name is neither true nor what a base of the wrong form is rightly called."""
     also = {"distance": "wiggling", "pixel": "fixed_pattern"}.get(one.case["base"], "")
-    return set(one.said.effects) - one.truths - {also}
+    return bool(set(one.said.effects) - one.truths - {also})
 
 
 def _real(cases: Sequence[Outcome]) -> list[Score]:
     """Tier K: what is named of what was done to real images."""
-    own = {name for one in cases if one.role == "plain" for name in one.said.effects}
     done = {role: [one for one in cases if one.role == role] for role in ("term", "added")}
+    judges = {"in a set": right, "named first": named_first}
     return [
         *(
-            share_score("K", f"{role}: {what}", done[role], judge)
-            for role in done
-            for what, judge in (("in a set", right), ("named first", named_first))
+            share_score("K", f"{role}: {what}", some, judge)
+            for role, some in done.items()
+            for what, judge in judges.items()
         ),
-        share_score(
-            "K", "named though neither added nor seen before", done["added"],
-            lambda one: bool(set(one.said.effects) - one.truths - own),
-        ),
-    ]  # fmt: skip
+        *shares_of("K", done["added"], {NEW_NAME: (names_something_new(cases),)}),
+    ]
 
 
 main = Check(
     "Check `tofcorr diagnose` on recordings whose effect is withheld from it.",
-    "tiers",
+    "tier",
     dict.fromkeys(TIERS, "") | {"K": "TOFCORR_REAL_DATA"},
     generate,
     score_all,
     cases=40,
-).group()
+).group
 main.add_command(pairs, "pairs")
 
 if __name__ == "__main__":

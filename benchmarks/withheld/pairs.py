@@ -605,9 +605,9 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
 
 pairs = Check(
     "Check `tofcorr diagnose --sim RECORDING` on pairs of a camera and a simulator.",
-    "kinds",
+    "kind",
     dict.fromkeys(KINDS, ""),
     generate,
     score_all,
     cases=40,
-).group()
+).group

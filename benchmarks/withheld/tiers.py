@@ -101,11 +101,11 @@ MISSING: tuple[tuple[str, tuple[str, ...], bool], ...] = (  # what is withheld; 
     ("every_pixel", ("pose_id", "ambient", "body_temperature_c", "room_temperature_c"), True),
 )
 NOISES: dict[str, dict[str, Any]] = {
-    "heavy tails": {"TAILS": {3.0: 1.0}},
-    "a filter": {"SPATIAL_FILTER": {"mean of 3x3": 0.5, "gauss of 1.2 pixels": 0.5}},
-    "frames mixed": {"TEMPORAL_FILTER": {0.7: 1.0}, "REPEATED": {0.35: 1.0}},
-    "sunlight": {"OUTDOOR": 1.0},
-    "a worse robot": {"ROBOT_MM": Range(2.0, 2.0)},
+    "heavy tails": {"tails": {3.0: 1.0}},
+    "a filter": {"spatial_filter": {"mean of 3x3": 0.5, "gauss of 1.2 pixels": 0.5}},
+    "frames mixed": {"temporal_filter": {0.7: 1.0}, "repeated": {0.35: 1.0}},
+    "sunlight": {"outdoor": 1.0},
+    "a worse robot": {"robot_mm": Range(2.0, 2.0)},
 }
 
 

@@ -20,58 +20,45 @@ from tofcorr.plausibility.examine import examine
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 
-# The ray of a single pixel is the optical axis.
-_ONE_PIXEL = CameraIntrinsics(
-    width=1, height=1, matrix=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-)
-
 
 def drawn_simulator(generator: np.random.Generator) -> dict[str, Any]:
     """Return options of a simulator with small images and everything else drawn."""
-    scale = float(generator.uniform(0.3, 0.6))
-    shots = [{"target": "white", "poses": int(generator.integers(5, 20))}]
-    shots.append({"target": "checkerboard", "poses": int(generator.integers(5, 20))})
-    near = float(generator.uniform(0.4, 0.7))
-    far = float(generator.uniform(1.3, 2.5))
+
+    def uniform(low: float, high: float) -> float:
+        return float(generator.uniform(low, high))
+
+    def normal(scale: float) -> float:
+        return float(generator.normal(0, scale))
+
+    scale = uniform(0.3, 0.6)
+    targets = ("white", "checkerboard")
+    shots = [{"target": name, "poses": int(generator.integers(5, 20))} for name in targets]
+    near, far = uniform(0.4, 0.7), uniform(1.3, 2.5)
+    seed = int(generator.integers(1 << 31))
+    focal, middle = 90.0 * scale, (32.0 * scale, 25.0 * scale)
+    camera = {
+        "width": round(64 * scale),
+        "height": round(50 * scale),
+        "K": [[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]],
+        "distortion": [normal(0.05), 0.0, 0.0, 0.0, 0.0],
+    }
+    shots = shots[: int(generator.integers(1, 3))] if shots[0]["poses"] >= 8 else shots
+    wave = {"order": 3, "share": uniform(0, 0.006), "phase_deg": uniform(0, 360)}
+    delays: dict[str, Any] = {"constant_mm": normal(40), "clock_deviation": normal(0.004)}
+    shapes = ("row_slope_mm", "column_slope_mm", "bowl_mm")
+    delays["pixel"] = {name: normal(6) for name in shapes} | {"irregular_mm": abs(normal(2))}
+    light = {"electrons_at_1m": 10 ** uniform(5.5, 6.5)}
     return {
-        "seed": int(generator.integers(1 << 31)),
-        "camera": {
-            "width": round(64 * scale),
-            "height": round(50 * scale),
-            "K": [
-                [90.0 * scale, 0.0, 32.0 * scale],
-                [0.0, 90.0 * scale, 25.0 * scale],
-                [0.0, 0.0, 1.0],
-            ],
-            "distortion": [float(generator.normal(0, 0.05)), 0.0, 0.0, 0.0, 0.0],
-        },
-        "shots": shots[: int(generator.integers(1, 3))] if shots[0]["poses"] >= 8 else shots,
-        "sensor": {
-            "harmonics": [
-                {
-                    "order": 3,
-                    "share": float(generator.uniform(0, 0.006)),
-                    "phase_deg": float(generator.uniform(0, 360)),
-                }
-            ],
-            "delays": {
-                "constant_mm": float(generator.normal(0, 40)),
-                "clock_deviation": float(generator.normal(0, 0.004)),
-                "pixel": {
-                    "row_slope_mm": float(generator.normal(0, 6)),
-                    "column_slope_mm": float(generator.normal(0, 6)),
-                    "bowl_mm": float(generator.normal(0, 6)),
-                    "irregular_mm": float(abs(generator.normal(0, 2))),
-                },
-            },
-            "light": {"electrons_at_1m": float(10 ** generator.uniform(5.5, 6.5))},
-        },
+        "seed": seed,
+        "camera": camera,
+        "shots": shots,
+        "sensor": {"harmonics": [wave], "delays": delays, "light": light},
         "robot": {
             "distance_m": [near, far],
             "farthest_pixel_m": far + 0.5,
-            "tilt_deg": float(generator.uniform(20, 42)),
-            "repeatability_mm": float(abs(generator.normal(0, 0.5))),
-            "repeatability_mrad": float(abs(generator.normal(0, 0.5))),
+            "tilt_deg": uniform(20, 42),
+            "repeatability_mm": abs(normal(0.5)),
+            "repeatability_mrad": abs(normal(0.5)),
         },
         "hand_eye": {"guess": {"translation_mm": 30.0, "rotation_deg": 5.0}},
     }
@@ -87,22 +74,15 @@ def clean_recordings(draws: int, shipped: int, seed: int, folder: Path) -> list[
         folder: Where they are written.
     """
     found = []
-    with tqdm(desc="clean", unit="recording", disable=None) as bar:
-        for name, path in _recordings(draws, shipped, seed, folder):
-            recording = Recording.open(path)
-            data = Dataset((recording,))
-            data.ray_directions()
-            start = time.process_time()
-            inspection = examine(data, resolved_planes("auto", [recording]))
-            found.append(
-                {
-                    "name": name,
-                    "stopped": bool(inspection.impossible),
-                    "headline": inspection.headline,
-                    "cpu_s": time.process_time() - start,
-                }
-            )
-            bar.update()
+    for name, path in tqdm(_recordings(draws, shipped, seed, folder), "clean", disable=None):
+        recording = Recording.open(path)
+        data = Dataset((recording,))
+        data.ray_directions()
+        start = time.process_time()
+        inspection = examine(data, resolved_planes("auto", [recording]))
+        spent = time.process_time() - start
+        said = {"stopped": bool(inspection.impossible), "headline": inspection.headline}
+        found.append({"name": name, **said, "cpu_s": spent})
     return found
 
 
@@ -130,22 +110,14 @@ def _write_trial(trial: Path, out: Path) -> Path:
     poses = np.loadtxt(trial / "transforms.csv", delimiter=",", usecols=range(16))
     lines = (trial / "measurements.csv").read_text(encoding="utf-8").splitlines()
     readings = [[float(cell) for cell in line.split(",")[1:] if cell.strip()] for line in lines]
-    rows = []
-    for number, pose in enumerate(poses.reshape(-1, 4, 4)):
-        left, _, right = np.linalg.svd(pose[:3, :3])
-        pose[:3, :3] = left @ right  # The file has it to six digits.
-        wall = np.array([0.0, 0.0, -1.0])
-        rows.append(
-            FrameRow(
-                timestamp=float(number),
-                world_from_tool=pose,
-                normal_world=wall,
-                offset=1.0,
-                target="wall",
-            )
-        )
+    poses = poses.reshape(-1, 4, 4)
+    left, _, right = np.linalg.svd(poses[:, :3, :3])
+    poses[:, :3, :3] = left @ right  # The file has it to six digits.
+    wall = {"normal_world": np.array([0.0, 0.0, -1.0]), "offset": 1.0, "target": "wall"}
+    rows = [FrameRow(timestamp=float(k), world_from_tool=p, **wall) for k, p in enumerate(poses)]
     depth = np.array([[[np.median(one) / 1e3]] for one in readings])
-    write_recording(
-        out, camera=_ONE_PIXEL, depth_kind="radial", rows=rows, depth=depth, planes="estimated"
-    )
+    # The ray of a single pixel is the optical axis.
+    axis = CameraIntrinsics(width=1, height=1, matrix=((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0)))
+    how = {"camera": axis, "depth_kind": "radial", "planes": "estimated"}
+    write_recording(out, rows=rows, depth=depth, **how)
     return out

@@ -16,11 +16,9 @@ without a refusal:
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
@@ -28,9 +26,6 @@ import tofcorr
 from tofcorr.diagnosis.findings.impossible import LARGEST_GAP
 from tofcorr.errors import TofcorrError
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.plausibility import examine
-from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.options import TrainingOptions
 
 # An error of the hand-eye counts as wrong above these, millimetres and degrees, and above so many
@@ -43,7 +38,16 @@ GEOMETRY = {
     *("target_registration", "robot_kinematics", "timestamp_offset", "motion"),
     *("lens", "target_shape", "mixed_pixels"),
 }
-_QUICK = {"page": False, "simulate_anew": False, "bootstraps": 19, "most_pixels": 10_000}
+KINDS = (
+    "stopped",
+    "do not use",
+    "headline",
+    "within its errors",
+    "confident and wrong",
+    "traceback",
+)
+"""What may come of a command."""
+WRONG = KINDS[-2:]
 
 Said = dict[str, Any]
 """`headline`, `sentence`, and the numbers that a command's answer is judged by."""
@@ -65,7 +69,7 @@ class Clean:
     def says(self, command: str) -> Said:
         """Return what a command says of it; run once."""
         if command not in self._said:
-            self._said[command] = _ASKED[command](self.folder, self)
+            self._said[command] = COMMANDS[command][0](self.folder, self)
         return self._said[command]
 
     def calibration(self) -> Path:
@@ -78,7 +82,8 @@ class Clean:
 def outcome(command: str, folder: Path, clean: Clean) -> Said:
     """Run a command on a recording and say what came, in the words of the summary's columns."""
     try:
-        said = _ASKED[command](folder, clean)
+        ask, is_wrong = COMMANDS[command]
+        said = ask(folder, clean)
     except TofcorrError as error:
         return {"outcome": "stopped", "sentence": str(error).partition(": ")[2], "exit": 2}
     except Exception as error:  # noqa: BLE001 - a traceback is what is counted here
@@ -88,7 +93,7 @@ def outcome(command: str, folder: Path, clean: Clean) -> Said:
     elif said["headline"]:
         kind = "headline"
     else:
-        kind = "confident and wrong" if _WRONG[command](said, clean) else "within its errors"
+        kind = "confident and wrong" if is_wrong(said, clean) else "within its errors"
     return said | {"outcome": kind, "exit": 0}
 
 
@@ -116,37 +121,29 @@ def _train(folder: Path, clean: Clean) -> Said:
 
 
 def _train_is_wrong(said: Said, clean: Clean) -> bool:
-    return said["off_mm"] > max(WRONG_MM, SIGMAS * said["se_mm"]) or said["off_deg"] > max(
-        WRONG_DEG, SIGMAS * said["se_deg"]
-    )
+    limits = {"mm": WRONG_MM, "deg": WRONG_DEG}
+    return any(said[f"off_{k}"] > max(most, SIGMAS * said[f"se_{k}"]) for k, most in limits.items())
 
 
 def _evaluate(folder: Path, clean: Clean) -> Said:
     result = tofcorr.evaluate(folder, {"models": _models("EA"), "folds": 0})
     (one,) = result.to_mapping()["sets"]
     (protocol,) = one["held_out"].values()
-    error = _number(protocol["error_mm"]["mean_abs_mm"]["EA"]["mean"])
-    headline = " ".join(result.headlines) or None
+    error = protocol["error_mm"]["mean_abs_mm"]["EA"]["mean"]
+    return _held_out(" ".join(result.headlines) or None, math.nan if error is None else error)
+
+
+def _select(folder: Path, clean: Clean) -> Said:
+    result = tofcorr.select(folder, {"models": _models("EA", "E0"), "folds": 3, "by": ["image"]})
+    return _held_out(result.headline, result.decisive.errors[result.winner].mean)
+
+
+def _held_out(headline: str | None, error: float) -> Said:
     return {
         "headline": headline,
         "sentence": headline or f"{error:.2f} mm held out",
         "error_mm": error,
     }
-
-
-def _select(folder: Path, clean: Clean) -> Said:
-    result = tofcorr.select(folder, {"models": _models("EA", "E0"), "folds": 3, "by": ["image"]})
-    error = result.decisive.errors[result.winner].mean
-    return {
-        "headline": result.headline,
-        "sentence": result.headline or f"{error:.2f} mm held out",
-        "error_mm": error,
-    }
-
-
-def _number(value: float | None) -> float:
-    """Return NaN for what a command could not measure."""
-    return math.nan if value is None else value
 
 
 def _models(*names: str) -> list[dict[str, Any]]:
@@ -182,7 +179,8 @@ def _check_is_wrong(said: Said, clean: Clean) -> bool:
 
 
 def _diagnose(folder: Path, clean: Clean) -> Said:
-    found = tofcorr.diagnose(folder, config=_QUICK)
+    quick = {"page": False, "simulate_anew": False, "bootstraps": 19, "most_pixels": 10_000}
+    found = tofcorr.diagnose(folder, config=quick)
     first = found.verdict.partition(". ")[0]
     doubtful = first.startswith(("Doubtful", "Ambiguous"))
     return {
@@ -201,40 +199,12 @@ def _diagnose_is_wrong(said: Said, clean: Clean) -> bool:
     return gap > clean.says("diagnose")["gap_mm"] + WRONG_MM and bool(light)
 
 
-_ASKED: Mapping[str, Callable[[Path, Clean], Said]] = {
-    "train": _train,
-    "evaluate": _evaluate,
-    "select": _select,
-    "check": _check("per_image"),
-    "check recorded": _check("recorded"),
-    "diagnose": _diagnose,
+COMMANDS: Mapping[str, tuple[Callable[[Path, Clean], Said], Callable[[Said, Clean], bool]]] = {
+    "train": (_train, _train_is_wrong),
+    "evaluate": (_evaluate, _error_is_wrong("evaluate")),
+    "select": (_select, _error_is_wrong("select")),
+    "check": (_check("per_image"), _check_is_wrong),
+    "check recorded": (_check("recorded"), _check_is_wrong),
+    "diagnose": (_diagnose, _diagnose_is_wrong),
 }
-_WRONG: Mapping[str, Callable[[Said, Clean], bool]] = {
-    "train": _train_is_wrong,
-    "evaluate": _error_is_wrong("evaluate"),
-    "select": _error_is_wrong("select"),
-    "check": _check_is_wrong,
-    "check recorded": _check_is_wrong,
-    "diagnose": _diagnose_is_wrong,
-}
-COMMANDS = tuple(_ASKED)
-"""The commands that a wrong recording is given to; `check` with unknown and with recorded walls."""
-
-
-# Each recording is looked at once, however many commands get it.
-
-
-@contextmanager
-def looked_at_once() -> Iterator[None]:
-    """Keep what was found, for as long as this lasts."""
-    found: dict[Any, Inspection] = {}
-    look = examine.examine
-
-    def kept(data: Dataset, planes: Any = "known", *, fits: bool = True) -> Inspection:  # noqa: ANN401
-        key = (tuple(one.path for one in data.recordings), planes, fits)
-        if key not in found:
-            found[key] = look(data, planes, fits=fits)
-        return found[key]
-
-    with patch.object(examine, "examine", kept):
-        yield
+"""What asks each command, and judges it; `check` with unknown and with recorded walls."""

@@ -12,9 +12,9 @@ from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Parts:
-    """What a recording folder holds, as arrays; a fault returns a changed copy.
+    """What a recording folder holds, as arrays; to be changed.
 
     Attributes:
         header: Keyword arguments of `write_recording` that are not arrays of frames.
@@ -37,6 +37,16 @@ class Parts:
     depth: np.ndarray
     amplitude: np.ndarray | None = None
     mask: np.ndarray | None = None
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """The rotations of the poses, shape (N, 3, 3), to be written to."""
+        return self.poses[:, :3, :3]
+
+    @property
+    def place(self) -> np.ndarray:
+        """The translations of the poses, shape (N, 3), metres, to be written to."""
+        return self.poses[:, :3, 3]
 
     @classmethod
     def read(cls, folder: Path | str) -> Self:
@@ -77,28 +87,24 @@ class Parts:
 
     def write(self, folder: Path | str) -> Path:
         """Write the recording; nothing may be there yet."""
-        rows = [
-            FrameRow(
-                timestamp=float(self.timestamp[k]),
-                world_from_tool=self.poses[k],
-                normal_world=self.normal[k],
-                offset=float(self.offset[k]),
-                target=str(self.target[k]),
-            )
-            for k in range(len(self.poses))
-        ]
+        columns = zip(
+            self.timestamp.tolist(),
+            self.poses,
+            self.normal,
+            self.offset.tolist(),
+            self.target.tolist(),
+            strict=True,
+        )
+        names = ("timestamp", "world_from_tool", "normal_world", "offset", "target")
         write_recording(
             folder,
-            rows=rows,
+            rows=[FrameRow(**dict(zip(names, row, strict=True))) for row in columns],
             depth=self.depth.astype(np.float32),
             amplitude=None if self.amplitude is None else self.amplitude.astype(np.float32),
             mask=None if self.mask is None else self.mask.astype(np.uint8),
             **self.header,
         )
         return Path(folder)
-
-
-# Rotations drawn and rewritten, in NumPy and SciPy alone.
 
 
 def drawn_rotation(degrees: float, generator: np.random.Generator) -> np.ndarray:
@@ -114,28 +120,3 @@ def drawn_motion(metres: float, degrees: float, generator: np.random.Generator) 
     step = generator.normal(size=3)
     motion[:3, 3] = metres * step / np.linalg.norm(step)
     return motion
-
-
-def with_quaternions(poses: np.ndarray, order: tuple[int, int, int, int]) -> np.ndarray:
-    """Return poses whose quaternions' entries x y z w are taken in another order."""
-    changed = poses.copy()
-    quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, list(order)]
-    changed[:, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    return changed
-
-
-def mirrored(poses: np.ndarray, axis: int) -> np.ndarray:
-    """Return poses as a left-handed program writes them: one axis of the world turned round."""
-    sign = np.ones(3)
-    sign[axis] = -1
-    changed = poses.copy()
-    changed[:, :3, :3] = sign[:, None] * poses[:, :3, :3] * sign
-    changed[:, :3, 3] = sign * poses[:, :3, 3]
-    return changed
-
-
-def scaled(poses: np.ndarray, factor: float) -> np.ndarray:
-    """Return poses with their translations in another unit."""
-    changed = poses.copy()
-    changed[:, :3, 3] *= factor
-    return changed

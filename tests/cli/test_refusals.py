@@ -11,8 +11,8 @@ from pathlib import Path
 
 import click
 import pytest
-from broken_recordings import REFUSALS
-from running import Program, Said
+from broken_recordings import OF_EACH_SORT
+from running import Program
 from small_recordings import write_small_recording
 
 from tofcorr.cli.main import group
@@ -22,59 +22,21 @@ ROOT = Path(__file__).resolve().parents[2]
 CONFIG = str(ROOT / "configs" / "train" / "ea.yaml")
 
 
-def assert_refused_in_one_sentence(answer: Said, message: str) -> None:
-    code, _, told = answer
+@pytest.mark.parametrize("command", ["correct", "train"])
+@pytest.mark.parametrize("message", OF_EACH_SORT)
+def test_a_command_refuses_a_broken_recording(
+    tmp_path: Path, program: Program, message: str, command: str
+) -> None:
+    model = tmp_path.parent / "corrector.ts"  # A recording is looked at before it is.
+    model.write_bytes(b"")
+    recording = write_small_recording(tmp_path / "recording")
+    OF_EACH_SORT[message](recording)
+    own = ("--model", model) if command == "correct" else ("--config", CONFIG)
+    code, _, told = program(
+        command, *own, "--recording", recording, "--out", tmp_path / "new" / "out"
+    )
     assert code == 2
-    assert told.startswith("Error: ")
-    assert told.count("\n") == 1
-    assert re.search(message, told)
-
-
-@pytest.fixture(scope="module")
-def no_module(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file where a corrector is asked for; recordings are looked at before it is."""
-    path = tmp_path_factory.mktemp("model") / "corrector.ts"
-    path.write_bytes(b"")
-    return path
-
-
-# One of each file and sort: all of them are refused by the reader (tests/data), and by `train`.
-# Contents are checked while the frames are corrected, which these commands do not reach here.
-OF_EACH_SORT = (
-    *("no header", "misspelt key", "no YAML", "mirrored hand-eye"),
-    *("semicolons", "a short row", "NaN in a pose"),
-    *("float64 depth", "truncated depth", "more masks"),
-)
-
-
-@pytest.mark.parametrize("name", OF_EACH_SORT)
-def test_correct_refuses_a_broken_recording(
-    tmp_path: Path,
-    no_module: Path,
-    program: Program,
-    name: str,
-) -> None:
-    damage, message = REFUSALS[name]
-    recording = write_small_recording(tmp_path / "recording")
-    damage(recording)
-    arguments = ("--model", no_module, "--recording", recording, "--out", tmp_path / "new" / "out")
-    answer = program("correct", *arguments)
-    assert_refused_in_one_sentence(answer, message)
-    assert list(tmp_path.iterdir()) == [recording]
-
-
-@pytest.mark.parametrize("name", REFUSALS)
-def test_train_refuses_a_broken_recording(
-    tmp_path: Path,
-    program: Program,
-    name: str,
-) -> None:
-    damage, message = REFUSALS[name]
-    recording = write_small_recording(tmp_path / "recording")
-    damage(recording)
-    arguments = ("--config", CONFIG, "--recording", recording, "--out", tmp_path / "new" / "run")
-    answer = program("train", *arguments)
-    assert_refused_in_one_sentence(answer, message)
+    assert re.fullmatch(rf"Error: .*({message}).*\n", told)
     assert list(tmp_path.iterdir()) == [recording]
 
 

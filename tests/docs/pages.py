@@ -1,17 +1,19 @@
 """The documents as tests see them: pages, and the fenced blocks in them."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
+# Their examples run in a package that has them, in `tests/extending`.
+ADDING = [page for page in PAGES if page.name.startswith("add-")]
+
 _FENCE = re.compile(r"^([ \t]*)```(\w+)[^\n]*\n(.*?)^\1```[ \t]*$", re.DOTALL | re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """A fenced block.
 
     Attributes:
@@ -40,8 +42,3 @@ def blocks(page: Path) -> list[Block]:
 def title(page: Path) -> str:
     """Return how a test names a page."""
     return page.relative_to(ROOT).as_posix()
-
-
-def pages_with(*languages: str) -> list[Path]:
-    """Return the pages that hold a block in one of these languages."""
-    return [page for page in PAGES if any(block.language in languages for block in blocks(page))]

@@ -5,14 +5,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from docs.pages import ROOT, blocks, pages_with, title
+from docs.pages import ADDING, PAGES, ROOT, blocks, title
 from docs.shell import run_command, tofcorr_commands
 
 from tofcorr.options import configs_folder
 
-# The examples of how-to/add-*.md run in `extending/test_pages.py`, in a package that has them.
-PAGES = [page for page in pages_with("python") if not page.name.startswith("add-")]
-
+RUNNING = [page for page in PAGES if page not in ADDING and "```python" in page.read_text("utf-8")]
 
 # Options of a diagnosis that takes a third of the time, on a third of the pixels.
 QUICK = {"bootstraps": 19, "most_pixels": 20_000}
@@ -41,7 +39,7 @@ def first_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.usefixtures("quick_diagnosis")
-@pytest.mark.parametrize("page", PAGES, ids=title)
+@pytest.mark.parametrize("page", RUNNING, ids=title)
 def test_blocks_of_page_run(
     page: Path, first_page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

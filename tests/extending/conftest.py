@@ -1,19 +1,198 @@
-"""A copy of the package with two effects, two terms, an importer and a format more."""
+"""A copy of the package with more files and more lines, as contributors would add them."""
 
+import copy
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import diagnosed_recordings
 import pytest
-from extended_package import ExtendedPackage
-from extending import page_examples, root_term, stripes
-from extending.extension import Extension
-from extending.page_examples import PAGES, addition_of, use_of
+import simulated_walls
+from docs.pages import ADDING, blocks
+
+import tofcorr
+from tofcorr.options import dump_yaml
+
+# The text in each registry in front of which the line goes.
+END_OF_LIST = {
+    "error_terms": ")\n\n\ndef _class",
+    "simulation": ")\n\n\ndef _effect",
+    "importing": '}\n"""The line of each',
+    "correction": ")\n\nFORMATS",
+    "plausibility": ')\n"""Checks that look at values',
+}
+
+RUN_PIECES = """
+import contextlib, io, json, os, sys, traceback
+from pathlib import Path
+
+outcomes = {}
+for name, code in json.load(sys.stdin).items():
+    Path(name).mkdir()
+    printed, error = io.StringIO(), ""
+    with contextlib.chdir(name), contextlib.redirect_stdout(printed):
+        try:
+            exec(compile(code, name, "exec"), {"__name__": name})
+        except BaseException:
+            error = traceback.format_exc()
+    outcomes[name] = printed.getvalue(), error
+print(json.dumps(outcomes))
+"""
+
+# An effect that the diagnosis can tell from all base errors, unlike that of the page.
+STRIPES = '''# tofcorr/simulation/effects/stripes.py
+"""A pattern of stripes over the image."""
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+
+class StripesEffect(LinearDelay):
+    """Stripes of six periods from the left to the right edge."""
+
+    name = "stripes"
+    summary = "stripes over the image"
+    source = "invented for a test"
+    remedy = "a white wall"
+
+    @classmethod
+    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
+        return (Coefficient("height_m", "m", 0.01),)
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        return torch.cos(6 * torch.pi * inputs.columns)[:, None]
+'''
+EFFECT_LINE = '# tofcorr/simulation/effects/registry.py\n    "stripes:StripesEffect",'
+SIMULATOR = copy.deepcopy(diagnosed_recordings.PLAIN) | {
+    "effects": [{"name": "stripes", "height_m": 0.006}]
+}
+DIAGNOSIS = {"catalogue": ["stripes", "incidence_angle"], "bootstraps": 19}
+DIAGNOSIS |= {"simulate_anew": False, "page": False}
+PIECES = {
+    "whose": "from pathlib import Path; import tofcorr; print(Path(tofcorr.__file__).parents[1])",
+    "import_help": (
+        "from tofcorr.cli.main import group; group(['import', '--help'], standalone_mode=False)"
+    ),
+    "ros_command": """
+from pathlib import Path
+
+import tofcorr
+from tofcorr.cli.main import group
+from tofcorr.correction.state import save_calibration
+
+camera = tofcorr.CameraIntrinsics(
+    width=7, height=5, matrix=((9.0, 0.0, 3.0), (0.0, 9.0, 2.0), (0.0, 0.0, 1.0))
+)
+module = tofcorr.DepthCorrection(camera, [{"kind": "distance_polynomial", "degree": 2}])
+module.export("ros_command", "module.sh")
+Path("run").mkdir()
+save_calibration("run/state.pt", module.to_state())
+words = "export --run run --format ros_command --out command.sh"
+group(words.split(), standalone_mode=False)
+group(["export", "--help"], standalone_mode=False)
+""",
+    "term": f"""
+import json, torch, tofcorr
+from tofcorr import DepthCorrection
+
+wall = tofcorr.simulate({simulated_walls.wall_options(1).model_dump(mode="json")!r}, "wall")
+terms = [{{"kind": "illumination_baseline"}}, {{"kind": "pixel_polynomial"}}]
+options = {{"name": "B", "model": {{"terms": terms}}, "advice": 0}}
+report = tofcorr.train(wall, options, out="run").report
+module = DepthCorrection.load("run")
+other = DepthCorrection(wall.camera, terms)
+other.load_state_dict(module.state_dict())
+depth = torch.tensor(wall.depth[:2])
+corrected, _ = torch.jit.load("run/corrector.ts")(depth, depth)
+print(json.dumps({{
+    "errors": report["error_mm"],
+    "symbols": module.error_model.symbols(),
+    "same": torch.equal(other(depth), module(depth)),
+    "apart": float((module(depth) - corrected).nan_to_num().abs().max()),
+}}))
+""",
+    "stripes": f"""
+from pathlib import Path
+from tofcorr.cli.main import group
+
+Path("sim.yaml").write_text({dump_yaml(SIMULATOR)!r}, encoding="utf-8")
+Path("diagnose.yaml").write_text({dump_yaml(DIAGNOSIS)!r}, encoding="utf-8")
+group(["simulate", "--config", "sim.yaml", "--out", "recording"], standalone_mode=False)
+group(["diagnose", "--recording", "recording", "--config", "diagnose.yaml", "--out", "report"],
+      standalone_mode=False)
+""",
+}
+
+
+@dataclass(frozen=True)
+class Extension:
+    """The extended package, after every piece of code was run in it.
+
+    Attributes:
+        root: The folder that holds the copied package, and a folder for each piece.
+        outcomes: What each piece printed, and the traceback of its error, if any.
+    """
+
+    root: Path
+    outcomes: Mapping[str, tuple[str, str]]
+
+    def printed_by(self, piece: str) -> str:
+        """Return what a piece printed; it must have run without an error."""
+        printed, error = self.outcomes[piece]
+        assert not error, error
+        return printed
+
+    def folder_of(self, piece: str) -> Path:
+        """Return the folder that a piece worked in; it must have run without an error."""
+        self.printed_by(piece)
+        return self.root / piece
+
+
+def add(package: Path, file: str, registration: str) -> None:
+    """Add a file and a line of a registry, each named by its first line, to a copied package."""
+    new, registry = (
+        text.splitlines()[0].removeprefix("# tofcorr/") for text in (file, registration)
+    )
+    assert not (package / new).exists()
+    (package / new).write_text(file, encoding="utf-8")
+    before, found = END_OF_LIST[registry.partition("/")[0]], (package / registry).read_text("utf-8")
+    assert found.count(before) == 1
+    _, line = registration.splitlines()
+    (package / registry).write_text(found.replace(before, f"{line}\n{before}"), encoding="utf-8")
 
 
 @pytest.fixture(scope="session")
 def extension(tmp_path_factory: pytest.TempPathFactory) -> Extension:
     """The copy, and what ran in it: one process for all, which loads torch once."""
-    package = ExtendedPackage.copy(tmp_path_factory.mktemp("extended"))
-    for addition in (*map(addition_of, PAGES), stripes.STRIPES, root_term.ROOT_TERM):
-        package.add(addition)
-    pieces = {page.stem: use_of(page) for page in PAGES}
-    pieces |= {"import_help": page_examples.IMPORT_HELP, "ros_command": page_examples.EXPORT_RUN}
-    pieces |= {"whose": page_examples.WHOSE, "stripes": stripes.RUN, "root": root_term.RUN}
-    return Extension(package.root, package.run(pieces))
+    root, pieces = tmp_path_factory.mktemp("extended"), dict(PIECES)
+    # Compiled files too: copying keeps their times, so they hold. Another worker may be writing
+    # one, which has such a name until it is whole.
+    unfinished = shutil.ignore_patterns("*.pyc.*")
+    shutil.copytree(Path(tofcorr.__file__).parent, root / "tofcorr", ignore=unfinished)
+    add(root / "tofcorr", STRIPES, EFFECT_LINE)
+    for page in ADDING:
+        shown = [block.text for block in blocks(page) if block.language == "python"]
+        own = [text for text in shown if text.startswith("# tofcorr/")]
+        add(root / "tofcorr", *own)
+        pieces[page.stem] = "\n".join(text for text in shown if text not in own)
+        assert pieces[page.stem], "the page shows no use"
+    done = subprocess.run(
+        [sys.executable, "-c", RUN_PIECES],
+        input=json.dumps(pieces),
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=root,
+        env=os.environ | {"PYTHONPATH": str(root)},
+    )
+    assert done.returncode == 0, done.stderr
+    return Extension(root, json.loads(done.stdout))

@@ -26,8 +26,8 @@ def test_the_noise_that_is_stated_is_the_noise_that_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Within a tenth, for most pixels: the darkest have a noise of their own law."""
-    monkeypatch.setattr(ranges, "SPATIAL_FILTER", {"gauss of 1.2 pixels": 1.0})
-    monkeypatch.setattr(ranges, "TAILS", {np.inf: 1.0})
+    monkeypatch.setitem(ranges.RANGES, "spatial_filter", {"gauss of 1.2 pixels": 1.0})
+    monkeypatch.setitem(ranges.RANGES, "tails", {np.inf: 1.0})
     for number in range(3):
         case = levels.write_case(5, "nothing", number, tmp_path / str(number))
         data = read(tmp_path / str(number))

@@ -98,7 +98,7 @@ def test_noise_dropouts_and_amplitude_are_as_the_truth_says(index: int, tmp_path
 def test_held_out_frames_are_ideal_and_an_oracle_leaves_little_of_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(ranges.PLAIN, "FRAMES", {60: 1.0})
+    monkeypatch.setitem(ranges.PLAIN, "frames", {60: 1.0})
     answer, camera, _, folder = a_pair(tmp_path, "ideal")
     held = read(tmp_path / "recordings" / answer["held_out"])
     true, sigma = np.load(folder / "held_out.npy"), np.load(folder / "held_out_sigma.npy")

@@ -100,8 +100,7 @@ def test_runs_are_recorded_resumed_and_scored_whether_they_succeed_or_fail(
     for folder in ("diagnoses", "runs", "configs"):
         (tmp_path / folder).mkdir()
     assert len(running.waiting(tmp_path)) == 3
-    plan = running.Plan(config="page: false\n")
-    codes = [running._run_one(tmp_path, entry, plan) for entry in entries]
+    codes = [running.run_one(tmp_path, entry, config="page: false\n") for entry in entries]
     assert codes == [1, 0, 0]
     assert running.waiting(tmp_path) == []
     outcomes = list(open_answers(tmp_path))
