@@ -17,13 +17,13 @@ from tofcorr.observables.read import observe
 from tofcorr.sensor.parts import section_of
 from tofcorr.sensor.sensor_file import (
     ErrorSection,
-    SensorCamera,
     SensorFile,
     dropout_section,
     light_section,
     validity_of,
     write_sensor,
 )
+from tofcorr.simulation.options import CameraOptions
 from tofcorr.training.result import calibration_state
 from tofcorr.training.run import train
 
@@ -76,7 +76,7 @@ def main(recording_path: Path, out: Path) -> None:
             "made by scripts/kinect_sensor.py.",
             *NOT_KNOWN,
         ),
-        camera=SensorCamera.of(state.camera),
+        camera=CameraOptions.of(state.camera),
         depth_kind=state.depth_kind,
         modulation_frequency_hz=recording.modulation_frequency,
         error=section_of(state.model().error, ErrorSection(reads="measured_distance", terms=terms)),

@@ -15,7 +15,6 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile, read_sensor
@@ -82,22 +81,23 @@ def degrade(
             `out` exists.
         FrameError: The sensor needs amplitudes and nothing says them.
     """
-    if isinstance(sensor, SensorModel):
-        model = sensor
-    else:
-        model = SensorModel(sensor if isinstance(sensor, SensorFile) else read_sensor(sensor))
+    if not isinstance(sensor, SensorModel):
+        sensor = SensorModel(sensor if isinstance(sensor, SensorFile) else read_sensor(sensor))
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, check_contents=False)
-    _refuse_another_camera(recording, model.sensor)
-    _say_another_hand_eye(recording, model.sensor)
-    slant = ray_directions(recording.camera)[..., 2].float()
-    wanted, own = (
-        slant if kind == "z" else torch.ones_like(slant)
-        for kind in (model.sensor.depth_kind, recording.depth_kind)
+    file, model = sensor.sensor, sensor
+    _refuse_another_camera(recording, file)
+    saturation = file.dropouts and file.dropouts.saturation_amplitude
+    header = replace(
+        recording,
+        depth_kind=file.depth_kind,
+        modulation_frequency=file.modulation_frequency_hz or recording.modulation_frequency,
+        saturation_amplitude=saturation or recording.saturation_amplitude,
     )
+    slant = ray_directions(recording.camera)[..., 2].float()
+    kinds = {"z": slant, "radial": torch.ones_like(slant)}
     source = "depth" if recording.true_depth is None else "true_depth"
     counts = np.zeros(3, dtype=np.int64)
-    header = _header(recording, model.sensor)
     with RecordingWriter.like(out, header) as writer, torch.inference_mode():
         shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
         step = max(1, chunk_pixels // slant.numel())
@@ -108,14 +108,17 @@ def degrade(
             )
             assert depth is not None
             for place, number in enumerate(chunk.tolist()):
-                true_depth = torch.from_numpy(depth[place]) * (wanted / own)
+                true_depth = torch.from_numpy(depth[place])
+                true_depth = true_depth * (kinds[file.depth_kind] / kinds[recording.depth_kind])
                 lit = None if light is None else torch.from_numpy(light[place])
                 if amplitude_is == "reflectivity" and lit is not None:
                     _refuse_no_share(recording, lit, number)
+                # A seed of one frame, independent of those of all other frames and seeds.
+                own = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
                 measured = model(
                     true_depth,
                     **{amplitude_is: lit},
-                    generator=torch.Generator().manual_seed(_frame_seed(seed, number)),
+                    generator=torch.Generator().manual_seed(int(own >> 1)),
                     frame_shift=shift[number],
                     **conditions_of_frames(recording, number),
                 )
@@ -132,13 +135,11 @@ def degrade(
     valid_share, covered_share = (counts[1:] / max(counts[0], 1)).tolist()
     # Then most of the result rests on errors at the edge of a range, or the unit is wrong.
     if counts[0] and covered_share < 0.5:
-        near, far = model.sensor.validity.radial_distance_m
-        warnings.warn(
+        near, far = file.validity.radial_distance_m
+        _warn(
             f"{recording.path}: {100 * covered_share:.0f} % of its pixels are at distances that "
             f"the sensor was measured at, {near:.2g} to {far:.2g} m; beyond, the error at the "
-            "range's edge was used. Is the depth in metres?",
-            UserWarning,
-            stacklevel=2,
+            "range's edge was used. Is the depth in metres?"
         )
     return Degraded(
         recording=Recording.open(out, check_contents=False),
@@ -161,47 +162,37 @@ def conditions_of_frames(
     return known
 
 
-def _header(recording: Recording, sensor: SensorFile) -> Recording:
-    """Return the recording with what the sensor states in its header."""
-    level = None if sensor.dropouts is None else sensor.dropouts.saturation_amplitude
-    return replace(
-        recording,
-        depth_kind=sensor.depth_kind,
-        modulation_frequency=sensor.modulation_frequency_hz or recording.modulation_frequency,
-        saturation_amplitude=level or recording.saturation_amplitude,
-    )
-
-
-def _say_another_hand_eye(recording: Recording, sensor: SensorFile) -> None:
-    given, found = recording.tool_from_camera, sensor.tool_from_camera
-    if found is None or np.allclose(given, np.eye(4)):  # The identity: no robot, or unknown.
-        return
-    shift, turn = se3.apart(torch.as_tensor(given), torch.tensor(found, dtype=torch.float64))
-    if max(shift, turn) > _SAME_MOUNT:
-        warnings.warn(
-            f"{recording.path}: its tool_from_camera is {1e3 * shift:.1f} mm and "
-            f"{np.degrees(turn):.2f} degrees from that of the sensor. Its errors go with its own: "
-            "if these frames stand for the sensor's robot, render them with the tool_from_camera "
-            "of sensor.yaml.",
-            UserWarning,
-            stacklevel=3,
-        )
-
-
 def _refuse_another_camera(recording: Recording, sensor: SensorFile) -> None:
+    """Refuse frames of another size; warn of those of another lens or hand-eye transform."""
     camera, own = recording.camera, sensor.intrinsics()
     if (camera.width, camera.height) != (own.width, own.height):
         raise CalibrationDataError(
             f"{recording.path}: frames are {camera.width}x{camera.height} pixels, the sensor has "
             f"{own.width}x{own.height}. Render with the intrinsics of the sensor."
         )
-    if np.abs(_lens(camera) - _lens(own)).max() > _SAME_LENS:
-        warnings.warn(
+    lenses = [
+        np.append(each.matrix, np.pad(each.distortion, (0, 14))[:14]) for each in (camera, own)
+    ]
+    if np.abs(lenses[0] - lenses[1]).max() > _SAME_LENS:
+        _warn(
             f"{recording.path}: its intrinsics are not those of the sensor. Each pixel gets the "
-            "sensor's error for that pixel; render with the sensor's intrinsics to avoid this.",
-            UserWarning,
-            stacklevel=3,
+            "sensor's error for that pixel; render with the sensor's intrinsics to avoid this."
         )
+    given, found = recording.tool_from_camera, sensor.tool_from_camera
+    if found is None or np.allclose(given, np.eye(4)):  # The identity: no robot, or unknown.
+        return
+    shift, turn = se3.apart(torch.as_tensor(given), torch.tensor(found, dtype=torch.float64))
+    if max(shift, turn) > _SAME_MOUNT:
+        _warn(
+            f"{recording.path}: its tool_from_camera is {1e3 * shift:.1f} mm and "
+            f"{np.degrees(turn):.2f} degrees from that of the sensor. Its errors go with its own: "
+            "if these frames stand for the sensor's robot, render them with the tool_from_camera "
+            "of sensor.yaml."
+        )
+
+
+def _warn(sentence: str) -> None:
+    warnings.warn(sentence, UserWarning, stacklevel=3)
 
 
 def _refuse_no_share(recording: Recording, light: Tensor, number: int) -> None:
@@ -212,14 +203,3 @@ def _refuse_no_share(recording: Recording, light: Tensor, number: int) -> None:
             f"a little more in highlights, got {most:.6g}; divide by what white has (255 in images "
             "of 8 bits)."
         )
-
-
-def _lens(camera: CameraIntrinsics) -> np.ndarray:
-    """Return K and distortion as one vector, distortion filled with zeros to 14."""
-    distortion = [*camera.distortion, *[0.0] * (14 - len(camera.distortion))]
-    return np.concatenate([np.array(camera.matrix).reshape(-1), np.array(distortion)])
-
-
-def _frame_seed(seed: int, frame: int) -> int:
-    """Return a seed of one frame; independent of those of all other frames and seeds."""
-    return int(np.random.SeedSequence([seed, frame]).generate_state(1, np.uint64)[0] >> 1)

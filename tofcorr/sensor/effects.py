@@ -37,19 +37,10 @@ class ImageEffect(nn.Module):
     def __init__(self, effect: CatalogueEffect) -> None:
         super().__init__()
         self.effect = effect
-        acts = [
-            group
-            for group in Group
-            for stage in group.value
-            if getattr(type(effect), f"on_{stage}") is not getattr(Effect, f"on_{stage}")
-        ]
+        stages = [(group, f"on_{stage}") for group in Group for stage in group.value]
+        acts = [g for g, hook in stages if getattr(type(effect), hook) is not getattr(Effect, hook)]
         self.group = acts[-1] if acts else Group.DELAY
         self.coefficients = nn.Parameter(effect.coefficients.clone())
-
-    def unknown(self, known: Mapping[str, Tensor]) -> list[str]:
-        """Return the columns of the conditions that the effect needs and the caller lacks."""
-        wanted = [need.condition for need in self.effect.needs if need.condition]
-        return [condition(name).column for name in wanted if name not in known]
 
     def shift(self, inputs: EffectInputs) -> Tensor:
         """Return the change of the measured distance in the chosen pixels, (M,), metres."""
@@ -112,13 +103,15 @@ class ImageEffects(nn.Module):
 
     def usable(self, known: Mapping[str, Tensor]) -> tuple[list[ImageEffect], list[str]]:
         """Return the effects whose conditions are known, and a sentence about each other one."""
-        lacking = [(each, each.unknown(known)) for each in self._all()]
-        missing = [
-            f"{each.effect.name}: {', '.join(columns)} was not given."
-            for each, columns in lacking
-            if columns
-        ]
-        return [each for each, columns in lacking if not columns], missing
+        usable, missing = [], []
+        for each in self._all():
+            needed = [need.condition for need in each.effect.needs if need.condition]
+            columns = [condition(name).column for name in needed if name not in known]
+            if columns:
+                missing.append(f"{each.effect.name}: {', '.join(columns)} was not given.")
+            else:
+                usable.append(each)
+        return usable, missing
 
     def frame_shift(self, known: Mapping[str, Tensor], count: int, like: Tensor) -> Tensor:
         """Return the shift that effects of whole frames cause, shape (B,), metres, float64.

@@ -11,7 +11,7 @@ from tofcorr.error_terms.base import DescribedModule
 from tofcorr.error_terms.condition_terms import Condition, with_means
 from tofcorr.sensor.effects import Group, ImageEffects
 from tofcorr.sensor.parts import BaseError, SensorNoise, section_of
-from tofcorr.sensor.scene import Eye, Scene, SceneFrames, conditions_of
+from tofcorr.sensor.scene import Eye, SceneFrames, conditions_of
 from tofcorr.sensor.sensor_file import SensorFile, read_sensor, write_sensor
 
 
@@ -167,16 +167,16 @@ class SensorModel(DescribedModule):
                 nothing says it.
         """
         known = conditions_of(conditions, true_depth.shape[:-2], self.eye.rays.device, self._ranges)
-        scene = Scene(true_depth, amplitude, reflectivity, known)
-        frames = self.eye(scene, needs_amplitude=self._needs_amplitude())
+        parts = (self.base, self.effects, self.noise, self.dropouts)
+        needed = any(part.needs_amplitude for part in parts if part is not None)
+        frames = self.eye(true_depth, amplitude, reflectivity, known, needs_amplitude=needed)
         radial = self._expected(frames, frame_shift)
-        valid = frames.seen
         reported = frames.amplitude
         if noise and self.noise is not None:
             sigma = self.noise.sigma(frames.distance, frames.amplitude)
             radial = radial + sigma * self.noise.draw(radial, generator)
         # Errors far beyond what was measured can exceed a distance: such a pixel has none.
-        valid = valid & (radial > 0)
+        valid = frames.seen & (radial > 0)
         saturated = torch.zeros_like(valid)
         if self.dropouts is not None:
             light = frames.amplitude.detach()
@@ -192,9 +192,10 @@ class SensorModel(DescribedModule):
         depth = torch.where(valid, radial / self.eye.radial_of_depth, torch.nan)
         valid = valid & ~saturated
         shape, dtype = true_depth.shape, true_depth.dtype
+        lit = amplitude is not None or self.eye.light is not None
         return Measurement(
             depth.reshape(shape).to(dtype),
-            reported.reshape(shape).to(dtype) if self.eye.is_lit(scene) else None,
+            reported.reshape(shape).to(dtype) if lit else None,
             valid.reshape(shape),
         )
 
@@ -229,10 +230,6 @@ class SensorModel(DescribedModule):
         error = error + self.effects.shift(Group.DELAY, at)
         at = at.moved(error) if one_by_one else frames
         return frames.distance + lens + error + self.effects.shift(Group.SIGNAL, at)
-
-    def _needs_amplitude(self) -> bool:
-        parts = (self.base, self.effects, self.noise, self.dropouts)
-        return any(part.needs_amplitude for part in parts if part is not None)
 
     def _say(self, sentences: list[str]) -> None:
         """Warn of effects that are left out, once of each."""

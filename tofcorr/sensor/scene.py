@@ -1,9 +1,8 @@
 """A rendered scene as a sensor sees it: distances along the rays, surfaces, and returned light."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +12,7 @@ from tofcorr.error_terms.condition_terms import Condition, in_si_units
 from tofcorr.errors import ConfigError, FrameError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.sensor.sensor_file import LightSection, SensorFile
+from tofcorr.sensor.sensor_file import SensorFile
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 
 # Conditions count up to this share of their range beyond it (no unit). Derived: a parabola that
@@ -22,22 +21,6 @@ _BEYOND = 0.125
 # Least cosine between ray and normal (89.4 degrees; no unit). Chosen: keeps light and slant finite
 # at the outlines of objects.
 _LEAST_COSINE = 0.01
-
-
-class Scene(NamedTuple):
-    """What a simulator states of frames.
-
-    Attributes:
-        true_depth: Of the camera's kind, shape (..., H, W), metres.
-        amplitude: The camera's units, the same shape; None: from the reflectivity.
-        reflectivity: 0 to 1, the same shape; None: the sensor's usual one.
-        conditions: In SI units by name, each (B,).
-    """
-
-    true_depth: Tensor
-    amplitude: Tensor | None
-    reflectivity: Tensor | None
-    conditions: Mapping[str, Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,46 +106,59 @@ class Eye(nn.Module):
         scale = 1.0 / slant if sensor.depth_kind == "z" else torch.ones_like(slant)
         self.register_buffer("radial_of_depth", scale)
 
-    def is_lit(self, scene: Scene) -> bool:
-        """Whether the amplitude of a scene is known."""
-        return scene.amplitude is not None or self.light is not None
-
-    def forward(self, scene: Scene, *, needs_amplitude: bool) -> SceneFrames:
+    def forward(
+        self,
+        true_depth: Tensor,
+        amplitude: Tensor | None,
+        reflectivity: Tensor | None,
+        conditions: Mapping[str, Tensor],
+        *,
+        needs_amplitude: bool,
+    ) -> SceneFrames:
         """Return the frames of a scene, B of them, in the dtype of the rays.
+
+        Args:
+            true_depth: Of the camera's kind, shape (..., H, W), metres.
+            amplitude: The camera's units, the same shape; None: from the reflectivity.
+            reflectivity: 0 to 1, the same shape; None: the sensor's usual one.
+            conditions: In SI units by name, each (B,).
+            needs_amplitude: Whether what is computed depends on it.
 
         Raises:
             FrameError: The frames are of another size or dtype, or an amplitude is needed and
                 nothing says it.
         """
-        depth = scene.true_depth
-        for name in ("true_depth", "amplitude", "reflectivity"):
-            self._check(name, getattr(scene, name), depth)
-        if not self.is_lit(scene) and (needs_amplitude or scene.reflectivity is not None):
+        given = {"true_depth": true_depth, "amplitude": amplitude, "reflectivity": reflectivity}
+        for name, image in given.items():
+            self._check(name, image, true_depth)
+        if amplitude is self.light is None and (needs_amplitude or reflectivity is not None):
             raise FrameError(
                 "amplitude: what this sensor measures depends on the amplitude, and its file has "
                 "no section 'light' that gives it from a reflectivity; pass amplitudes in the "
                 "camera's units."
             )
-        depth = depth.reshape(-1, *depth.shape[-2:]).to(self.rays.dtype)
+        depth, lit, shares = (
+            None if image is None else image.reshape(-1, *image.shape[-2:]).to(self.rays.dtype)
+            for image in given.values()
+        )
+        assert depth is not None
         seen = torch.isfinite(depth) & (depth > 0)
         distance = torch.where(seen, depth * self.radial_of_depth, 1.0)
         surface = cache(lambda: surfaces(distance, seen, self.rays))
+        if lit is None and self.light is not None:
+            shares = self.light.usual_reflectivity if shares is None else shares
+            # Lambertian surfaces lit from beside the camera.
+            lit = self.light.amplitude_at_1m * surface()[0] * shares / distance.square()
+            lit = lit * self.rays[..., 2] ** self.light.vignetting_exponent
         amplitude = torch.zeros_like(depth)
-        if scene.amplitude is not None:
-            amplitude = scene.amplitude.reshape(depth.shape).to(depth.dtype)
-            amplitude = torch.where(seen & torch.isfinite(amplitude), amplitude, 0.0)
-        elif self.light is not None:
-            shares = torch.full_like(depth, self.light.usual_reflectivity)
-            if scene.reflectivity is not None:
-                shares = scene.reflectivity.reshape(depth.shape).to(depth.dtype)
-            lit = amplitude_of(self.light, shares, distance, surface()[0], self.rays)
-            amplitude = torch.where(seen, lit, 0.0)
+        if lit is not None:
+            amplitude = torch.where(seen & torch.isfinite(lit), lit, 0.0)
         return SceneFrames(
             rays=self.rays,
             distance=distance,
             amplitude=amplitude,
             seen=seen,
-            conditions=scene.conditions,
+            conditions=conditions,
             surface=surface,
         )
 
@@ -229,33 +225,6 @@ def surfaces(distance: Tensor, seen: Tensor, rays: Tensor) -> tuple[Tensor, Tens
     return cosine, -normal / length[..., None]
 
 
-def amplitude_of(
-    section: LightSection,
-    reflectivity: Tensor,
-    radial_distance: Tensor,
-    incidence_cosine: Tensor,
-    rays: Tensor,
-) -> Tensor:
-    r"""Return the amplitude of Lambertian surfaces lit from beside the camera.
-
-    .. math:: A = A_1 \rho \cos\theta \cos^n\alpha / d^2
-
-    with the angle of incidence theta and the angle alpha of the ray to the optical axis.
-
-    Args:
-        section: A_1 and n.
-        reflectivity: rho, shape (..., H, W), 0 to 1.
-        radial_distance: d, shape (..., H, W), metres.
-        incidence_cosine: Shape (..., H, W).
-        rays: Unit rays, shape (H, W, 3).
-
-    Returns:
-        Shape (..., H, W), the camera's units.
-    """
-    lit = section.amplitude_at_1m * incidence_cosine * reflectivity / radial_distance.square()
-    return lit * rays[..., 2] ** section.vignetting_exponent
-
-
 def conditions_of(
     given: Mapping[str, Condition],
     leading: Sequence[int],
@@ -289,15 +258,10 @@ def conditions_of(
 def _facts(conditions: Mapping[str, Tensor], count: int, like: Tensor) -> FrameFacts:
     """Return the conditions of frames; poses and planes, which images lack, stand in front."""
     eye = torch.eye(4, dtype=like.dtype, device=like.device)
-    known = {
-        each.name: conditions[each.name].to(like.dtype)
-        for each in fields(FrameFacts)
-        if each.name in conditions
-    }
-    known.setdefault("timestamp", like.new_zeros(count))
+    known = {name: values.to(like.dtype) for name, values in conditions.items()}
     return FrameFacts(
         world_from_tool=eye.expand(count, 4, 4),
         normal_world=-eye[2, :3].expand(count, 3),
         offset=like.new_ones(count),
-        **known,
+        **{"timestamp": like.new_zeros(count)} | known,
     )

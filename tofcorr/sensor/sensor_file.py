@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, field_validator
+from pydantic import BeforeValidator, Field, field_validator
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.data.recording import CameraSection, DepthKind, Number, PositiveNumber, RigidTransform
+from tofcorr.data.recording import DepthKind, Number, PositiveNumber, RigidTransform
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation.noise import NoiseModel
@@ -15,11 +15,17 @@ from tofcorr.files import staged_file
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.observables.dropouts import DropoutModel
 from tofcorr.observables.read import Observed
-from tofcorr.options import Options, dump_yaml, resolve_options, shipped_names
+from tofcorr.options import (
+    NonNegativeNumber,
+    Options,
+    Range,
+    dump_yaml,
+    resolve_options,
+    shipped_names,
+)
+from tofcorr.simulation.options import CameraOptions
 
 FILE_NAME = "sensor.yaml"
-
-Range = tuple[Number, Number]
 
 # Reflectivity of white paper and paint (no unit). Chosen: those of real scenes are rarely measured.
 _WHITE = 0.8
@@ -31,19 +37,6 @@ _HEADING = """\
 # effects: as in a simulator's YAML. noise, dropouts: of one pixel in one frame.
 # Lengths are metres; amplitudes are in the camera's own linear units.
 """
-
-
-class SensorCamera(CameraSection):
-    """Image size, pinhole matrix and distortion; keys as in `recording.yaml`."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    @classmethod
-    def of(cls, camera: CameraIntrinsics) -> "SensorCamera":
-        """Return the section of a camera."""
-        return cls(
-            width=camera.width, height=camera.height, K=camera.matrix, distortion=camera.distortion
-        )
 
 
 class ErrorSection(Options):
@@ -70,6 +63,9 @@ class ConditionRange(Options):
     low: Number
     high: Number
     mean: Number
+
+
+_PARTS = tuple(ConditionRange.model_fields)
 
 
 class ValiditySection(Options):
@@ -107,7 +103,7 @@ class LightSection(Options):
     """
 
     amplitude_at_1m: PositiveNumber
-    vignetting_exponent: Annotated[Number, Field(ge=0)] = 0.0
+    vignetting_exponent: NonNegativeNumber = 0.0
     usual_reflectivity: Annotated[Number, Field(gt=0, le=1)] = 0.5
 
 
@@ -139,7 +135,7 @@ class SensorFile(Options):
     version: Annotated[Literal[1], BeforeValidator(lambda v: None if v is True else v)]
     title: str = "A time-of-flight camera, as it was found."
     measured_from: tuple[str, ...] = ()
-    camera: SensorCamera
+    camera: CameraOptions
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None
     tool_from_camera: RigidTransform | None = None
@@ -169,7 +165,7 @@ class SensorFile(Options):
             conditions={
                 name: tuple(  # type: ignore[misc]
                     getattr(validity.conditions[column], part) * condition(name).si_per_unit
-                    for part in ("low", "high", "mean")
+                    for part in _PARTS
                 )
                 for name, column in ((name, condition(name).column) for name in CONDITIONS)
                 if column in validity.conditions
@@ -181,8 +177,8 @@ def validity_of(domain: Domain) -> ValiditySection:
     """Return the section of calibrated ranges."""
     conditions = {}
     for name, numbers in domain.conditions.items():
-        low, high, mean = (condition(name).in_file(number) for number in numbers)
-        conditions[condition(name).column] = ConditionRange(low=low, high=high, mean=mean)
+        values = map(condition(name).in_file, numbers)
+        conditions[condition(name).column] = dict(zip(_PARTS, values, strict=True))
     return ValiditySection(
         radial_distance_m=domain.radial_distance,
         amplitude=domain.amplitude,
@@ -248,7 +244,7 @@ def light_section(observed: Observed) -> LightSection | None:
     and incidence, is taken as white of reflectivity 0.8.
     """
     table = observed.table
-    full = table.amplitude * table.distance**2 / table.cosine
+    full = table.amplitude / table.signal
     full = full[np.isfinite(full) & (full > 0)]
     if not len(full):
         return None

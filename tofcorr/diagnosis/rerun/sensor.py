@@ -33,7 +33,6 @@ from tofcorr.sensor.model import SensorModel, SensorWarning
 from tofcorr.sensor.parts import section_of
 from tofcorr.sensor.sensor_file import (
     ErrorSection,
-    SensorCamera,
     SensorFile,
     dropout_section,
     light_section,
@@ -43,7 +42,7 @@ from tofcorr.simulation.effects import CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.effects.saturation import light_of
-from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.options import CameraOptions, SimulatorOptions
 
 
 def sensor_of(
@@ -87,7 +86,7 @@ def sensor_of(
         version=1,
         title="A time-of-flight camera, as a diagnosis found it.",
         measured_from=tuple(sentences),
-        camera=SensorCamera.of(recording.camera),
+        camera=CameraOptions.of(recording.camera),
         depth_kind=recording.depth_kind,
         modulation_frequency_hz=recording.modulation_frequency,
         tool_from_camera=cast(RigidTransform, tuple(map(tuple, pose.tolist()))),
