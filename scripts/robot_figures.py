@@ -69,7 +69,6 @@ def draw_wall(run: Path, path: Path) -> "Figure":
     from matplotlib.figure import Figure
 
     from tofcorr import DepthCorrection, Recording
-    from tofcorr.geometry.rays import signed_distance
 
     module, recording = DepthCorrection.load(run), Recording.open(path)
     report = json.loads((run / "report.json").read_text(encoding="utf-8"))
@@ -88,7 +87,7 @@ def draw_wall(run: Path, path: Path) -> "Figure":
         ("corrected", after),
     ):
         world = points @ world_from_tool[:3, :3].T + world_from_tool[:3, 3]
-        images[name] = 1e3 * signed_distance(world, normal, offset).numpy()
+        images[name] = 1e3 * (world @ normal + offset).numpy()
     limit = float(np.nanquantile(np.abs(images["measured"]), 0.98))
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     panels = figure.subplots(1, 2)

@@ -18,7 +18,6 @@ from tofcorr.geometry.rays import (
     radial_distance_from_z_depth,
     ray_directions,
     ray_plane_distance,
-    signed_distance,
     tangents,
     unambiguous_range,
     z_depth_from_radial_distance,
@@ -158,10 +157,8 @@ def test_signed_distance_does_not_depend_on_the_frame(values: list[float]) -> No
     offset = torch.tensor(-1.7, dtype=torch.float64)
     points = torch.tensor([[0.1, 0.2, 0.3], [-4.0, 5.0, 6.0]], dtype=torch.float64)
     in_world = points @ world_from_frame[:3, :3].T + world_from_frame[:3, 3]
-    torch.testing.assert_close(
-        signed_distance(points, *plane_in_frame(normal, offset, world_from_frame)),
-        signed_distance(in_world, normal, offset),
-    )
+    there, height = plane_in_frame(normal, offset, world_from_frame)
+    torch.testing.assert_close(points @ there + height, in_world @ normal + offset)
 
 
 def test_points_where_rays_meet_a_plane_lie_in_it() -> None:
@@ -169,7 +166,7 @@ def test_points_where_rays_meet_a_plane_lie_in_it() -> None:
     normal = torch.nn.functional.normalize(torch.tensor([0.2, -0.3, -1.0]).double(), dim=0)
     offset = torch.tensor(1.3, dtype=torch.float64)
     points = rays * ray_plane_distance(rays, normal, offset)[..., None]
-    apart = signed_distance(points.reshape(-1, 3), normal, offset)
+    apart = points.reshape(-1, 3) @ normal + offset
     torch.testing.assert_close(apart, torch.zeros_like(apart), rtol=0, atol=1e-12)
 
 

@@ -137,8 +137,6 @@ _EXACT = 1e-13
 # Numbers of polynomials that are tried. Multiples of 8, which processors multiply quickly: on
 # AVX-512, 24 columns take two thirds of the time of 21.
 _POLYNOMIALS = range(8, 49, 8)
-# Which ray product belongs to ray axes a and b; axis 3 stands for the constant column.
-_RAY_PRODUCT = torch.tensor([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])
 
 
 StaticImages = Callable[[Tensor | slice], Iterable[Float[Tensor, "G h W"]]]
@@ -231,6 +229,8 @@ class MomentAccumulator:
         count, height, width = batch.valid[frames].shape
         step = max(1, self._block // (count * width))
 
+        valid = None if whole else batch.valid
+        images = batch.radial_distance, batch.amplitude, valid, weights
         # Each block is written over the last: it is in the cache.
         memory = torch.empty(
             len(self.formed) * count * step * width, dtype=torch.float64, device=self._device
@@ -239,13 +239,7 @@ class MomentAccumulator:
         def blocks() -> Iterator[Float[Tensor, "F B h W"]]:
             for row in range(0, height, step):
                 at = frames, slice(row, row + step)
-                yield self._products(
-                    batch.radial_distance[at],
-                    None if batch.amplitude is None else batch.amplitude[at],
-                    None if whole else batch.valid[at],
-                    None if weights is None else weights[at],
-                    memory,
-                )
+                yield self._products(*(one if one is None else one[at] for one in images), memory)
 
         reduced = self._reduction.reduced(blocks())
         functions, others = reduced.tensor_split([count * len(self._kept)])
@@ -322,9 +316,12 @@ class MomentAccumulator:
         signal = torch.cat([design.signal[columns], zero])
         pixel = torch.cat([design.pixel[columns], zero])
         axis = torch.cat([torch.arange(3).repeat(design.num_columns), zero + 3])
+        left, right = torch.triu_indices(4, 4)
+        ray_product = torch.zeros(4, 4, dtype=torch.long)
+        ray_product[left, right] = ray_product[right, left] = torch.arange(10)
         product = product_of[signal[:, None], signal]
         static = design.pixel_pairs[pixel[:, None], pixel] * 10
-        static = static + _RAY_PRODUCT[axis[:, None], axis]
+        static = static + ray_product[axis[:, None], axis]
         num_static = self._reduction.num_static
         of_others = functions * num_static + (product - functions) * 10 + static
         return torch.where(product < functions, product * num_static + static, of_others)
@@ -354,11 +351,12 @@ def _write_powers(
 def _static_products(design: Design, rows: Tensor | slice) -> Iterator[Float[Tensor, "10 h W"]]:
     """Yield, for each pair of pixel functions, its product with the ten ray products.
 
-    Those are xx, xy, xz, yy, yz, zz, x, y, z and 1; each yield has shape (10, h, W), for h rows.
+    Those are the distinct products of x, y, z and 1; each yield has shape (10, h, W), for h rows.
     """
-    x, y, z = design.ray_directions[rows].unbind(-1)
     functions = design.pixel_functions[:, rows]
-    rays = torch.stack([x * x, x * y, x * z, y * y, y * z, z * z, x, y, z, torch.ones_like(x)])
+    axes = torch.cat([design.ray_directions[rows].movedim(-1, 0), functions[:1]])
+    left, right = torch.triu_indices(4, 4)
+    rays = axes[left] * axes[right]
     for product in range(int(design.pixel_pairs.max()) + 1):
         a, b = (design.pixel_pairs == product).nonzero()[0]
         yield functions[a] * functions[b] * rays
@@ -389,18 +387,13 @@ def moments_of_few(
         *(index.split(8_192) for index in torch.nonzero(valid, as_tuple=True)), strict=True
     ):
         distance = batch.radial_distance[frame, rows, columns].double()
-        amplitude = distance
-        if batch.amplitude is not None:
-            amplitude = batch.amplitude[frame, rows, columns].double()
-        signal = design.signal_functions(distance, amplitude)[design.signal]
+        given = distance if batch.amplitude is None else batch.amplitude[frame, rows, columns]
+        signal = design.signal_functions(distance, given.double())[design.signal]
         column = signal * design.pixel_functions[:, rows, columns][design.pixel]
         rays = design.ray_directions[rows, columns].T.to(column)
-        products = (column[:, None] * rays).flatten(0, 1)
-        products = torch.cat([products, torch.ones_like(distance)[None].to(products)])
-        weighted = products
-        if weights is not None:
-            weighted = products * weights[frame, rows, columns]
-        gram += weighted @ products.T
+        products = torch.cat([(column[:, None] * rays).flatten(0, 1), torch.ones_like(column[:1])])
+        own = products if weights is None else products * weights[frame, rows, columns]
+        gram += own @ products.T
     return gram
 
 
@@ -421,13 +414,14 @@ class PixelReduction:
     def __init__(self, static: StaticImages, height: int, device: str = "cpu") -> None:
         along_row, projected = _along_rows(static, height)
         along_column, projected = _along_columns(projected)
-        self._along_row = None if along_row is None else along_row.to(device)
-        self._along_column = None if along_column is None else along_column.T.to(device)
+        self._along_row = along_row if along_row is None else along_row.to(device)
+        self._along_column = along_column if along_column is None else along_column.T.to(device)
         self._shape = projected.shape[1:]
         # A thousand numbers that no static image has more of than this share change a sum by less
         # than `_EXACT`, relative to the images' norms.
-        numbers = torch.nn.functional.normalize(projected.flatten(1), dim=1, eps=1e-300).abs()
-        self._used = (numbers.amax(0) > 1e-15).nonzero()[:, 0].to(device)
+        tiny = torch.finfo(projected.dtype).tiny
+        numbers = torch.nn.functional.normalize(projected.flatten(1), dim=1, eps=tiny).abs()
+        self._used = (numbers.amax(0) > _EXACT / 100).nonzero()[:, 0].to(device)
         self._static = projected.flatten(1).T.to(device)[self._used].contiguous()
         self.size, self.num_static = self._static.shape
 

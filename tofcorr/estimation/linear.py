@@ -38,7 +38,7 @@ added before one is factored."""
 # is larger is no error of a camera or a robot, but two effects of opposite signs.
 _LARGEST_VARIANCE = 0.05**2
 # Least curvature: equations of nothing but zeros have a solution, zero.
-_TINY = 1e-300
+_TINY = torch.finfo(torch.float64).tiny
 
 
 def pose_products(

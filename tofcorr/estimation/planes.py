@@ -130,7 +130,7 @@ class _WallObjective:
         # Keeps undetermined directions where they started: a prior of 100 mm and 100 mrad, weighed
         # against residuals of 1 mm, in square metres. That is too weak to move what the images do
         # determine, however far off the walls were recorded.
-        ridge = (1e-3 / 0.1) ** 2 * torch.eye(size, dtype=torch.float64)
+        ridge = torch.eye(size, dtype=torch.float64) / 100**2
         held = NormalEquations(ridge.new_zeros(()), ridge.new_zeros(size), ridge)
         self.moments, self._prior = moments, held.plus(prior)
 

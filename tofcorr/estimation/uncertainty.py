@@ -45,9 +45,6 @@ PRIOR_SIGMA = 0.1
 It is wider than the error of any depth camera and of any usable hand-eye guess. Set by hand.
 """
 
-# Posterior variance of which half is the prior's: the images carry less information than that.
-_MOST_KNOWN = PRIOR_SIGMA**2 / 2
-
 
 @dataclass(frozen=True)
 class Covariance:
@@ -231,7 +228,7 @@ class Direction(NamedTuple):
     @property
     def is_undetermined(self) -> bool:
         """Whether the images say less about it than a prior of 100 mm and 100 mrad."""
-        return self.sigma**2 > _MOST_KNOWN
+        return self.sigma**2 > PRIOR_SIGMA**2 / 2  # Half of the variance is then the prior's.
 
     def in_words(self) -> str:
         """Return the direction's name, such as `c0 and t_z together (corr +0.99)`."""
@@ -310,7 +307,7 @@ def observability(
     order = variances.argsort(descending=True)
     # Rounding may leave a variance below zero where the images fit exactly.
     variances, vectors = variances[order].clamp(min=0.0), vectors[:, order]
-    undetermined = int((variances > _MOST_KNOWN).sum())
+    undetermined = int((variances > PRIOR_SIGMA**2 / 2).sum())
     vectors[:, :undetermined] = _sparse_basis(vectors[:, :undetermined])
     left, right = torch.triu_indices(len(names), len(names), offset=1)
     order = correlation[left, right].abs().argsort(descending=True)

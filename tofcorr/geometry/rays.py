@@ -31,9 +31,14 @@ def ray_directions(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {
         Directions with x to the right, y down and z along the optical axis, shape
         (height, width, 3), norm 1, float64. The tensor is shared: do not write into it.
     """
-    pixels = _pixels(camera)
+    wanted = pixels = _pixels(camera)
     if camera.distortion:
-        pixels = _undistorted(pixels, camera)
+        lens = camera.matrix_tensor()[None], torch.tensor([camera.distortion], dtype=torch.float64)
+        parts = [
+            undistort_points(part[None], *lens, num_iters=_ITERATIONS)[0]
+            for part in wanted.split(_AT_ONCE)
+        ]
+        pixels = _improved(torch.cat(parts), wanted, camera)
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
     rays = torch.linalg.solve(camera.matrix_tensor(), homogeneous.T).T
     unit = torch.nn.functional.normalize(rays, dim=-1)
@@ -86,16 +91,6 @@ def moved_rays(
     if depth_kind == "radial":
         toward = toward - rays * (toward * rays).sum(-1, keepdim=True)
     return (toward * normal).sum(-1) * distance
-
-
-def _undistorted(wanted: Float[Tensor, "N 2"], camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
-    matrix = camera.matrix_tensor()[None]
-    distortion = torch.tensor([camera.distortion], dtype=torch.float64)
-    parts = [
-        undistort_points(part[None], matrix, distortion, num_iters=_ITERATIONS)[0]
-        for part in wanted.split(_AT_ONCE)
-    ]
-    return _improved(torch.cat(parts), wanted, camera)
 
 
 def _distorted(points: Float[Tensor, "N 2"], camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
@@ -168,15 +163,6 @@ def plane_in_frame(
     return normal, offset + (normal_world * translation).sum(-1)
 
 
-def signed_distance(
-    points: Float[Tensor, "*batch P 3"],
-    normal: Float[Tensor, "*batch 3"],
-    offset: Float[Tensor, "*batch"],
-) -> Float[Tensor, "*batch P"]:
-    """Return n . x + d of points (..., P, 3) for planes (..., 3) and (...): shape (..., P)."""
-    return (points @ normal[..., :, None])[..., 0] + offset[..., None]
-
-
 def ray_plane_distance(
     ray_directions: Float[Tensor, "H W 3"],
     normal: Float[Tensor, "*batch 3"],
@@ -219,9 +205,8 @@ def distance_along_rays(
     Returns:
         Shape (M,). Nothing is masked: a ray that points away from the plane gives a negative value.
     """
-    normal_camera = (normal_world[:, None, :] @ world_from_camera[:, :3, :3])[:, 0]
-    height = (normal_world * world_from_camera[:, :3, 3]).sum(-1) + offset
-    return -height[frame] / (rays * normal_camera[frame]).sum(-1)
+    normal, height = plane_in_frame(normal_world, offset, world_from_camera)
+    return -height[frame] / (rays * normal[frame]).sum(-1)
 
 
 def tangents(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
@@ -296,10 +281,9 @@ def wrapped(errors: np.ndarray, modulation_frequency: float | None) -> np.ndarra
     """
     if modulation_frequency is None:
         return np.zeros(errors.shape, dtype=bool)
-    periods = errors / unambiguous_range(modulation_frequency)
-    whole = np.round(periods)
-    off = np.abs(periods - whole) * unambiguous_range(modulation_frequency)
-    return (whole != 0) & (off < _WRAPPED_WITHIN)
+    full = unambiguous_range(modulation_frequency)
+    whole = np.round(errors / full)
+    return (whole != 0) & (np.abs(errors - whole * full) < _WRAPPED_WITHIN)
 
 
 def range_of_wrapped(errors: np.ndarray, modulation_frequency: float | None) -> float | None:

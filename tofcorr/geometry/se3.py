@@ -91,7 +91,8 @@ def log(transform: Tensor) -> Tensor:
     Returns:
         Twists, translational part first, shape (..., 6).
     """
-    with _gradient_only_if_asked(transform):
+    # kornia makes parameters of tensors: without a gradient unless the argument needs one.
+    with torch.set_grad_enabled(torch.is_grad_enabled() and transform.requires_grad):
         twist = Se3.from_matrix(transform.reshape(-1, 4, 4)).log()
     return twist.reshape(*transform.shape[:-2], 6)
 
@@ -144,11 +145,6 @@ def apart(one: Tensor, other: Tensor) -> tuple[float, float]:
     """Return the distance of two rigid transforms (4, 4), metres, and their angle, radians."""
     between = inverse(one.double()) @ other.double()
     return float(between[:3, 3].norm()), float(rotation_angle(between[:3, :3]))
-
-
-def _gradient_only_if_asked(argument: Tensor) -> torch.set_grad_enabled:
-    """Disable gradients unless the argument needs them: kornia makes parameters of tensors."""
-    return torch.set_grad_enabled(torch.is_grad_enabled() and argument.requires_grad)
 
 
 def transformed(transform: Tensor, points: Tensor) -> Tensor:

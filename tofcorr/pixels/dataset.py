@@ -59,8 +59,8 @@ class Dataset:
         """Refuse recordings that are not of one camera in one setting."""
         if not self.recordings:
             raise CalibrationDataError("There is no recording to calibrate.")
-        first = self.first
-        for other in self.recordings[1:]:
+        first, *others = self.recordings
+        for other in others:
             for name in ("camera", "depth_kind", "modulation_frequency"):
                 if getattr(other, name) != getattr(first, name):
                     raise CalibrationDataError(
@@ -184,23 +184,22 @@ class Dataset:
         # Images stay as recorded where nothing but the sums reads them: half the bytes.
         as_recorded = weighting is None and self.exclude is None
         as_recorded &= self.first.depth_kind == "radial"
-        images = self.batches(
-            own, device, image_dtype=torch.float32 if as_recorded else torch.float64
-        )
+        dtype = torch.float32 if as_recorded else torch.float64
+        images = self.batches(own, device, image_dtype=dtype)
 
         def moments_of(batch: FrameBatch) -> ImageMoments:
             return accumulator(batch, weighting(batch) if weighting else None)
 
         parts = in_threads(moments_of, images, None if device == "cpu" else 1)
-        # A process may have no frame where there are more processes than frames.
-        mine = [(self._in_order_read(own), concatenate([*parts]))] if len(own) else []
+        # Batches come recording by recording. A process may have no frame where there are more
+        # processes than frames.
+        read = [start + local for _, start, local in self.by_recording(own)]
+        mine = [(np.concatenate(read), concatenate([*parts]))] if read else []
         everything = [part for share in everyones(mine) for part in share]
         numbers = np.concatenate([indices for indices, _ in everything])
-        return concatenate([moments for _, moments in everything]).images(_order(numbers, wanted))
-
-    def _in_order_read(self, frames: np.ndarray) -> np.ndarray:
-        """Return frames recording by recording, as `batches` yields them."""
-        return np.concatenate([start + local for _, start, local in self.by_recording(frames)])
+        rank = np.argsort(np.argsort(wanted, kind="stable"), kind="stable")
+        order = np.argsort(numbers, kind="stable")[rank].tolist()
+        return concatenate([moments for _, moments in everything]).images(order)
 
     def by_recording(
         self, frames: Sequence[int] | np.ndarray | None
@@ -213,13 +212,6 @@ class Dataset:
             if inside.any():
                 yield recording, start, wanted[inside] - start
             start += recording.num_frames
-
-
-def _order(found: np.ndarray, wanted: np.ndarray) -> list[int]:
-    """Return where each wanted frame lies among those found; both hold the same numbers."""
-    order = np.empty(len(wanted), dtype=np.int64)
-    order[np.argsort(wanted, kind="stable")] = np.argsort(found, kind="stable")
-    return order.tolist()
 
 
 Recordings = str | PathLike[str] | Recording | Sequence[str | PathLike[str] | Recording]
@@ -290,10 +282,6 @@ def recorded_hand_eye(dataset: Dataset) -> Float[Tensor, "4 4"]:
     return torch.from_numpy(np.asarray(dataset.first.tool_from_camera, dtype=np.float64)).clone()
 
 
-# Fewest frames to train on: the covariance leaves out one pose of at least three.
-_FEWEST_FRAMES = 3
-
-
 class SplitOptions(Options):
     """Which frames are held out; frames of one pose always stay together.
 
@@ -306,21 +294,25 @@ class SplitOptions(Options):
     seed: NonNegativeInt = 0
 
 
+def _poses(dataset: Dataset, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose of each frame, and all poses in a random order."""
+    group = dataset.pose_groups()
+    return group, np.random.default_rng(seed).permutation(int(group.max()) + 1)
+
+
 def split_frames(dataset: Dataset, options: SplitOptions) -> tuple[np.ndarray, np.ndarray]:
     """Return the global numbers of the frames to train on and to test on, both sorted.
 
     Raises:
         CalibrationDataError: Fewer than three frames would be left to train on.
     """
-    group = dataset.pose_groups()
-    order = np.random.default_rng(options.seed).permutation(int(group.max()) + 1)
-    num_test = round(options.test_fraction * len(order))
-    test = np.flatnonzero(np.isin(group, order[:num_test]))
-    train = np.flatnonzero(~np.isin(group, order[:num_test]))
-    if len(train) < _FEWEST_FRAMES:
+    group, poses = _poses(dataset, options.seed)
+    held_out = np.isin(group, poses[: round(options.test_fraction * len(poses))])
+    test, train = np.flatnonzero(held_out), np.flatnonzero(~held_out)
+    if len(train) < 3:  # The covariance leaves out one pose of at least three.
         raise CalibrationDataError(
             f"{dataset.first.path}: {len(train)} of {dataset.num_frames} frames are left to train "
-            f"on, {_FEWEST_FRAMES} are needed; record more, or set split.test_fraction to 0."
+            "on, 3 are needed; record more, or set split.test_fraction to 0."
         )
     return train, test
 
@@ -331,15 +323,13 @@ def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
     Raises:
         CalibrationDataError: There are fewer poses than folds.
     """
-    group = dataset.pose_groups()
-    num_poses = int(group.max()) + 1
-    if num_poses < num_folds:
+    group, poses = _poses(dataset, seed)
+    if len(poses) < num_folds:
         raise CalibrationDataError(
-            f"{dataset.first.path}: {num_poses} poses cannot be divided into {num_folds} folds; "
+            f"{dataset.first.path}: {len(poses)} poses cannot be divided into {num_folds} folds; "
             "record more, or ask for fewer folds."
         )
-    order = np.random.default_rng(seed).permutation(num_poses)
-    return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(order, num_folds)]
+    return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(poses, num_folds)]
 
 
 def covered_domain(
@@ -362,29 +352,27 @@ def covered_domain(
     Raises:
         CalibrationDataError: No pixel of these frames is usable.
     """
+    first = dataset.first
     per_frame = max(pixels // max(len(frames), 1), 50)
-    samples = (
-        [
-            _sample(recording, local, per_frame)
-            for recording, _, local in dataset.by_recording(frames)
+    step = max(first.camera.height * first.camera.width // per_frame, 1)
+    if dataset.exclude is None:
+        parts = [_sample(one, local, step) for one, _, local in dataset.by_recording(frames)]
+    else:
+        parts = [
+            _both(one.radial_distance, one.amplitude)[:, one.valid][:, ::step]
+            for one in dataset.batches(frames)
         ]
-        if dataset.exclude is None
-        else _sample_not_excluded(dataset, frames, per_frame)
-    )
-    distance = torch.cat([sample[0] for sample in samples])
+    distance, amplitude = torch.cat(parts, dim=1)
     if not distance.numel():
         raise CalibrationDataError(
-            f"{dataset.first.path}: no pixel of the {len(frames)} frames asked for is usable; "
+            f"{first.path}: no pixel of the {len(frames)} frames asked for is usable; "
             "check mask.npy, saturation_amplitude and the unit of depth.npy (metres)."
         )
-    amplitude = None
-    if dataset.has_amplitude:
-        amplitude = torch.cat([sample[1] for sample in samples if sample[1] is not None])
     return domain_from(
-        dataset.first.camera,
+        first.camera,
         distance,
-        amplitude,
-        dataset.first.modulation_frequency,
+        amplitude if dataset.has_amplitude else None,
+        first.modulation_frequency,
         dataset.conditions(frames),
         outside_share=outside_share,
     )
@@ -411,58 +399,48 @@ def domain_from(
         outside_share: Share of the values that may lie below a range, and above it.
         method: How to interpolate between the two values nearest to a quantile.
     """
-    normalised = None if amplitude is None else amplitude * radial_distance * radial_distance
 
-    def interval(values: torch.Tensor) -> Interval:
+    def interval(values: Tensor | None) -> Interval | None:
+        if values is None:
+            return None
         quantiles = (outside_share, 1 - outside_share)
-        low, high = np.quantile(values.numpy(), quantiles, method=method)
-        return Interval(float(low), float(high))
+        return Interval(*np.quantile(values.numpy(), quantiles, method=method).tolist())
 
+    known = zip(CONDITIONS, conditions.unbind(1), strict=True)
+    near_and_far = interval(radial_distance)
+    assert near_and_far is not None
     return Domain(
         height=camera.height,
         width=camera.width,
-        radial_distance=interval(radial_distance),
-        amplitude=None if amplitude is None else interval(amplitude),
-        normalised_amplitude=None if normalised is None else interval(normalised),
+        radial_distance=near_and_far,
+        amplitude=interval(amplitude),
+        normalised_amplitude=interval(
+            None if amplitude is None else amplitude * radial_distance.square()
+        ),
         modulation_frequency=modulation_frequency,
-        conditions=_known_conditions(conditions),
+        # Of those that are known of all frames.
+        conditions={
+            name: (float(column.min()), float(column.max()), float(column.mean()))
+            for name, column in known
+            if bool(column.isfinite().all())
+        },
     )
 
 
-def _known_conditions(values: Float[Tensor, "N C"]) -> dict[str, tuple[float, float, float]]:
-    """Return lowest, highest and mean value of each condition that is known of all frames."""
-    return {
-        name: (float(column.min()), float(column.max()), float(column.mean()))
-        for name, column in zip(CONDITIONS, values.unbind(1), strict=True)
-        if bool(column.isfinite().all())
-    }
+def _both(distance: Tensor, amplitude: Tensor | None) -> Float[Tensor, "2 *pixels"]:
+    """Return distances and amplitudes (NaN without any) in one tensor, float64."""
+    amplitude = torch.full_like(distance, torch.nan) if amplitude is None else amplitude
+    return torch.stack([distance.double(), amplitude.double()])
 
 
-def _sample_not_excluded(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, per_frame: int
-) -> list[tuple[torch.Tensor, torch.Tensor | None]]:
-    """Return distances and amplitudes of a regular sample; reads all pixels, as exclusion must."""
-    camera = dataset.first.camera
-    step = max(camera.height * camera.width // per_frame, 1)
-    samples = []
-    for batch in dataset.batches(frames):
-        amplitude = None if batch.amplitude is None else batch.amplitude[batch.valid][::step]
-        samples.append((batch.radial_distance[batch.valid][::step], amplitude))
-    return samples
-
-
-def _sample(
-    recording: Recording, frames: np.ndarray, per_frame: int
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Return distances and amplitudes of a regular sample of the usable pixels."""
-    size = recording.camera.height * recording.camera.width
+def _sample(recording: Recording, frames: np.ndarray, step: int) -> Float[Tensor, "2 M"]:
+    """Return distances and amplitudes of every so many pixels that are usable."""
     # A step that shares no factor with the width visits all columns.
-    step = max(size // per_frame, 1)
     while step > 1 and np.gcd(step, recording.camera.width) > 1:
         step -= 1
     z_of_ray = ray_directions(recording.camera)[..., 2].reshape(-1)[::step]
 
-    def of_frame(frame: int) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def of_frame(frame: int) -> Tensor:
         depth, amplitude, mask = (
             None
             if array is None
@@ -471,12 +449,10 @@ def _sample(
         )
         assert depth is not None  # Every recording has it.
         valid = valid_pixels(depth, amplitude, mask, recording.saturation_amplitude)
-        radial = depth.double() / z_of_ray if recording.depth_kind == "z" else depth.double()
-        return radial[valid], None if amplitude is None else amplitude.double()[valid]
+        radial = depth.double() / z_of_ray if recording.depth_kind == "z" else depth
+        return _both(radial, amplitude)[:, valid]
 
-    distances, amplitudes = zip(*in_threads(of_frame, frames.tolist()), strict=True)
-    known = [amplitude for amplitude in amplitudes if amplitude is not None]
-    return torch.cat(distances), torch.cat(known) if known else None
+    return torch.cat([*in_threads(of_frame, frames.tolist())], dim=1)
 
 
 Item = TypeVar("Item")

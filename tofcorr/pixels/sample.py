@@ -18,7 +18,6 @@ from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differe
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
 from tofcorr.pixels.masks import (
-    Mask,
     edges,
     grazing,
     off_largest_plane,
@@ -99,10 +98,8 @@ def draw_pixels(
     """
     generator = torch.Generator().manual_seed(seed)
     per_frame = max(number // max(len(frames), 1), 1)
-    rays, place_of = (
-        dataset.ray_directions().flatten(0, 1),
-        {int(f): k for k, f in enumerate(frames)},
-    )
+    rays = dataset.ray_directions().flatten(0, 1)
+    place_of = {int(frame): k for k, frame in enumerate(frames)}
     drawn: list[tuple[Tensor, ...]] = []
     for batch in dataset.batches(frames):
         for k, frame in enumerate(batch.indices.tolist()):
@@ -140,15 +137,9 @@ def distance_to_plane(
     amplitude = batch.amplitude
     if amplitude is not None:
         amplitude = torch.where(batch.valid, amplitude, 1.0)
+    planes = batch.normal_tool, batch.offset_tool
     with torch.no_grad():
-        return model.residual(
-            distance,
-            amplitude,
-            ray_directions,
-            batch.normal_tool,
-            batch.offset_tool,
-            batch.conditions,
-        )
+        return model.residual(distance, amplitude, ray_directions, *planes, batch.conditions)
 
 
 def cosine_of_incidence(
@@ -319,15 +310,14 @@ def _repeat_differences(
     distance = torch.cat([batch.radial_distance for batch in batches])
     amplitude = torch.cat([one.amplitude for one in batches if one.amplitude is not None])
     valid = torch.cat([batch.valid for batch in batches])
-    differences, amplitudes = [], []
+    found = [distance.new_zeros(2, 0)]
     for k in range(0, len(distance) - 1, 2):
         both = valid[k] & valid[k + 1]
         change = (distance[k + 1] - distance[k])[both]
         if change.numel():
-            differences.append(change - change.median())
-            amplitudes.append((amplitude[k] + amplitude[k + 1])[both] / 2)
-    empty = distance.new_zeros(0)
-    return torch.cat([*differences, empty]), torch.cat([*amplitudes, empty])
+            mean = (amplitude[k] + amplitude[k + 1])[both] / 2
+            found.append(torch.stack([change - change.median(), mean]))
+    return torch.cat(found, dim=1).unbind()
 
 
 def without_outliers(
@@ -423,16 +413,11 @@ def usable_pixels(
         )
     dataset = without_outliers(dataset, options.outlier_window_mm, frames)
     rays = dataset.ray_directions()
-    masks: list[Mask] = []
     if options.mask == "ransac":
-        masks.append(off_largest_plane(rays, options.mask_tolerance_mm * 1e-3))
+        dataset = dataset.without(off_largest_plane(rays, options.mask_tolerance_mm * 1e-3))
     if options.edge_contrast is not None:
         dataset.require("amplitude", "the mask of edges (edge_contrast)")
-        masks.append(edges(options.edge_contrast))
+        dataset = dataset.without(edges(options.edge_contrast))
     if options.grazing_deg is not None:
-        masks.append(grazing(options.grazing_deg, rays))
-    if robust:
-        masks.append(off_the_wall(rays))
-    for mask in masks:
-        dataset = dataset.without(mask)
-    return dataset
+        dataset = dataset.without(grazing(options.grazing_deg, rays))
+    return dataset.without(off_the_wall(rays)) if robust else dataset
