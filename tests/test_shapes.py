@@ -12,7 +12,7 @@ from jaxtyping import TypeCheckError
 
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.uncertainty import posterior_covariance
-from tofcorr.geometry.rays import signed_distance
+from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.masks import grazing
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,13 +59,13 @@ def annotated(path: Path) -> Iterator[tuple[str, str, str]]:
 
 
 def test_a_wrong_shape_is_refused_in_a_test_run() -> None:
-    points, normal = torch.zeros(2, 5, 3), torch.zeros(2, 3)
-    assert signed_distance(points, normal, torch.zeros(2)).shape == (2, 5)
+    normal, places = torch.zeros(2, 3), torch.zeros(2, 4, 4)
+    assert plane_in_frame(normal, torch.zeros(2), places)[0].shape == (2, 3)
     for _ in range(2):  # What was refused once is refused again.
         with pytest.raises(TypeCheckError, match="offset"):
-            signed_distance(points, normal, torch.zeros(3))
+            plane_in_frame(normal, torch.zeros(3), places)
     with pytest.raises(TypeCheckError, match="offset"):
-        signed_distance(points, normal, torch.zeros(2, dtype=torch.int64))
+        plane_in_frame(normal, torch.zeros(2, dtype=torch.int64), places)
     with pytest.raises(TypeCheckError, match="precision"):
         posterior_covariance(torch.zeros(4, 5))
     with pytest.raises(TypeCheckError, match="tool_from_camera"):
