@@ -34,16 +34,10 @@ NOISE = {"floor_m": 0.001, "shot_m": 0.003, "read_m": 0.001, "reference_amplitud
 
 def sensor_values(**changes: Any) -> dict[str, Any]:
     """Return the content of a `sensor.yaml`, with changes."""
-    camera = {
-        "width": CAMERA.width,
-        "height": CAMERA.height,
-        "K": [list(row) for row in CAMERA.matrix],
-        "distortion": list(CAMERA.distortion),
-    }
     return {
         "format": "tofcorr-sensor",
         "version": 1,
-        "camera": camera,
+        "camera": CAMERA.section(),
         "depth_kind": "radial",
         "modulation_frequency_hz": FREQUENCY,
         "validity": {

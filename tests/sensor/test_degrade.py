@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from sensor.sensors import sensor_file
 from small_recordings import CAMERA, frame_rows, small_images
 
 from tofcorr.cli.main import main
@@ -24,24 +25,17 @@ EFFECTS = [{"name": "warm_up", "heat_120s": 0.05}, {"name": "pixel", "x1_y0": 0.
 
 
 def sensor(**changes: object) -> SensorFile:
-    camera = {
-        "width": CAMERA.width,
-        "height": CAMERA.height,
-        "K": [list(row) for row in CAMERA.matrix],
-        "distortion": list(CAMERA.distortion),
-    }
-    values = {
-        "format": "tofcorr-sensor",
-        "version": 1,
-        "camera": camera,
+    own = {
+        "camera": CAMERA.section(),
         "depth_kind": "z",
+        "modulation_frequency_hz": None,
         "error": {"coefficients": {"distance": {"c0": 0.02}}},
         "effects": EFFECTS,
         "noise": NOISE,
         "dropouts": {"base_share": 0.2},
         "validity": {"radial_distance_m": [0.4, 3.0]},
     }
-    return SensorFile.from_mapping(values | changes, "the test")
+    return sensor_file(**own | changes)
 
 
 @pytest.fixture

@@ -1,7 +1,9 @@
 """Two recordings without noise, of a robot that stops and of one that does not."""
 
 import pytest
-from simulation.effects.scenes import FEW, Scene
+from simulation.effects.scenes import FEW, Scene, plain_inputs
+
+from tofcorr.simulation.effects.inputs import EffectInputs
 
 
 @pytest.fixture(scope="session")
@@ -14,3 +16,9 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     changes = FEW | {"robot": FEW["robot"] | {"motion": "continuous"}}
     changes |= {"conditions": {"frame_interval_s": 0.3}}
     return Scene(tmp_path_factory.mktemp("moving"), changes)
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> EffectInputs:
+    """Four poses before a checkerboard."""
+    return plain_inputs(tmp_path_factory.mktemp("plain"), "checkerboard", 4)

@@ -42,3 +42,10 @@ class Scene:
             entry = effect.listed(decimals=20)  # A float64 of 0.1 mm has no more.
         simulated = self.record(f"with_{effect.name}_{torch.rand(()).item()}", [entry])
         return diagnosed_recordings.measured(simulated) - diagnosed_recordings.measured(self.plain)
+
+
+def plain_inputs(folder: Path, target: str, poses: int) -> EffectInputs:
+    """Return what is true of a few noise-free poses of a camera without effects."""
+    few = {"shots": [{"target": target, "poses": poses}]}
+    recording = diagnosed_recordings.recorded(folder / "few", 5, [], few, noise=False)
+    return diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], few))

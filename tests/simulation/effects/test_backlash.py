@@ -1,22 +1,19 @@
 """A robot with play stays behind, on the side from which it came."""
 
 from dataclasses import replace
-from pathlib import Path
 
-import diagnosed_recordings
 import torch
 
 from tofcorr.simulation.effects.backlash import BacklashEffect, sides_of_approach
+from tofcorr.simulation.effects.inputs import EffectInputs
 
-FEW = {"shots": [{"target": "white", "poses": 2}]}
 
-
-def test_an_arm_that_comes_from_the_other_side_stops_farther_by_the_play(tmp_path: Path) -> None:
-    recording = diagnosed_recordings.recorded(tmp_path / "few", 5, [], FEW, noise=False)
-    inputs = diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], FEW))
+def test_an_arm_that_comes_from_the_other_side_stops_farther_by_the_play(
+    inputs: EffectInputs,
+) -> None:
     play = torch.tensor([0.003, -0.002, 0.001], dtype=torch.float64)
     effect = BacklashEffect(BacklashEffect.shape_type(), play / 2)
-    sides = [torch.full((2, 3), side, dtype=torch.float64) for side in (-1.0, 1.0)]
+    sides = [torch.full((4, 3), side, dtype=torch.float64) for side in (-1.0, 1.0)]
     below, above = (
         effect.shift(
             replace(inputs, facts=replace(inputs.facts, approach=side)), effect.coefficients

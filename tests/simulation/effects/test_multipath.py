@@ -1,9 +1,7 @@
 """Light by other ways than the direct one, against sums by hand."""
 
 from dataclasses import replace
-from pathlib import Path
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
@@ -17,15 +15,6 @@ from tofcorr.simulation.effects.multipath import (
     in_every_pixel,
     light_by_surfaces,
 )
-
-FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> EffectInputs:
-    folder: Path = tmp_path_factory.mktemp("multipath") / "few"
-    recording = diagnosed_recordings.recorded(folder, 5, [], FEW, noise=False)
-    return diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], FEW))
 
 
 def _only(effect: MultipathEffect, start: str) -> torch.Tensor:

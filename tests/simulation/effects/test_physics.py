@@ -1,10 +1,8 @@
 """Effects compared with what others know of the same physics."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
@@ -29,15 +27,6 @@ from tofcorr.simulation.effects.temperature import (
     lagged_by,
 )
 from tofcorr.simulation.effects.timestamp_offset import TimestampOffsetEffect
-
-FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> EffectInputs:
-    folder: Path = tmp_path_factory.mktemp("physics") / "few"
-    recording = diagnosed_recordings.recorded(folder, 5, [], FEW, noise=False)
-    return diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], FEW))
 
 
 def test_the_lens_bends_rays_as_opencv_distorts_points(generator: torch.Generator) -> None:

@@ -1,8 +1,8 @@
 """Taps that clip, and charge that spills from them."""
 
-import diagnosed_recordings
 import pytest
 import torch
+from simulation.effects.scenes import plain_inputs
 
 from tofcorr.simulation.effects.image_filters import spilled
 from tofcorr.simulation.effects.inputs import EffectInputs
@@ -10,27 +10,24 @@ from tofcorr.simulation.effects.saturation import SaturationEffect, SaturationSh
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> EffectInputs:
-    few = {"shots": [{"target": "white", "poses": 2}]}
-    folder = tmp_path_factory.mktemp("bright") / "few"
-    recording = diagnosed_recordings.recorded(folder, 5, [], few, noise=False)
-    return diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], few))
+def bright(tmp_path_factory: pytest.TempPathFactory) -> EffectInputs:
+    return plain_inputs(tmp_path_factory.mktemp("bright"), "white", 2)
 
 
 def test_a_pixel_whose_four_taps_all_clip_has_no_shift_that_rounding_decides(
-    inputs: EffectInputs,
+    bright: EffectInputs,
 ) -> None:
     # At a contrast of one half the darkest tap is the amplitude: far above every knee.
-    full = 0.1 * float(inputs.known_amplitude.min())
+    full = 0.1 * float(bright.known_amplitude.min())
     effect = SaturationEffect(SaturationShape(full_counts=full, contrast=0.5))
-    assert float(effect.columns(inputs)[:, 1:-2].abs().max()) == 0.0
+    assert float(effect.columns(bright)[:, 1:-2].abs().max()) == 0.0
 
 
-def test_charge_spills_where_a_tap_is_full_and_nowhere_else(inputs: EffectInputs) -> None:
+def test_charge_spills_where_a_tap_is_full_and_nowhere_else(bright: EffectInputs) -> None:
     # At a contrast of one half the brightest tap is at most three times the amplitude.
-    most = 3 * float(inputs.known_amplitude.max())
+    most = 3 * float(bright.known_amplitude.max())
     spilt = [
-        SaturationEffect(SaturationShape(full_counts=full, spill_knee=1.0)).columns(inputs)[:, -2:]
+        SaturationEffect(SaturationShape(full_counts=full, spill_knee=1.0)).columns(bright)[:, -2:]
         for full in (0.5 * most, 1.001 * most)
     ]
     assert float(spilt[0].abs().amax(0).min()) > 1e-3

@@ -57,6 +57,12 @@ def by_frame(values: Tensor, matrices: Tensor, frame: Tensor) -> Tensor:
     return product if order is None else torch.empty_like(product).index_copy(0, order, product)
 
 
+def inner_range(values: Tensor, beyond: float) -> tuple[float, float]:
+    """Return the ends of what values (M,) lie between, but for a share of them at either end."""
+    ordered, last = values.sort().values, len(values) - 1
+    return float(ordered[int(beyond * last)]), float(ordered[int((1 - beyond) * last)])
+
+
 # Legendre polynomials on [-1, 1], in one and two variables.
 
 

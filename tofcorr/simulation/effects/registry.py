@@ -3,7 +3,7 @@
 The order is that of the columns in a linear fit, and decides between effects that fit equally well.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
@@ -39,21 +39,13 @@ _EFFECTS = (
 )
 
 
-def _effect(line: str) -> type[CatalogueEffect]:
-    module, _, name = line.partition(":")
-    return getattr(import_module(f"tofcorr.simulation.effects.{module}"), name)
+def _classes() -> Iterator[type[CatalogueEffect]]:
+    for module, _, name in (line.partition(":") for line in _EFFECTS):
+        yield getattr(import_module(f"tofcorr.simulation.effects.{module}"), name)
 
 
-CATALOGUE: dict[str, type[CatalogueEffect]] = {
-    effect.name: effect for effect in map(_effect, _EFFECTS)
-}
+CATALOGUE: dict[str, type[CatalogueEffect]] = {effect.name: effect for effect in _classes()}
 """Every effect class by its name in `diagnosis.json` and in a simulator's YAML."""
-
-
-# Effects from the list in a configuration.
-
-
-_KNOWN = ", ".join(sorted(CATALOGUE))
 
 
 def build_effects(
@@ -68,17 +60,15 @@ def build_effects(
     Raises:
         ConfigError: An entry lacks its name, its name is unknown, or a parameter is wrong.
     """
-    return tuple(
-        _build_effect(dict(entry), f"{where}[{place}]") for place, entry in enumerate(entries)
-    )
-
-
-def _build_effect(entry: dict[str, Any], where: str) -> Effect:
-    name = entry.pop("name", None)
-    if name is None:
-        raise ConfigError(f"{where}: 'name' is missing; known effects: {_KNOWN}.")
-    if name not in CATALOGUE:
-        close = get_close_matches(str(name), CATALOGUE, n=1)
-        hint = f"Did you mean '{close[0]}'?" if close else f"Known effects: {_KNOWN}."
-        raise ConfigError(f"{where}: there is no effect '{name}'. {hint}")
-    return CATALOGUE[name].from_mapping(entry, f"{where} ({name})")
+    effects, known = [], ", ".join(sorted(CATALOGUE))
+    for place, entry in enumerate(entries):
+        at, name = f"{where}[{place}]", entry.get("name")
+        if name is None:
+            raise ConfigError(f"{at}: 'name' is missing; known effects: {known}.")
+        if name not in CATALOGUE:
+            close = get_close_matches(str(name), CATALOGUE, n=1)
+            hint = f"Did you mean '{close[0]}'?" if close else f"Known effects: {known}."
+            raise ConfigError(f"{at}: there is no effect '{name}'. {hint}")
+        values = {key: value for key, value in entry.items() if key != "name"}
+        effects.append(CATALOGUE[name].from_mapping(values, f"{at} ({name})"))
+    return tuple(effects)

@@ -11,14 +11,14 @@ from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.image_filters import spilled
 from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
-from tofcorr.simulation.effects.numerics import phase_difference
+from tofcorr.simulation.effects.numerics import inner_range, phase_difference
 from tofcorr.simulation.hooks import FrameState
 
-# Quantile of amplitude per light that is taken as white (no unit). Set by hand: above dark
-# surfaces, below the noise of bright ones.
-_WHITE = 0.9
-# Quantile of the amplitudes that hardly a pixel exceeds (no unit).
-_BRIGHTEST = 0.999
+# Share of the dim pixels whose amplitude per light is above that of white (no unit). Set by hand:
+# white is above dark surfaces, below the noise of bright ones.
+_ABOVE_WHITE = 0.1
+# Share of the pixels that may be brighter than the brightest (no unit).
+_BRIGHTER = 0.001
 # A pixel may be clipped if its amplitude is at least this share of white's (no unit). Set by hand:
 # a clipped tap loses less than three quarters of the amplitude.
 _DARKEST_CLIPPED = 0.25
@@ -41,13 +41,10 @@ def _restored(inputs: EffectInputs) -> Tensor:
         return amplitude
     light = inputs.of_frame(seconds) * inputs.incidence_cosine / inputs.radial_distance**2
     dim = light <= light.median()
-    white = light * _quantile((amplitude / light)[dim], _WHITE)
-    clipped = (white > _quantile(amplitude, _BRIGHTEST)) & (amplitude > _DARKEST_CLIPPED * white)
+    white = light * inner_range((amplitude / light)[dim], _ABOVE_WHITE)[1]
+    _, brightest = inner_range(amplitude, _BRIGHTER)
+    clipped = (white > brightest) & (amplitude > _DARKEST_CLIPPED * white)
     return torch.where(clipped, torch.maximum(amplitude, white), amplitude)
-
-
-def _quantile(values: Tensor, share: float) -> float:
-    return float(values.sort().values[int(share * (len(values) - 1))])
 
 
 # The effect.
@@ -105,7 +102,7 @@ class SaturationEffect(CatalogueEffect):
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the brightest tap of the recording, A + A / contrast, as the full level."""
         ambient, contrast = inputs.facts.ambient, SaturationShape().contrast
-        full = (1 + 1 / contrast) * _quantile(inputs.known_amplitude, _BRIGHTEST)
+        full = (1 + 1 / contrast) * inner_range(inputs.known_amplitude, _BRIGHTER)[1]
         full += 0.0 if ambient is None else float(ambient.nan_to_num(0.0).max())
         return cls(SaturationShape(full_counts=max(full, 1e-6)))
 

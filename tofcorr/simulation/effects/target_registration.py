@@ -71,14 +71,8 @@ class TargetRegistrationEffect(GeometryEffect):
         listed = tuple(tuple(plane) for plane in unique.tolist()) if len(unique) > 1 else ()
         pivot = tuple(inputs.points_world.mean(0).tolist())
         start, end = float(facts.timestamp.min()), float(facts.timestamp.max())
-        return cls(
-            TargetRegistrationShape(
-                planes=listed[:_MOST_PLANES],
-                pivot_m=pivot,
-                start_s=start,
-                duration_s=end - start,
-            )
-        )
+        moves = {"start_s": start, "duration_s": end - start}
+        return cls(TargetRegistrationShape(planes=listed[:_MOST_PLANES], pivot_m=pivot, **moves))
 
     @classmethod
     def terms(cls, shape: TargetRegistrationShape) -> tuple[Coefficient, ...]:

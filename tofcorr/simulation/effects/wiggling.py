@@ -10,14 +10,14 @@ from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.inputs import FREQUENCY, EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.numerics import inner_range
 from tofcorr.simulation.hooks import FrameState
 
 # Periods of the error within the unambiguous range: multiples of the first. The harmonic of order
 # n + 1 of the light causes n of them.
 _CYCLES = (4, 8, 12)
-# Shares of the amplitudes below and above which the error changes no more: the range that most
-# pixels lie in. Chosen.
-_LOW, _HIGH = 0.02, 0.98
+# Share of the amplitudes, at either end, beyond which the error changes no more. Chosen.
+_BEYOND = 0.02
 
 
 class WigglingShape(Options):
@@ -54,11 +54,10 @@ class WigglingEffect(SignalEffect):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the range of most amplitudes, where they are known."""
-        known = inputs.amplitude
-        if known is None or not bool((known > 0).any()):
+        amplitude = inputs.amplitude
+        if amplitude is None or not bool((amplitude > 0).any()):
             return cls(WigglingShape())
-        ordered = known[known > 0].sort().values
-        low, high = (float(ordered[int(share * (len(ordered) - 1))]) for share in (_LOW, _HIGH))
+        low, high = inner_range(amplitude[amplitude > 0], _BEYOND)
         return cls(WigglingShape(low_counts=low, high_counts=high))
 
     @classmethod
@@ -87,32 +86,26 @@ class WigglingEffect(SignalEffect):
         orders = [*(cycles + 1 for cycles in _CYCLES), _CYCLES[0] + 1]
         pairs = self.coefficients.reshape(-1, 2).unbind(0)
         for (sine, cosine), order, own in zip(pairs, orders, waves, strict=False):
-            if sine != 0 or cosine != 0:
-                share = torch.complex(sine, cosine) / scale
-                _add_harmonic(state, order, share * fundamental * own)
+            if sine == 0 and cosine == 0:
+                continue
+            phasor = torch.complex(sine, cosine) / scale * fundamental * own
+            same = state.orders == order
+            if bool(same.any()):
+                state.signal = state.signal + same[:, None, None] * phasor
+            else:
+                state.orders = torch.cat([state.orders, state.orders.new_tensor([order])])
+                state.signal = torch.cat([state.signal, phasor[None]])
 
     def _waves(self, turn: Tensor, inputs: EffectInputs) -> list[Tensor]:
         """Return e^(j n phase) for each number of periods, then the first one times u."""
         # Products: a power takes torch 60 times as long.
         first = turn.square().square()
         waves = [first, first.square(), first.square() * first]
-        if self.shape.knows_amplitude:
-            waves.append(self._level(inputs).reshape(first.shape) * first)
+        if self.shape.knows_amplitude and inputs.amplitude is not None:
+            ends = self.shape.low_counts, self.shape.high_counts
+            low, high = map(math.log, ends)
+            level = 2 * (inputs.amplitude.clamp(*ends).log() - low) / (high - low) - 1
+            waves.append(level.reshape(first.shape) * first)
+        elif self.shape.knows_amplitude:
+            waves.append(torch.zeros_like(first))
         return waves
-
-    def _level(self, inputs: EffectInputs) -> Tensor:
-        """Return u, the logarithm of the amplitude from -1 to 1; 0 if unknown, shape (M,)."""
-        if inputs.amplitude is None:
-            return torch.zeros_like(inputs.radial_distance)
-        low, high = math.log(self.shape.low_counts), math.log(self.shape.high_counts)
-        ends = self.shape.low_counts, self.shape.high_counts
-        return 2 * (inputs.amplitude.clamp(*ends).log() - low) / (high - low) - 1
-
-
-def _add_harmonic(state: FrameState, order: int, phasor: Tensor) -> None:
-    same = state.orders == order
-    if bool(same.any()):
-        state.signal = state.signal + same[:, None, None] * phasor
-    else:
-        state.orders = torch.cat([state.orders, state.orders.new_tensor([order])])
-        state.signal = torch.cat([state.signal, phasor[None]])
