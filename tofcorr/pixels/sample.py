@@ -24,7 +24,6 @@ from tofcorr.pixels.masks import (
     off_the_wall,
     outside_window,
     raw_errors,
-    some_pixels,
 )
 
 
@@ -200,15 +199,24 @@ def sample_pixels(
         most_read: About how many they are drawn from: bounds the time on long recordings.
     """
     camera = dataset.first.camera
-    size = camera.height * camera.width
-    read = thinned(np.asarray(frames), max(most_read // size, 1))
-    step = max(size * len(read) // pixels, 1)
-    parts = [_sample(dataset, stages, batch, step) for batch in dataset.batches(read)]
-    columns = (
-        {k: np.concatenate([one[place][k] for one in parts]) for k in parts[0][place]}
-        for place in (1, 2)
-    )
-    return PixelSample(np.concatenate([one[0] for one in parts]), *columns)
+    read = thinned(np.asarray(frames), max(most_read // (camera.height * camera.width), 1))
+    drawn = draw_pixels(dataset, read, pixels, seed=0)
+    covariates = {
+        "distance [m]": drawn.pixels.radial_distance,
+        "row [pixel]": drawn.pixels.rows,
+        "column [pixel]": drawn.pixels.columns,
+    }
+    if dataset.has_amplitude:
+        covariates["amplitude [camera's units]"] = drawn.pixels.amplitude
+    errors = {}
+    for name, model in stages.items():
+        hand_eye = model.hand_eye().detach()
+        off, cosine = model.error.error_at(drawn.pixels), drawn.cosine(hand_eye)
+        errors[name] = (1e3 * drawn.distance_to_plane(hand_eye, off) / cosine).numpy()
+        angle = torch.rad2deg(torch.acos(cosine.abs().clamp(max=1.0)))
+        covariates["angle of incidence [degrees]"] = angle
+    values = {name: column.double().numpy() for name, column in covariates.items()}
+    return PixelSample(read[drawn.frame.numpy()], values, errors)
 
 
 def thinned(values: np.ndarray, most: int) -> np.ndarray:
@@ -226,33 +234,6 @@ def errors_along_ray(
     residual = distance_to_plane(model, batch, rays)
     cosine = cosine_of_incidence(model, batch, rays)
     return torch.where(batch.valid, 1e3 * residual / cosine, torch.nan), cosine
-
-
-def _sample(
-    dataset: Dataset, stages: Mapping[str, CalibrationModel], batch: FrameBatch, step: int
-) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return frame, covariates and errors of some pixels of a batch, as in `PixelSample`."""
-    valid = batch.valid.reshape(-1).nonzero()[:, 0]
-    # At random: a regular step would meet the same columns in every row. Figures do not change.
-    chosen = some_pixels(valid, len(valid) // step + 1, seed=0)
-    height, width = batch.valid.shape[1:]
-    pixel = chosen % (height * width)
-    errors, cosine = {}, None
-    for name, model in stages.items():
-        error, cosine = errors_along_ray(dataset, model, batch)
-        errors[name] = error.reshape(-1)[chosen].numpy()
-    covariates = {
-        "distance [m]": batch.radial_distance.reshape(-1)[chosen],
-        "row [pixel]": pixel // width,
-        "column [pixel]": pixel % width,
-    }
-    if batch.amplitude is not None:
-        covariates["amplitude [camera's units]"] = batch.amplitude.reshape(-1)[chosen]
-    if cosine is not None:
-        angle = torch.rad2deg(torch.acos(cosine.reshape(-1)[chosen].abs().clamp(max=1.0)))
-        covariates["angle of incidence [degrees]"] = angle
-    values = {name: column.numpy().astype(np.float64) for name, column in covariates.items()}
-    return batch.indices[chosen // (height * width)].numpy(), values, errors
 
 
 def estimate_noise(
