@@ -133,32 +133,34 @@ and would look like information. A hundredth of a millimetre is far below any ca
 class Parameters:
     """A point in the space of the unknowns: the hand-eye's twist, then the coefficients.
 
+    Or many of them, a batch (...).
+
     Attributes:
-        tool_from_camera: The hand-eye transform, shape (4, 4).
-        coefficients: Constant and coefficients of the error model, shape (K,), metres.
+        tool_from_camera: The hand-eye transform, shape (..., 4, 4).
+        coefficients: Constant and coefficients of the error model, shape (..., K), metres.
         hand_eye_is_free: Whether the hand-eye is estimated; it is fixed without a robot.
     """
 
-    tool_from_camera: Float[Tensor, "4 4"]
-    coefficients: Float[Tensor, "K"]
+    tool_from_camera: Float[Tensor, "*B 4 4"]
+    coefficients: Float[Tensor, "*B K"]
     hand_eye_is_free: bool = True
 
     @property
     def size(self) -> int:
         """How many unknowns there are."""
-        return self.twist_size + self.coefficients.numel()
+        return self.twist_size + self.coefficients.shape[-1]
 
     @property
     def twist_size(self) -> int:
         """6 if the hand-eye is estimated, else 0."""
         return 6 if self.hand_eye_is_free else 0
 
-    def moved(self, step: Float[Tensor, "P"]) -> "Parameters":
+    def moved(self, step: Float[Tensor, "*B P"]) -> "Parameters":
         """Return T exp(step[:6]) and coefficients + step[6:]; differentiable in the step (P,)."""
-        transform = self.tool_from_camera
+        transform = self.tool_from_camera.expand(*step.shape[:-1], 4, 4)
         if self.hand_eye_is_free:
-            transform = transform @ se3.exp(step[:6])
-        moved = self.coefficients + step[self.twist_size : self.size]
+            transform = transform @ se3.exp(step[..., :6])
+        moved = self.coefficients + step[..., self.twist_size : self.size]
         return replace(self, tool_from_camera=transform, coefficients=moved)
 
     def step_to(self, other: "Parameters") -> Float[Tensor, "P"]:
@@ -174,13 +176,31 @@ class Parameters:
         transform, coefficients = self.tool_from_camera.detach(), self.coefficients.detach()
         return replace(self, tool_from_camera=transform, coefficients=coefficients)
 
-    def by_entries(self) -> Float[Tensor, "4 S"]:
+    def by_entries(self) -> Float[Tensor, "*B 4 S"]:
         """Return the matrix A whose rows a plane (m_i, e_i) sums to its residual vector."""
-        return plane_entries(self.tool_from_camera, self.coefficients)
+        b = torch.nn.functional.pad(-self.coefficients, (1, 0), value=1.0)
+        rotation = self.tool_from_camera[..., :3, :3]
+        normals = (b[..., None, :, None] * rotation[..., :, None, :]).flatten(-2)
+        normals = torch.nn.functional.pad(normals, (0, 0, 0, 1))
+        last = torch.nn.functional.pad(self.tool_from_camera[..., :3, 3:], (0, 0, 0, 1), value=1.0)
+        return torch.cat([normals, last], dim=-1)
 
-    def slope(self) -> Float[Tensor, "4 S P"]:
-        """Return the derivative of that matrix by a step."""
-        return slope_of_entries(self.tool_from_camera, self.coefficients, self.twist_size)
+    def slope(self) -> Float[Tensor, "*B 4 S P"]:
+        """Return the derivative of that matrix by a step of `moved`."""
+        rotation, twist_size = self.tool_from_camera[..., :3, :3], self.twist_size
+        num = self.coefficients.shape[-1]
+        slope = rotation.new_zeros(*rotation.shape[:-2], 4, 3 * num + 4, twist_size + num)
+        if twist_size:
+            # (R exp(w))^T m = exp(-w) a = a + a x w: the derivative is the cross matrix of a.
+            b = torch.nn.functional.pad(-self.coefficients, (1, 0), value=1.0)
+            axes = torch.eye(3).to(rotation).expand(*rotation.shape[:-1], 3, 3)
+            crossed = torch.linalg.cross(rotation[..., None, :], axes).mT
+            slope[..., :3, -1, :3] = rotation
+            turned = b[..., None, :, None, None] * crossed[..., :, None, :, :]
+            slope[..., :3, :-1, 3:6] = turned.flatten(-3, -2)
+        for k in range(num):
+            slope[..., :3, 3 * (k + 1) : 3 * (k + 2), twist_size + k] = -rotation
+        return slope
 
 
 @runtime_checkable
@@ -293,37 +313,6 @@ class MomentObjective:
 def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S"]:
     """Return p_i = (b outer R^T m_i, m_i . t + e_i), shape (N, S), S = 3C + 1."""
     return moments.planes @ parameters.by_entries()
-
-
-def plane_entries(
-    transform: Float[Tensor, "*B 4 4"], coefficients: Float[Tensor, "*B K"]
-) -> Float[Tensor, "*B 4 S"]:
-    """Return the matrices A of hand-eye transforms and coefficients, see `MomentObjective`."""
-    b = torch.nn.functional.pad(-coefficients, (1, 0), value=1.0)
-    rotation, translation = transform[..., :3, :3], transform[..., :3, 3:]
-    normals = (b[..., None, :, None] * rotation[..., :, None, :]).flatten(-2)
-    offset = torch.zeros_like(normals[..., :1, :])
-    last = torch.cat([translation, torch.ones_like(translation[..., :1, :])], dim=-2)
-    return torch.cat([torch.cat([normals, offset], dim=-2), last], dim=-1)
-
-
-def slope_of_entries(
-    transform: Float[Tensor, "*B 4 4"], coefficients: Float[Tensor, "*B K"], twist_size: int
-) -> Float[Tensor, "*B 4 S P"]:
-    """Return the derivatives of `plane_entries` by a step of `Parameters.moved`."""
-    rotation, num = transform[..., :3, :3], coefficients.shape[-1]
-    slope = rotation.new_zeros(*transform.shape[:-2], 4, 3 * num + 4, twist_size + num)
-    if twist_size:
-        # (R exp(w))^T m = exp(-w) a = a + a x w: the derivative is the cross matrix of a.
-        b = torch.nn.functional.pad(-coefficients, (1, 0), value=1.0)
-        axes = torch.eye(3).to(rotation).expand(*rotation.shape[:-1], 3, 3)
-        crossed = torch.linalg.cross(rotation[..., None, :], axes).mT
-        slope[..., :3, -1, :3] = rotation
-        turned = b[..., None, :, None, None] * crossed[..., :, None, :, :]
-        slope[..., :3, :-1, 3:6] = turned.flatten(-3, -2)
-    for k in range(num):
-        slope[..., :3, 3 * (k + 1) : 3 * (k + 2), twist_size + k] = -rotation
-    return slope
 
 
 def _change_of_entries(origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, "4 S"]:

@@ -33,8 +33,6 @@ from tofcorr.estimation.moments import (
     MomentObjective,
     Parameters,
     Prior,
-    plane_entries,
-    slope_of_entries,
 )
 from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian
 from tofcorr.geometry import se3
@@ -164,13 +162,10 @@ def bootstrap(
     # Matrices of 4 million entries are held at once: 32 MB.
     entries = (4 * moments.gram.shape[-1]) ** 2
     for chunk in torch.arange(len(weights)).split(max(1, 4_000_000 // entries)):
-        transform = optimum.tool_from_camera.expand(len(chunk), 4, 4)
-        if twist_size:
-            transform = transform @ se3.exp(steps[chunk, :6])
-        coefficients = optimum.coefficients + steps[chunk, twist_size:]
-        slope = slope_of_entries(transform, coefficients, twist_size).flatten(1, 2)
+        here = optimum.moved(steps[chunk])
+        slope = here.slope().flatten(1, 2)
         weighted = objective.joint(weights[chunk]) @ slope
-        at = plane_entries(transform, coefficients).flatten(1)[:, None]
+        at = here.by_entries().flatten(1)[:, None]
         found = NormalEquations(at.new_zeros(()), (at @ weighted)[:, 0], slope.mT @ weighted)
         if held is not None:
             found = found.plus(held._replace(gradient=held.gradient + steps[chunk] @ held.hessian))
