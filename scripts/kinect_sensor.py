@@ -64,7 +64,7 @@ def main(recording_path: Path, out: Path) -> None:
     print(f"noise: {noise.curve} from {noise.source}")
     print(f"missing: {missing.model} ({missing.share:.4f} of the pixels)")
     state = calibration_state(result.data, result.options, result.fit)
-    pixels = int(observed.pose_pixels.sum())
+    pixels = int(observed.map_frames.sum())
     terms = state.error_model.with_columns().terms
     sensor = SensorFile(
         format="tofcorr-sensor",

@@ -98,9 +98,9 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
     """
     amplitude, recorded = _amplitude_everywhere(observed)
     saturation, stated = _saturation(observed, amplitude)
-    table, pixels = observed.table, max(observed.pose_pixels.sum(), 1)
+    table, pixels = observed.table, max(observed.map_frames.sum(), 1)
     beyond = amplitude >= (np.inf if saturation is None else saturation)
-    saturated = observed.pose_saturated.sum() / pixels
+    saturated = observed.saturated / pixels
     if not stated:
         saturated = table.frames[beyond].sum() / max(table.frames.sum(), 1)
     border = border_of(observed.map_frames.shape)
@@ -110,7 +110,7 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
     )
     return DropoutMeasurement(
         model=_fitted(observed, amplitude, saturation),
-        share=float(observed.pose_missing.sum() / pixels),
+        share=float(observed.map_missing.sum() / pixels),
         saturated_share=float(saturated),
         saturated_missing=float(table.missing[beyond].sum() / max(table.frames.sum(), 1)),
         map=quotient(observed.map_missing, observed.map_frames),
@@ -189,7 +189,7 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
     ]
     best = min(tried, key=lambda found: found.fun)
     # Half the 95 % quantile of chi-square with two degrees of freedom, for each pose with any.
-    if unlikely(base) - best.fun < 3 * max((observed.pose_missing > 0).sum(), 1):
+    if unlikely(base) - best.fun < 3 * max(observed.losing_poses, 1):
         return plain
     found = model(best.x)
     return found if found.base_share * total >= 1 else found.model_copy(update={"base_share": 0.0})

@@ -75,9 +75,8 @@ class Observed:
             m^2; NaN without repeats.
         map_missing: How often each pixel was missing, shape (H, W).
         map_frames: In how many frames it looked at the target, shape (H, W).
-        pose_missing: Missing pixels of each pose, shape (P,).
-        pose_saturated: Saturated pixels of each pose, shape (P,).
-        pose_pixels: Pixels of each pose on the target, all frames, shape (P,).
+        losing_poses: How many poses miss a pixel.
+        saturated: How many pixels of all frames are saturated.
     """
 
     recording: Recording
@@ -91,9 +90,8 @@ class Observed:
     repeated: np.ndarray
     map_missing: np.ndarray
     map_frames: np.ndarray
-    pose_missing: np.ndarray
-    pose_saturated: np.ndarray
-    pose_pixels: np.ndarray
+    losing_poses: int
+    saturated: int
 
 
 def observe(recording: Recording) -> Observed:
@@ -114,23 +112,22 @@ def observe(recording: Recording) -> Observed:
     tables, temporal, within, repeated, between, counts = ([] for _ in range(6))
     for number, images in enumerate(_iterate_poses(recording)):
         residual, weight = _clipped(images.residual, images.amplitude)
-        mean = known_mean(residual)
-        whole.add(mean, weight, images.place)
-        temporal.append(_products(residual - mean, images.amplitude))
+        whole.add(known_mean(residual), weight, images.place)
         second = {axis: second_differences(residual, images.amplitude, axis) for axis in AXES}
-        within.append(_differences_within(images, residual, weight, second, shared))
+        sums = _of_neighbours(images, residual, weight, second, shared)
+        temporal.append(sums[0])
+        within.append(sums[1])
         repeated.append(_repeated_variance(residual))
         between.append(_frame_differences(residual))
         tables.append(_rows(images, residual, second, (number, names.index(images.target)), shape))
-        sums = (images.missing, images.saturated, images.on_target)
-        maps[:, *images.place] += sums[0].sum(0), sums[2].sum(0)
-        counts.append([len(residual), *(each.sum() for each in sums)])
+        maps[:, *images.place] += images.missing.sum(0), images.on_target.sum(0)
+        counts.append([len(residual), images.missing.any(), images.saturated.sum()])
     table = np.concatenate(tables).view(np.recarray)
     if not np.isfinite(table.distance).any():
         raise CalibrationDataError(
             f"{recording.path}: no image has 100 usable pixels on the target, as noise needs."
         )
-    repeats, missing, saturated, pixels = np.array(counts).T
+    repeats, losing, saturated = np.array(counts).T
     return Observed(
         recording=recording,
         table=table,
@@ -143,9 +140,8 @@ def observe(recording: Recording) -> Observed:
         repeated=np.array(repeated),
         map_missing=maps[0],
         map_frames=maps[1],
-        pose_missing=missing,
-        pose_saturated=saturated,
-        pose_pixels=pixels,
+        losing_poses=int(losing.sum()),
+        saturated=int(saturated.sum()),
     )
 
 
@@ -417,40 +413,35 @@ def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: i
     return found
 
 
-def _products(deviation: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:
-    """Sum products of neighbouring deviations (R, H, W) from the mean of the repeats, (3, 2, 2)."""
-    sums = np.zeros((3, len(AXES), len(LAGS)))
-    if len(deviation) < 2:
-        return sums
-    for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
-        first, second = _shifted_pair(deviation, axis, lag)
-        both = np.isfinite(first) & np.isfinite(second)
-        if amplitude is not None:
-            both &= _alike(amplitude.mean(0), axis, lag)
-        first, second = first[both], second[both]
-        squares = (first @ first + second @ second) / 2
-        sums[:, row, column] = first @ second, squares, len(first)
-    return sums
-
-
-def _differences_within(
+def _of_neighbours(
     images: _PoseImages,
     residual: np.ndarray,
     weight: np.ndarray,
     second: dict[int, np.ndarray],
     shared: dict[tuple[int, int], _BetweenPoses],
 ) -> np.ndarray:
-    """Sum half squares of differences of neighbours, where there is a second difference too.
+    """Sum over neighbours along each axis, at each lag, what `Observed` says.
 
     Returns:
-        Shape (3, 2, 2); what poses share of both kinds of differences is added to `shared`.
+        `temporal`: products of deviations from the mean of the repeats; `within`: half squares of
+        differences in one image, where there is a second difference too; shape (2, 3, 2, 2). What
+        poses share of both kinds of differences is added to `shared`.
     """
-    sums = np.zeros((3, len(AXES), len(LAGS)))
+    sums = np.zeros((2, 3, len(AXES), len(LAGS)))
+    deviation = residual - known_mean(residual)
     for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
+        if len(deviation) > 1:
+            first, later = _shifted_pair(deviation, axis, lag)
+            both = np.isfinite(first) & np.isfinite(later)
+            if images.amplitude is not None:
+                both &= _alike(images.amplitude.mean(0), axis, lag)
+            first, later = first[both], later[both]
+            squares = (first @ first + later @ later) / 2
+            sums[0, :, row, column] = first @ later, squares, len(first)
         found = _differences(residual, images.amplitude, axis, lag) / 2**0.5
         at, _ = _shifted_pair(second[axis], axis, lag)
         both = np.isfinite(found) & np.isfinite(at)
-        sums[:, row, column] = (found[both] ** 2).sum(), (at[both] ** 2).sum(), both.sum()
+        sums[1, :, row, column] = (found[both] ** 2).sum(), (at[both] ** 2).sum(), both.sum()
         mean = known_mean(np.where(both, found, np.nan))
         shared[axis, lag].add(mean, _shifted_pair(weight, axis, lag)[0], images.place)
     for axis in AXES:
