@@ -15,9 +15,7 @@ from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SensorOptions
 from tofcorr.simulation.scene import SceneOptions
 from tofcorr.simulation.signal import (
-    LightOptions,
     ReadoutOptions,
-    amplitude_per_reflectivity,
     read_out,
 )
 from tofcorr.simulation.simulator import SensorPipeline
@@ -69,25 +67,19 @@ def test_amplitude_falls_with_the_square_of_the_distance(measure: Measure) -> No
     torch.testing.assert_close(near / far, torch.full_like(near, 9.0))
 
 
-def test_amplitude_follows_the_cosine_of_incidence() -> None:
-    rays = ray_directions(CAMERA)
-    distance = torch.full_like(rays[..., 0], 1.3)
-    frontal = amplitude_per_reflectivity(
-        LightOptions(), distance, torch.ones_like(distance), rays, None
-    )
-    oblique = amplitude_per_reflectivity(
-        LightOptions(), distance, torch.full_like(distance, math.cos(1.0)), rays, None
-    )
-    torch.testing.assert_close(oblique / frontal, torch.full_like(distance, math.cos(1.0)))
-
-
-def test_state_holds_the_cosine_of_incidence_and_points_on_the_plane(measure: Measure) -> None:
+def test_a_tilted_wall_is_met_on_its_plane_lit_by_the_cosine_of_incidence_and_measured_exactly(
+    measure: Measure,
+) -> None:
     tilt = 0.5
     state = measure(1.2, tilt)
     expected = -(ray_directions(CAMERA) @ state.normal_world)
     torch.testing.assert_close(state.incidence_cosine, expected)
     height = state.points_world @ state.normal_world + state.offset
     assert height.abs().max() < 1e-12
+    full = 300_000.0 * 0.5 / 40.0 * ray_directions(CAMERA)[..., 2] ** 4 * 0.8
+    lit = full * expected / state.radial_distance**2
+    torch.testing.assert_close(state.measured_amplitude, lit)
+    assert (state.measured_distance - state.radial_distance).abs().max() < 1e-9
 
 
 def test_frontal_wall_is_vignetted_as_the_fourth_power(measure: Measure) -> None:
@@ -101,11 +93,6 @@ def test_integration_time_scales_light(measure: Measure) -> None:
     base = measure(1.0, integration_time=500e-6).measured_amplitude
     longer = measure(1.0, integration_time=1500e-6).measured_amplitude
     torch.testing.assert_close(longer, 3 * base)
-
-
-def test_noise_free_sine_returns_the_true_distance(measure: Measure) -> None:
-    state = measure(1.4, 0.4)
-    assert (state.measured_distance - state.radial_distance).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("ambient", [0.0, 2000.0])

@@ -120,51 +120,40 @@ def test_conditions_reach_the_recording_or_stay_unknown(small: Small, tmp_path: 
     assert (table.pose_id, table.integration_time, table.ambient) == (None, None, None)
 
 
-class _Recorder(Effect):
-    """Notes the stages it is called in and what is ready by then."""
-
-    def __init__(self) -> None:
-        self.calls: list[str] = []
-
-    def on_pose(self, state: FrameState) -> None:
+def _changed(stage: str, state: FrameState) -> dict[str, Any]:
+    """Return what an effect changes at a stage, from what is ready by then."""
+    if stage == "pose":
         assert state.radial_distance.numel() == 0
-        self.calls.append("pose")
-        state.offset = state.offset - 0.1
-
-    def on_geometry(self, state: FrameState) -> None:
-        self.calls.append("geometry")
-
-    def on_light(self, state: FrameState) -> None:
-        self.calls.append("light")
-        state.amplitude = 0.5 * state.amplitude
-
-    def on_delay(self, state: FrameState) -> None:
-        self.calls.append("delay")
-        state.delay = state.delay + 0.02
-
-    def on_signal(self, state: FrameState) -> None:
-        self.calls.append("signal")
-        state.signal = state.signal * state.path_phasor(0.03)
-        state.tap_delay = torch.full((4, 12, 16), 0.04, dtype=torch.float64)
-
-    def on_taps(self, state: FrameState) -> None:
-        self.calls.append("taps")
-        state.taps = state.taps + 1000.0
-
-    def on_readout(self, state: FrameState) -> None:
-        self.calls.append("readout")
-        state.measured_distance = state.measured_distance + 0.05
+    changes: dict[str, Callable[[], dict[str, Any]]] = {
+        "pose": lambda: {"offset": state.offset - 0.1},
+        "light": lambda: {"amplitude": 0.5 * state.amplitude},
+        "delay": lambda: {"delay": state.delay + 0.02},
+        "signal": lambda: {
+            "signal": state.signal * state.path_phasor(0.03),
+            "tap_delay": torch.full((4, 12, 16), 0.04, dtype=torch.float64),
+        },
+        "taps": lambda: {"taps": state.taps + 1000.0},
+        "readout": lambda: {"measured_distance": state.measured_distance + 0.05},
+    }
+    return changes.get(stage, dict)()
 
 
 def test_effects_act_in_every_stage_in_order(small: Small) -> None:
     options = small()
     plan = draw_plan(options, seeded(options), num_frames=1)
     plain = next(take_frames(options, plan, None))
-    effect = _Recorder()
+    effect, calls = Effect(), []
+    for stage in STAGES:
+
+        def act(state: FrameState, stage: str = stage) -> None:
+            calls.append(stage)
+            vars(state).update(_changed(stage, state))
+
+        setattr(effect, f"on_{stage}", act)
     pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (effect,))
     state = replace(plan[0], world_from_tool=plan[0].world_from_tool_recorded)
     pipeline.run(state)
-    assert effect.calls == list(STAGES)
+    assert calls == list(STAGES)
     error = state.measured_distance - state.radial_distance
     torch.testing.assert_close(error, torch.full_like(error, 0.02 + 0.03 + 0.04 + 0.05))
     # The wall came nearer by 0.1 m, and of the light that this gives half arrived.

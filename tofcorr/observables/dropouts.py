@@ -174,7 +174,7 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
 
     def unlikely(probability: np.ndarray | float) -> float:
         """Return the negative log likelihood."""
-        sure = np.clip(probability, 1e-9, 1.0 - 1e-9)
+        sure = np.clip(probability, np.finfo(float).eps, 1.0 - np.finfo(float).eps)
         return float(-(lost * np.log(sure) + (count - lost) * np.log1p(-sure)).sum())
 
     base = missing.sum() / frames.sum()
@@ -183,7 +183,6 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
             lambda x: unlikely(model(x).probability(np.exp(centre))),
             np.array([logit(np.clip(base / 2, 1e-6, 1.0)), start, np.log(0.1)]),
             method="Nelder-Mead",
-            options={"maxiter": 2000, "xatol": 1e-4, "fatol": 1e-3},
         )
         for start in np.quantile(centre, (0.02, 0.1, 0.3))
     ]

@@ -49,13 +49,13 @@ class AmbientLightEffect(LinearDelay):
         """Take the strongest background as unit."""
         ambient = inputs.facts.ambient
         strongest = 0.0 if ambient is None else float(ambient.max())
-        return cls(AmbientLightShape(reference_counts=max(strongest, 1e-6)))
+        return cls(AmbientLightShape(reference_counts=strongest or 1.0))
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return share, background, logarithm and false signals, shape (M, 7)."""
         background = inputs.of_frame(known(inputs.facts, "ambient"))
-        amplitude = inputs.known_amplitude.clamp(min=1e-3 * self.shape.reference_counts)
-        share = background / (amplitude + background).clamp(min=1e-12)
+        amplitude = inputs.known_amplitude.clamp(min=self.shape.reference_counts / 1000)
+        share = background / (amplitude + background)
         linear = background / self.shape.reference_counts
         ratio = background / amplitude
         returned = linear * inputs.radial_distance**2 / inputs.incidence_cosine

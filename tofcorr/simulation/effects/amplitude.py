@@ -1,8 +1,8 @@
 """Error that depends on the amplitude, of higher order than the base model's quadratic."""
 
+import math
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
@@ -57,15 +57,15 @@ class AmplitudeEffect(LinearDelay):
     def terms(cls, shape: AmplitudeShape) -> tuple[Coefficient, ...]:
         """Return the coefficients of the logarithm, then of the amplitude itself."""
         logarithm = [
-            Coefficient(f"log_{k}", "m", 0.04 / (1 + 0.5 * k)) for k in range(1, shape.degree + 1)
+            Coefficient(f"log_{k}", "m", 2 * cls.prior / (1 + 0.5 * k))
+            for k in range(1, shape.degree + 1)
         ]
-        return (*logarithm, Coefficient("linear", "m", 0.03), Coefficient("square", "m", 0.03))
+        return (*logarithm, *(Coefficient(name, "m", 0.03) for name in ("linear", "square")))
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the functions of the amplitude, shape (M, K)."""
         low, high = self.shape.low_counts, self.shape.high_counts
         amplitude = inputs.known_amplitude.clamp(low, high)
-        ends = torch.tensor([low, high], dtype=torch.float64).log()
-        scaled = 2 * (amplitude.log() - ends[0]) / (ends[1] - ends[0]).clamp(min=1e-9) - 1
+        scaled = 2 * (amplitude / low).log() / (math.log(high / low) or 1.0) - 1
         share = amplitude / high
         return side_by_side([*legendre(scaled, self.shape.degree)[1:], share, share**2])

@@ -68,6 +68,7 @@ class CatalogueEffect(Effect, ABC):
         of_frame: Whether the shift is the same in all pixels of a frame.
         moves_images: Whether it displaces camera or target, which mostly shifts whole images.
         fixed_terms: The coefficients, where they do not depend on the shape.
+        prior: Standard deviation of the priors of its main coefficients, where `terms` names them.
         form_error: What a real effect of this kind may leave of itself, as a share of what these
             columns explain of it (root mean squares): no two lenses, rooms or robots are alike. At
             0.7 they explain two thirds of its squares; of 91 simulated recordings 85 did.
@@ -87,6 +88,7 @@ class CatalogueEffect(Effect, ABC):
     in_few_images: ClassVar[bool] = False
     of_frame: ClassVar[bool] = False
     moves_images: ClassVar[bool] = False
+    prior: ClassVar[float] = 0.02
     form_error: ClassVar[float] = 0.7
     may_be: ClassVar[tuple[str, ...]] = ()
     reads_light: ClassVar[bool] = False

@@ -34,6 +34,7 @@ class DistanceEffect(LinearDelay):
     source = "Lindner and Kolb 2006; Kahlmann et al. 2006"
     remedy = "more distances over the whole range, at one tilt and one reflectivity"
     shape_type: ClassVar[type[Options]] = DistanceShape
+    prior, decay = 0.06, 1.3
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "DistanceEffect":
@@ -45,11 +46,12 @@ class DistanceEffect(LinearDelay):
     def terms(cls, shape: DistanceShape) -> tuple[Coefficient, ...]:
         """Return c1, c2, ...; the prior is smaller for higher degrees."""
         return tuple(
-            Coefficient(f"legendre_{k}", "m", 0.06 / k**1.3) for k in range(1, shape.degree + 1)
+            Coefficient(f"legendre_{k}", "m", cls.prior / k**cls.decay)
+            for k in range(1, shape.degree + 1)
         )
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the Legendre polynomials, shape (M, K)."""
         low, high = self.shape.low_m, self.shape.high_m
-        scaled = 2 * (inputs.radial_distance - low) / max(high - low, 1e-9) - 1
+        scaled = 2 * (inputs.radial_distance - low) / ((high - low) or 1.0) - 1
         return side_by_side(legendre(scaled.clamp(-1.0, 1.0), self.shape.degree)[1:])

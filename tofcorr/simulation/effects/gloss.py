@@ -37,7 +37,7 @@ class GlossEffect(LinearDelay):
     @classmethod
     def terms(cls, shape: GlossShape) -> tuple[Coefficient, ...]:
         """Return the shift at the middle of each lobe: plastics delay light by millimetres."""
-        return tuple(Coefficient(f"lobe_{width:g}deg", "m", 0.02) for width in shape.width_deg)
+        return tuple(Coefficient(f"lobe_{width:g}deg", "m", cls.prior) for width in shape.width_deg)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the lobes, shape (M, K)."""

@@ -37,6 +37,7 @@ class IntegrationTimeEffect(FrameEffect):
     needs = (INTEGRATION_TIME,)
     linear = True
     shape_type: ClassVar[type[Options]] = IntegrationTimeShape
+    prior = 0.03
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "IntegrationTimeEffect":
@@ -52,7 +53,9 @@ class IntegrationTimeEffect(FrameEffect):
     @classmethod
     def terms(cls, shape: IntegrationTimeShape) -> tuple[Coefficient, ...]:
         """Return the coefficients of the powers of the logarithm."""
-        return tuple(Coefficient(f"log_{k}", "m", 0.03 / k) for k in range(1, shape.degree + 1))
+        return tuple(
+            Coefficient(f"log_{k}", "m", cls.prior / k) for k in range(1, shape.degree + 1)
+        )
 
     def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
         """Return the polynomial of the logarithm, shape (F,), metres."""

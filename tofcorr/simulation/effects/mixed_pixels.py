@@ -53,7 +53,7 @@ class MixedPixelsEffect(CatalogueEffect):
     def terms(cls, shape: MixedPixelsShape) -> tuple[Coefficient, ...]:
         """Return the shares of the neighbours, then the coefficients of edges."""
         shares = [Coefficient(f"share_{sigma:g}px", "1", 1.0) for sigma in shape.sigma_px]
-        return (*shares, *(Coefficient(name, "m", 0.02) for name in _EDGES))
+        return (*shares, *(Coefficient(name, "m", cls.prior) for name in _EDGES))
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the mixed phase and of the edges, shape (M,), metres."""

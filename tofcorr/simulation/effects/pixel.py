@@ -33,6 +33,7 @@ class PixelEffect(LinearDelay):
     source = "Fuchs and May 2007; Abdo and Borgeat 2010"
     remedy = "a white wall, frontal, at three or more distances, with the camera rolled"
     shape_type: ClassVar[type[Options]] = PixelShape
+    prior, decay = 0.04, 1.3
     may_be = ("fixed_pattern",)  # A pattern of the sensor may be smooth.
 
     @classmethod
@@ -44,10 +45,10 @@ class PixelEffect(LinearDelay):
     def terms(cls, shape: PixelShape) -> tuple[Coefficient, ...]:
         """Return the surface's coefficients, then those that grow with the distance."""
         surface = [
-            Coefficient(f"x{i}_y{j}", "m", 0.04 / (i + j) ** 1.3)
+            Coefficient(f"x{i}_y{j}", "m", cls.prior / (i + j) ** cls.decay)
             for i, j in exponents(1, shape.degree)
         ]
-        growth = [Coefficient(f"growth_{part}", "m", 0.02) for part in ("x", "y", "r2")]
+        growth = [Coefficient(f"growth_{part}", "m", cls.prior / 2) for part in ("x", "y", "r2")]
         return (*surface, *growth)
 
     def columns(self, inputs: EffectInputs) -> Tensor:

@@ -104,7 +104,7 @@ class SaturationEffect(CatalogueEffect):
         ambient, contrast = inputs.facts.ambient, SaturationShape().contrast
         full = (1 + 1 / contrast) * inner_range(inputs.known_amplitude, _BRIGHTER)[1]
         full += 0.0 if ambient is None else float(ambient.nan_to_num(0.0).max())
-        return cls(SaturationShape(full_counts=max(full, 1e-6)))
+        return cls(SaturationShape(full_counts=full or 1.0))
 
     @classmethod
     def terms(cls, shape: SaturationShape) -> tuple[Coefficient, ...]:

@@ -35,6 +35,7 @@ class TargetShapeEffect(LinearEffect):
     remedy = "look at another part of the target, or rotate it in its plane"
     needs = (FIXED_TARGET,)
     shape_type: ClassVar[type[Options]] = TargetShapeShape
+    prior = 0.03
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
@@ -46,7 +47,8 @@ class TargetShapeEffect(LinearEffect):
     def terms(cls, shape: TargetShapeShape) -> tuple[Coefficient, ...]:
         """Return the heights; the prior is smaller for shorter waves."""
         return tuple(
-            Coefficient(f"x{i}_y{j}", "m", 0.03 / (i + j)) for i, j in exponents(2, shape.degree)
+            Coefficient(f"x{i}_y{j}", "m", cls.prior / (i + j))
+            for i, j in exponents(2, shape.degree)
         )
 
     def columns(self, inputs: EffectInputs) -> Tensor:

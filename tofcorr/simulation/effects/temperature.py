@@ -66,16 +66,16 @@ class WarmUpEffect(FrameEffect):
         reference = None
         if body is not None and bool(torch.isfinite(body).all()):
             reference = float(body.mean())
-        shape = WarmUpShape(frame_interval_s=max(interval, 1e-3), body_reference_c=reference)
+        shape = WarmUpShape(frame_interval_s=interval or 1.0, body_reference_c=reference)
         return cls(shape)
 
     @classmethod
     def terms(cls, shape: WarmUpShape) -> tuple[Coefficient, ...]:
         """Return one coefficient per time constant, and one of the body temperature if known."""
-        rise = [Coefficient(f"rise_{t:g}s", "m", 0.02) for t in shape.rise_s]
-        heat = [Coefficient(f"heat_{t:g}s", "m", 0.02) for t in shape.heat_s]
+        rise = [Coefficient(f"rise_{t:g}s", "m", cls.prior) for t in shape.rise_s]
+        heat = [Coefficient(f"heat_{t:g}s", "m", cls.prior) for t in shape.heat_s]
         known = shape.body_reference_c is not None
-        body = [Coefficient("body_10k", "m", 0.02)] if known else []
+        body = [Coefficient("body_10k", "m", cls.prior)] if known else []
         return (*rise, *heat, *body)
 
     def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
@@ -140,12 +140,14 @@ class RoomTemperatureEffect(FrameEffect):
     remedy = "the same poses at room temperatures at least 3 degrees apart, logged"
     needs = (ROOM_TEMPERATURE,)
     shape_type: ClassVar[type[Options]] = RoomTemperatureShape
+    prior, prior_start = 0.008, 1.5
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the mean temperature as reference, and the times after the longest pauses."""
         room, times = inputs.facts.room_temperature, inputs.facts.timestamp.sort().values
-        shape = RoomTemperatureShape(reference_c=22.0 if room is None else float(room.mean()))
+        mean = {} if room is None else {"reference_c": float(room.mean())}
+        shape = RoomTemperatureShape(**mean)
         pauses = times.diff()
         longest = pauses.argsort(descending=True)[:_MOST_PAUSES].sort().values
         after = [times[i + 1] for i in longest if pauses[i] > min(shape.lags_s)]
@@ -155,12 +157,17 @@ class RoomTemperatureEffect(FrameEffect):
     @classmethod
     def terms(cls, shape: RoomTemperatureShape) -> tuple[Coefficient, ...]:
         """Return the coefficients of immediate, lagged, squared and earlier temperature."""
-        lagged = [Coefficient(f"lagged_{lag:g}s_per_degree", "m/K", 0.008) for lag in shape.lags_s]
+        lagged = [
+            Coefficient(f"lagged_{lag:g}s_per_degree", "m/K", cls.prior) for lag in shape.lags_s
+        ]
         return (
-            Coefficient("per_degree", "m/K", 0.008),
+            Coefficient("per_degree", "m/K", cls.prior),
             *lagged,
-            Coefficient("square", "m/K^2", 0.001),
-            *(Coefficient(f"start_{i}", "K", 1.5) for i, _ in enumerate(shape.starts_s)),
+            Coefficient("square", "m/K^2", cls.prior / 8),
+            *(
+                Coefficient(f"start_{i}", "K", cls.prior_start)
+                for i, _ in enumerate(shape.starts_s)
+            ),
         )
 
     def in_other_recordings(self) -> Self:

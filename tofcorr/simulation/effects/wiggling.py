@@ -50,6 +50,7 @@ class WigglingEffect(SignalEffect):
     remedy = "many distances over one and a half periods of the error (a quarter of c / 2f each)"
     needs = (FREQUENCY,)
     shape_type: ClassVar[type[Options]] = WigglingShape
+    prior = 0.08
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
@@ -67,7 +68,7 @@ class WigglingEffect(SignalEffect):
         if shape.knows_amplitude:
             names.append((f"_{_CYCLES[0]}_amplitude", 2 * _CYCLES[0]))
         return tuple(
-            Coefficient(f"{wave}{name}", "m", 0.08 / rank)
+            Coefficient(f"{wave}{name}", "m", cls.prior / rank)
             for name, rank in names
             for wave in ("sin", "cos")
         )
@@ -81,8 +82,7 @@ class WigglingEffect(SignalEffect):
         """Add the harmonics of order n + 1 to the light."""
         scale = unambiguous_range(state.modulation_frequency) / (2 * torch.pi)
         fundamental = state.signal[0]
-        turn = fundamental / fundamental.abs().clamp(min=1e-30)
-        waves = self._waves(turn, inputs_from_state(state))
+        waves = self._waves(fundamental.sgn(), inputs_from_state(state))
         orders = [*(cycles + 1 for cycles in _CYCLES), _CYCLES[0] + 1]
         pairs = self.coefficients.reshape(-1, 2).unbind(0)
         for (sine, cosine), order, own in zip(pairs, orders, waves, strict=False):
