@@ -35,9 +35,8 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.options import TrainingOptions
-from tofcorr.training.result import calibration_state, run_reference
-from tofcorr.training.run import train
+from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.run import calibration_state, run_reference, train
 
 WALLS: tuple[Wall, ...] = ("per_image", "one", "recorded")
 FRAMES = (1, 3, 5, 10, 20, 40)

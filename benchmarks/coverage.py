@@ -25,7 +25,7 @@ from tofcorr.options import load_options
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import hand_eye_intervals
 
 NAMES = [f"{kind}_{axis}" for kind in "tw" for axis in "xyz"]

@@ -30,7 +30,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, covered_domain
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 NUM_FOLDS = 6
 NUM_RESAMPLES = 1000

@@ -67,7 +67,7 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import train
 
 SECONDS, MEMORY, LONGEST_MESSAGE = 20.0, 4 * 2**30, 5000

@@ -25,7 +25,7 @@ from benchmarks.renewed.world import draw_world
 from benchmarks.sealed.scores import share, table
 from tofcorr.estimation.robust import student_quantile
 from tofcorr.options import resolve_options
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")
 

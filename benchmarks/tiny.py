@@ -11,7 +11,7 @@ from tofcorr.data.writing import write_recording
 from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import train
 
 CONFIG: dict[str, Any] = {

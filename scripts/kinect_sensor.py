@@ -24,7 +24,7 @@ from tofcorr.sensor.sensor_file import (
     write_sensor,
 )
 from tofcorr.simulation.options import CameraOptions
-from tofcorr.training.result import calibration_state
+from tofcorr.training.run import calibration_state
 from tofcorr.training.run import train
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tofcorr import Recording
-    from tofcorr.fit.result import Fit
+    from tofcorr.fit.problem import Fit
 
 MOUNTS = {"P1": "mount 1", "P2": "mount 2"}
 WALLS = {"R1": "wall 1", "R2": "wall 2", "W1": "wall 3", "W2": "wall 4"}
@@ -113,7 +113,7 @@ def _imported(data: Path, mount: str, walls: tuple[str, ...], folder: Path) -> "
 def _fit(recording: "Recording", degree: int, frames: np.ndarray | None = None) -> "Fit":
     from tofcorr.fit.fitting import fit
     from tofcorr.pixels.dataset import Dataset, covered_domain
-    from tofcorr.training.options import TrainingOptions
+    from tofcorr.training.calibration import TrainingOptions
 
     terms = [{"kind": "distance_polynomial", "degree": degree}]
     options = TrainingOptions.from_mapping({"name": "D", "model": {"terms": terms}}, "trials")
@@ -133,7 +133,7 @@ def _origin(result: "Fit") -> Origin:
 
 def _predicted_rms(recording: "Recording", wall: str) -> float:
     """Fit the other walls; estimate this wall's plane alone; return its distances' RMS, mm."""
-    from tofcorr.fit.walls import name_walls, walls_alone
+    from tofcorr.fit.walls import walls_alone
     from tofcorr.pixels.dataset import Dataset
     from tofcorr.pixels.metrics import frame_errors
 
@@ -141,7 +141,7 @@ def _predicted_rms(recording: "Recording", wall: str) -> float:
     seen = np.flatnonzero(data.targets != wall)
     unseen = np.flatnonzero(data.targets == wall)
     model = _fit(recording, _PARABOLA, seen).model
-    data = walls_alone(data, name_walls(data), unseen, model).put_into(data)
+    data = walls_alone(data, unseen, model).put_into(data)
     return frame_errors(data, {"after": model}, unseen)["after"].rms_mm(unseen)
 
 

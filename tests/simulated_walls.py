@@ -12,7 +12,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.fit.fitting import fit
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit
 from tofcorr.geometry import se3
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.sample import usable_pixels
@@ -20,7 +20,7 @@ from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.robot import draw_plan
 from tofcorr.simulation.simulator import append_measurement, row_of, simulate, take_frames
 from tofcorr.training.advice import advise, draw_pool
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 CAMERA = {
     "width": 32,

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from tofcorr.sensor.degrade import degrade as degrade
     from tofcorr.sensor.model import SensorModel as SensorModel
     from tofcorr.simulation.simulator import simulate as simulate
-    from tofcorr.training.result import TrainingResult as TrainingResult
+    from tofcorr.training.run import TrainingResult as TrainingResult
     from tofcorr.training.run import train as train
 
 _NAMES = {
@@ -59,8 +59,7 @@ _NAMES = {
     "tofcorr.sensor.degrade": ("degrade",),
     "tofcorr.sensor.model": ("SensorModel",),
     "tofcorr.simulation.simulator": ("simulate",),
-    "tofcorr.training.result": ("TrainingResult",),
-    "tofcorr.training.run": ("train",),
+    "tofcorr.training.run": ("TrainingResult", "train"),
 }
 _PUBLIC = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = ["__version__", *sorted(_PUBLIC)]  # noqa: PLE0604  # pyright: ignore

@@ -26,7 +26,7 @@ import tofcorr
 from tofcorr.diagnosis.findings.impossible import LARGEST_GAP
 from tofcorr.errors import TofcorrError
 from tofcorr.options import resolve_options
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 # An error of the hand-eye counts as wrong above these, millimetres and degrees, and above so many
 # of its own standard errors.

@@ -16,7 +16,7 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.importing.registry import IMPORTERS
 from tofcorr.options import Options, resolve_options
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(CONFIGS.glob("*/*.yaml"))

@@ -9,7 +9,8 @@ import torch
 from comparison.evaluated import MODELS, options
 from synthetic_scene import Scene, write_scene
 
-from tofcorr.comparison.evaluate import SetEvaluation, evaluate_set
+from tofcorr.comparison.evaluate import evaluate_set
+from tofcorr.comparison.experiment import Experiment
 from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -17,21 +18,20 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit, fit_hand_eye
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.metrics import frame_errors
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 
 def test_every_split_is_measured_as_a_training_on_its_frames_would_be(
-    dataset: Dataset, evaluation: SetEvaluation
+    dataset: Dataset, evaluation: Experiment
 ) -> None:
     domain = covered_domain(dataset, np.arange(dataset.num_frames))
     for protocol in ("half", "folds", "repeats"):
         values = evaluation.values[protocol]
-        split = list(evaluation.experiment.splits[protocol].values())[-1]
+        test = list(evaluation.splits[protocol].values())[-1]
+        train = np.setdiff1d(np.arange(dataset.num_frames), test)
         for named in options().models:
-            trained = fit(
-                dataset, split.train, TrainingOptions(name="x", model=named.model), domain
-            )
-            expected = frame_errors(dataset, {"x": trained.model}, split.test)["x"]
+            trained = fit(dataset, train, TrainingOptions(name="x", model=named.model), domain)
+            expected = frame_errors(dataset, {"x": trained.model}, test)["x"]
             mean_abs = values["mean_abs_mm"][named.name][-1]
             rms = values["rms_mm"][named.name][-1]
             # Both fits end within a millionth of a standard error of the optimum.
@@ -40,12 +40,12 @@ def test_every_split_is_measured_as_a_training_on_its_frames_would_be(
 
 
 def test_before_is_the_recorded_hand_eye_without_correction(
-    dataset: Dataset, evaluation: SetEvaluation
+    dataset: Dataset, evaluation: Experiment
 ) -> None:
     domain = covered_domain(dataset, np.arange(dataset.num_frames))
     hand_eye = HandEye(dataset.first.tool_from_camera)
     bare = CalibrationModel(ErrorModel(ErrorModelOptions(), domain), hand_eye)
-    test = evaluation.experiment.splits["half"]["half"].test
+    test = evaluation.splits["half"]["half"]
     expected = frame_errors(dataset, {"bare": bare}, test)["bare"].mean_abs_mm()
     found = evaluation.values["half"]["mean_abs_mm"]
     assert found[BEFORE][0] == pytest.approx(expected, rel=1e-12)
@@ -53,10 +53,10 @@ def test_before_is_the_recorded_hand_eye_without_correction(
 
 
 def test_hand_eye_only_is_the_fit_of_the_hand_eye_without_any_term(
-    dataset: Dataset, evaluation: SetEvaluation
+    dataset: Dataset, evaluation: Experiment
 ) -> None:
     domain = covered_domain(dataset, np.arange(dataset.num_frames))
-    train = evaluation.experiment.splits["half"]["half"].train
+    train = np.setdiff1d(np.arange(dataset.num_frames), evaluation.splits["half"]["half"])
     alone = fit_hand_eye(
         dataset, train, TrainingOptions(name="x", model=ErrorModelOptions()), domain
     )
@@ -71,7 +71,7 @@ def test_errors_along_the_ray_and_in_z_are_those_of_the_true_distance(
     recording = dataset.first
     known = replace(recording, tool_from_camera=scene.truth.tool_from_camera.numpy())
     found = evaluate_set("wall", Dataset((known,)), options(folds=0))
-    test = found.experiment.splits["half"]["half"].test
+    test = found.splits["half"]["half"]
     cosine = scene.batch.normal_tool @ scene.truth.tool_from_camera[:3, :3]
     to_plane = torch.einsum("hwk,nk->nhw", scene.rays, cosine)
     origin = scene.batch.normal_tool @ scene.truth.tool_from_camera[:3, 3]
@@ -87,25 +87,24 @@ def test_errors_along_the_ray_and_in_z_are_those_of_the_true_distance(
 
 
 def test_poses_are_never_parted_and_folds_hold_out_every_frame_once(
-    dataset: Dataset, evaluation: SetEvaluation
+    dataset: Dataset, evaluation: Experiment
 ) -> None:
     pose = dataset.pose_groups()
-    splits = evaluation.experiment.splits
+    splits = evaluation.splits
     for drawn in splits.values():
-        for split in drawn.values():
-            assert not set(pose[split.train]) & set(pose[split.test])
-            assert sorted([*split.train, *split.test]) == list(range(dataset.num_frames))
-    held_out = np.concatenate([split.test for split in splits["folds"].values()])
+        for test in drawn.values():
+            assert not set(pose[test]) & set(np.delete(pose, test))
+    held_out = np.concatenate(list(splits["folds"].values()))
     assert sorted(held_out) == list(range(dataset.num_frames))
     repeats = splits["repeats"].values()
     assert len(repeats) == 3
-    assert len({tuple(split.test) for split in repeats}) == 3
-    assert all(len(split.test) == 8 for split in repeats)
+    assert len({tuple(test) for test in repeats}) == 3
+    assert all(len(test) == 8 for test in repeats)
 
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_figures_and_another_seed_others(
-    dataset: Dataset, evaluation: SetEvaluation
+    dataset: Dataset, evaluation: Experiment
 ) -> None:
     asked = options(repeats={"number": 3, "test_fraction": 0.25}, models=MODELS[:1])
     again = evaluate_set("wall", dataset, asked)
@@ -118,7 +117,7 @@ def test_the_same_seed_gives_the_same_figures_and_another_seed_others(
 
 
 def test_models_side_by_side_are_what_each_is_alone(
-    dataset: Dataset, evaluation: SetEvaluation
+    dataset: Dataset, evaluation: Experiment
 ) -> None:
     alone = evaluate_set("wall", dataset, options(models=[MODELS[0]]))
     for metric in ("mean_abs_mm", "rms_mm"):
@@ -129,7 +128,7 @@ def test_models_side_by_side_are_what_each_is_alone(
 
 
 def test_the_model_that_made_the_errors_is_significantly_better(
-    evaluation: SetEvaluation,
+    evaluation: Experiment,
 ) -> None:
     difference = evaluation.estimate("folds", "mean_abs_mm", "E0", less="EA")
     assert difference.significant
@@ -163,8 +162,8 @@ def test_too_few_poses_for_the_folds_are_refused(dataset: Dataset) -> None:
 
 def test_a_fit_that_does_not_converge_is_told(dataset: Dataset) -> None:
     found = evaluate_set("wall", dataset, options(folds=0, solver={"max_iterations": 1}))
-    assert len(found.experiment.warnings) == 3
-    assert "Not converged" in found.experiment.warnings[0]
+    assert len(found.warnings) == 3
+    assert "Not converged" in found.warnings[0]
 
 
 def test_a_model_that_needs_amplitudes_refuses_a_recording_without(

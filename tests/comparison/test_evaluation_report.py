@@ -11,11 +11,11 @@ from comparison.evaluated import MODELS, options
 from tofcorr.cli.calibrate import evaluate_command as command
 from tofcorr.comparison.evaluate import (
     EvaluationResult,
-    SetEvaluation,
     main_pairs,
     pairs,
     set_names,
 )
+from tofcorr.comparison.experiment import Experiment
 from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.options import dump_yaml
@@ -51,7 +51,7 @@ def test_pairs_leave_before_out_and_the_main_ones_are_a_chain_and_a_star() -> No
     ]  # fmt: skip
 
 
-def test_tables_have_the_papers_layout(evaluation: SetEvaluation) -> None:
+def test_tables_have_the_papers_layout(evaluation: Experiment) -> None:
     asked = options(repeats={"number": 3, "test_fraction": 0.25})
     half, folds, *_ = EvaluationResult([evaluation, evaluation], asked).tables()
     for table in (half, folds):
@@ -65,7 +65,7 @@ def test_tables_have_the_papers_layout(evaluation: SetEvaluation) -> None:
     assert len({len(line) for line in lines[2:6]}) == 1
 
 
-def test_the_report_is_complete_and_holds_no_nan(evaluation: SetEvaluation, tmp_path: Path) -> None:
+def test_the_report_is_complete_and_holds_no_nan(evaluation: Experiment, tmp_path: Path) -> None:
     asked = options(repeats={"number": 3, "test_fraction": 0.25})
     result = EvaluationResult([evaluation], asked)
     result.write(tmp_path)

@@ -33,7 +33,7 @@ def test_pixels_outside_the_window_count_as_masked_out(scene: Scene, tmp_path: P
     found = evaluate_set("a", Dataset((spoilt,)), window)
     expected = evaluate_set("b", Dataset((masked,)), window)
     unguarded = evaluate_set("c", Dataset((spoilt,)), asked)
-    assert found.experiment.fitter.num_pixels == expected.experiment.fitter.num_pixels
+    assert found.fitter.num_pixels == expected.fitter.num_pixels
     for column in asked.columns:
         values = found.values["folds"]["rms_mm"][column]
         # The domain that scales the variables has seen the outliers, the optimum has not.

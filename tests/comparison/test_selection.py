@@ -9,9 +9,9 @@ from click.testing import CliRunner
 from simulated_walls import EA, simulated_wall
 
 from tofcorr.cli.main import group as cli
+from tofcorr.comparison.experiment import groupings
 from tofcorr.comparison.options import SelectionOptions
 from tofcorr.comparison.select import rank_models
-from tofcorr.comparison.splits import groupings
 from tofcorr.comparison.statistics import rank
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.options import dump_yaml
@@ -68,8 +68,7 @@ def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None
 @pytest.mark.parametrize("by", ["image", "distance", "target"])
 def test_each_frame_is_held_out_once_and_poses_stay_together(wall: Dataset, by: str) -> None:
     held_out, skipped = groupings(wall, options(by=[by]))
-    (splits,) = held_out.values()
-    groups = {name: split.test for name, split in splits.items()}
+    (groups,) = held_out.values()
     assert not skipped
     assert sorted(np.concatenate(list(groups.values()))) == list(range(wall.num_frames))
     poses = wall.pose_groups()

@@ -8,11 +8,11 @@ import pytest
 import yaml
 from small_recordings import CAMERA, frame_rows, rigid, small_images, write_small_recording
 
-from tofcorr.data.recording import FrameNames, Recording
+from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter, write_recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 
 # A rotation goes through a quaternion and back: some units in the last place of float64.
 ROUNDING = 1e-14

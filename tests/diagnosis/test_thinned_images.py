@@ -7,8 +7,8 @@ from diagnosed_recordings import recorded
 
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.patterns import drawn_values
+from tofcorr.simulation.effects.registry import CATALOGUE
 
 _SPREAD, _SEED = 0.004, 6
 _PATTERN = {

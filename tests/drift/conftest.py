@@ -8,8 +8,8 @@ from drift.few_walls import FEW, Walls, sensor
 from simulated_walls import fitted, simulated_wall
 
 from tofcorr.correction.state import CalibrationState
+from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import Reference, estimate_reference
-from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 
 

@@ -8,7 +8,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import MomentObjective, WithPrior
 from tofcorr.estimation.solvers import minimise
 from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit
 from tofcorr.training.report import bootstrap_summary, correction_curves
 
 

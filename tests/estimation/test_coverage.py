@@ -4,7 +4,7 @@ import pytest
 from simulated_walls import EA, QUIET, SENSOR, wall_options
 
 from benchmarks.coverage import study
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from tofcorr.estimation.uncertainty import (
     effective_variance,
     observability,
 )
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.judgement import warnings
 from tofcorr.training.report import observability_summary

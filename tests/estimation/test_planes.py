@@ -11,9 +11,9 @@ from simulated_walls import QUIET, SENSOR, fitted, simulated_wall, true_hand_eye
 from tofcorr.data.recording import FrameBatch
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import MomentObjective
-from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian
-from tofcorr.fit.result import Fit
-from tofcorr.fit.walls import name_walls, recorded_walls, with_walls
+from tofcorr.estimation.planes import joint_image_equations, marginal_hessian
+from tofcorr.fit.problem import Fit
+from tofcorr.fit.walls import name_walls, recorded_walls
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import off_largest_plane
 from tofcorr.training.report import hand_eye_intervals
@@ -41,7 +41,7 @@ def found(wall: Dataset) -> Fit:
 
 def test_a_wall_recorded_30_cm_and_17_degrees_wrong_is_found(wall: Dataset, found: Fit) -> None:
     assert found.walls is not None
-    assert found.walls.names == ["checkerboard", "white"]
+    assert [one["wall"] for one in found.walls.summary()] == ["checkerboard", "white"]
     normals, offsets = found.walls.walls.normal_world, found.walls.walls.offset
     assert float(normals[:, 2].min()) > np.cos(2e-3)
     assert float(offsets.abs().max()) < 6e-3
@@ -130,8 +130,8 @@ def test_walls_of_two_places_are_told_apart_by_name(wall: Dataset) -> None:
     offset = np.array(table.offset)
     offset[:12] += 0.5
     moved = Dataset((replace(wall.first, frames=replace(table, offset=offset)),))
-    named = name_walls(moved)
-    assert set(named.names) == {"checkerboard (1)", "checkerboard (2)", "white (1)", "white (2)"}
+    _, names = name_walls(moved)
+    assert set(names) == {"checkerboard (1)", "checkerboard (2)", "white (1)", "white (2)"}
 
 
 def test_a_wall_of_two_images_is_refused(wall: Dataset) -> None:
@@ -139,18 +139,16 @@ def test_a_wall_of_two_images_is_refused(wall: Dataset) -> None:
     board = np.flatnonzero(wall.targets == "checkerboard")
     frames = np.concatenate([white, board[:2]])
     with pytest.raises(CalibrationDataError, match="'checkerboard' has 2"):
-        recorded_walls(wall, frames, name_walls(wall))
+        recorded_walls(wall, frames)
 
 
 def test_frames_held_out_get_the_wall_that_was_found(wall: Dataset) -> None:
-    named = name_walls(wall)
-    walls, numbers = recorded_walls(wall, np.arange(wall.num_frames), named)
-    step = torch.zeros(walls.size, dtype=torch.float64)
+    found = recorded_walls(wall, np.arange(wall.num_frames))
+    step = torch.zeros(found.walls.size, dtype=torch.float64)
     step[2] = 0.25
-    moved: Walls = walls.moved(step)
-    table = with_walls(wall, named, moved, numbers).first.frames
+    table = replace(found, walls=found.walls.moved(step)).put_into(wall).first.frames
     change = table.offset - wall.first.frames.offset
-    assert np.allclose(change, np.where(named.of_frame == 0, 0.25, 0.0))
+    assert np.allclose(change, np.where(found.of_frame == 0, 0.25, 0.0))
 
 
 def test_the_largest_plane_is_found_in_a_cluttered_image(generator: torch.Generator) -> None:

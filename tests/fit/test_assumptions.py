@@ -10,7 +10,7 @@ from simulated_walls import QUIET, fitted, simulated_wall
 
 from tofcorr.data.recording import Recording
 from tofcorr.fit.misfit import assumptions, misfit_pixels
-from tofcorr.fit.result import Assumption, Fit
+from tofcorr.fit.problem import Fit, Shift
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import tangents
 from tofcorr.pixels.dataset import Dataset
@@ -28,10 +28,10 @@ def right(data: Dataset) -> Fit:
 
 
 @pytest.fixture(scope="module")
-def found(data: Dataset, right: Fit) -> dict[str, Assumption]:
+def found(data: Dataset, right: Fit) -> dict[str, Shift]:
     seen = misfit_pixels(data, right, np.arange(data.num_frames))
     assert seen is not None
-    return {one.name: one for one in assumptions(seen, right, data.first.camera)}
+    return {one.cause: one for one in assumptions(seen, right, data.first.camera)}
 
 
 def _with_k(recording: Recording, focal: float, right: float, down: float) -> Recording:
@@ -59,7 +59,7 @@ def test_a_fit_to_a_wrong_recording_moves_as_far(
     wrong: Callable[[Recording], Recording],
     data: Dataset,
     right: Fit,
-    found: dict[str, Assumption],
+    found: dict[str, Shift],
 ) -> None:
     """A focal length 0.3 % off moved it by 4.5 of its standard errors, and nothing said so."""
     other = fitted(Dataset((wrong(data.first),)))
@@ -71,15 +71,17 @@ def test_a_fit_to_a_wrong_recording_moves_as_far(
 
 
 def test_turned_planes_move_the_camera_as_far(
-    data: Dataset, right: Fit, found: dict[str, Assumption]
+    data: Dataset, right: Fit, found: dict[str, Shift]
 ) -> None:
     """About no axis of the wall, through its middle, does a turn move the camera farther."""
     seen = misfit_pixels(data, right, np.arange(data.num_frames))
     assert seen is not None
     table, angle = data.first.frames, np.radians(0.1)
     across = tangents(torch.from_numpy(table.normal_world)).numpy()
-    places = np.einsum("ma,mka->mk", seen.world.numpy(), across[seen.frame.numpy()])
     before = right.solution.parameters.tool_from_camera
+    pose = (torch.from_numpy(table.world_from_tool) @ before)[seen.frame]
+    world = torch.einsum("mij,mj->mi", pose[:, :3, :3], seen.points) + pose[:, :3, 3]
+    places = np.einsum("ma,mka->mk", world.numpy(), across[seen.frame.numpy()])
     shifts = []
     for axis in (0, 1):
         turned = np.cos(angle) * table.normal_world + np.sin(angle) * across[:, axis]
@@ -96,5 +98,5 @@ def test_planes_that_are_estimated_are_not_assumed(data: Dataset, right: Fit) ->
     seen = misfit_pixels(data, right, np.arange(8))
     assert seen is not None
     seen = replace(seen, walls_estimated=True)
-    names = {one.name for one in assumptions(seen, right, data.first.camera)}
+    names = {one.cause for one in assumptions(seen, right, data.first.camera)}
     assert names == {"focal_length", "principal_point_right", "principal_point_down"}

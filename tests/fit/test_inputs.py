@@ -14,7 +14,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.problem import build_model, refuse_missing_inputs
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 
 def test_a_model_named_by_the_refusal_of_another_takes_the_recording(tmp_path: Path) -> None:

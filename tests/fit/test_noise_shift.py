@@ -12,11 +12,10 @@ from diagnosed_recordings import recorded
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.fit.fitting import fit
-from tofcorr.fit.noise_shift import NoiseShift
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit, Shift
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, covered_domain
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import hand_eye_accuracy
 
 SIGMA = 0.02  # metres
@@ -55,7 +54,7 @@ def _moved(there: Parameters, found: list[Parameters]) -> torch.Tensor:
     return torch.stack([turn.T @ (one.tool_from_camera[:3, 3] - place) for one in found])
 
 
-def _shift(one: Fit) -> NoiseShift:
+def _shift(one: Fit) -> Shift:
     assert one.noise_shift is not None
     return one.noise_shift
 

@@ -11,10 +11,11 @@ from simulated_walls import fitted, simulated_wall
 from tofcorr.correction.model import HandEye
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import Pixels
-from tofcorr.fit.linear_image import CLASSES, FormFunctions, Linearisation
+from tofcorr.fit.linear_image import CLASSES, LinearPixels, form_classes, form_functions, linearised
 from tofcorr.fit.reference import Reference, estimate_reference
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.pixels.sample import pixels_of_image
 
 DOMAIN = Domain(
     height=25,
@@ -37,41 +38,39 @@ def pixels(count: int) -> Pixels:
 
 
 def test_every_function_has_a_class_and_about_unit_size() -> None:
-    forms = FormFunctions(DOMAIN)
-    values = forms(pixels(500), torch.full((500,), -0.9).double())
-    assert len(values) == len(forms.classes())
-    assert set(forms.classes().tolist()) == set(range(len(CLASSES)))
+    values = torch.cat(form_functions(DOMAIN, pixels(500), torch.full((500,), -0.9).double()))
+    classes = form_classes(DOMAIN)
+    assert len(values) == len(classes)
+    assert set(classes.tolist()) == set(range(CLASSES))
     assert float(values.abs().max()) <= 1.0 + 1e-9
 
 
 def test_without_amplitudes_no_function_reads_them() -> None:
     domain = Domain(height=25, width=32, radial_distance=Interval(0.5, 2.0))
-    forms, some = FormFunctions(domain), pixels(50)
+    some = pixels(50)
     gain = torch.full((50,), -0.9).double()
     unknown = some._replace(amplitude=torch.full((50,), torch.nan).double())
-    torch.testing.assert_close(forms(some, gain), forms(unknown, gain))
+    seen, unseen = (torch.cat(form_functions(domain, one, gain)) for one in (some, unknown))
+    torch.testing.assert_close(seen, unseen)
 
 
 def test_the_columns_are_derivatives_of_the_residual(tmp_path: Path) -> None:
     dataset = simulated_wall(tmp_path / "wall", 3, (("white", 8), ("checkerboard", 8)))
     fit = fitted(dataset)
     hand_eye = fit.solution.parameters.tool_from_camera
-    linear = Linearisation(
-        fit.model.error, FormFunctions(fit.domain), dataset.ray_directions(), twist=True
-    )
     batch = next(dataset.batches([0]))
     used = batch.valid[0].flatten().nonzero()[:, 0]
+    seen, rays = pixels_of_image(batch, 0, used), dataset.ray_directions().flatten(0, 1)[used]
 
-    def residual(twist: torch.Tensor) -> torch.Tensor:
+    def linear(twist: torch.Tensor) -> LinearPixels:
         moved = HandEye(hand_eye @ se3.exp(twist), fixed=True)().detach()
         plane = plane_in_frame(batch.normal_tool[0], batch.offset_tool[0], moved)
-        return linear(batch, 0, used, plane).residual
+        return linearised(fit.model.error, seen, rays, plane, twist=True, domain=fit.domain)
 
-    at = linear(
-        batch, 0, used, plane_in_frame(batch.normal_tool[0], batch.offset_tool[0], hand_eye)
-    )
+    at = linear(torch.zeros(6).double())
     step = 1e-5 * torch.eye(6, dtype=torch.float64)
-    numeric = torch.stack([(residual(own) - residual(-own)) / 2e-5 for own in step], dim=1)
+    numeric = [(linear(own).residual - linear(-own).residual) / 2e-5 for own in step]
+    numeric = torch.stack(numeric, dim=1)
     # The columns stand where the wall is, the residual where the noise puts the pixels.
     off = float((at.residual / at.gain).abs().max())
     torch.testing.assert_close(at.unknowns[:, :6], numeric, rtol=0, atol=1.5 * off)

@@ -16,11 +16,11 @@ from tofcorr.correction.state import (
 )
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.simulation.signal import PixelDelayOptions, pixel_delay
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 CORE = [
     {"kind": "distance_polynomial", "degree": 3},

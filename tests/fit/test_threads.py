@@ -11,7 +11,7 @@ from tofcorr.estimation.solvers import Solution
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels import dataset as dataset_module
 from tofcorr.pixels.dataset import covered_domain, threads_at_once
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 
 def test_solver_and_pass_each_use_threads_as_they_should(

@@ -10,7 +10,7 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.options import resolve_options
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 CAMERA = CameraIntrinsics(
     width=7,

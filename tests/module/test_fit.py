@@ -15,9 +15,8 @@ from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.options import resolve_options
-from tofcorr.training.options import TrainingOptions
-from tofcorr.training.result import TrainingResult
-from tofcorr.training.run import train
+from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.run import TrainingResult, train
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.errors import ConfigError
 from tofcorr.options import Options, load_options, resolve_options, shipped_names
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CLASSES: list[type[Options]] = [

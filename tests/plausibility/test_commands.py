@@ -10,7 +10,7 @@ from running import Program
 import tofcorr
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import FURTHER, TABLE
-from tofcorr.comparison.splits import Split, without_frames
+from tofcorr.comparison.experiment import without_frames
 
 E0 = {"name": "E0", "model": {"terms": []}, "advice": 0, "figures": False}
 
@@ -95,10 +95,8 @@ def test_evaluate_and_select_leave_out_the_frames_that_a_training_leaves_out(
 
 
 def test_a_fold_that_held_out_nothing_but_left_out_frames_is_dropped() -> None:
-    first = Split(np.array([1, 2, 3]), np.array([0]))
-    splits = {"first": first, "second": Split(np.array([0, 1]), np.array([2, 3]))}
-    (kept,) = without_frames(splits, [0]).values()
-    assert (kept.train.tolist(), kept.test.tolist()) == ([1], [2, 3])
+    kept = without_frames({"first": np.array([0]), "second": np.array([0, 2, 3])}, [0])
+    assert {name: test.tolist() for name, test in kept.items()} == {"second": [2, 3]}
 
 
 def test_a_forced_run_is_not_to_be_used_and_has_a_corrector_all_the_same(

@@ -11,8 +11,8 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 from tofcorr.plausibility.finding import Inspection
+from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.judgement import against_garbage
-from tofcorr.training.options import TrainingOptions
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,10 @@ from simulated_walls import fitted, followed, simulated_wall
 from tofcorr.data.recording import planes_in_tool
 from tofcorr.estimation.accumulator import Design
 from tofcorr.estimation.uncertainty import posterior_covariance
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.advice import advise, choose_views, draw_pool, predicted_moments, worst_sigma
+from tofcorr.training.advice import advise, choose_views, draw_pool, predicted_moments
+from tofcorr.training.support import worst_sigma
 
 
 @pytest.fixture(scope="module")

@@ -12,14 +12,13 @@ from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.solvers import Solution
 from tofcorr.fit.fitting import fit
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.pixels.sample import errors_along_ray, sample_pixels, thinned
-from tofcorr.training.calibration import Calibration
+from tofcorr.training.calibration import Calibration, TrainingOptions
+from tofcorr.training.figures import coloured
 from tofcorr.training.monitor import RunMonitor, loss_parts
-from tofcorr.training.options import TrainingOptions
-from tofcorr.training.shown import coloured
 
 TRAIN, TEST = np.arange(0, 20), np.arange(20, 28)
 REPORT = {

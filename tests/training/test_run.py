@@ -17,7 +17,7 @@ from training.trained import CONFIG, FILES, Trained, without_times
 import tofcorr
 from tofcorr import CalibrationDataError, Recording
 from tofcorr.cli.calibrate import train_command as command
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 
 def test_held_out_images_do_not_move_the_window_of_outliers(
@@ -171,7 +171,7 @@ def test_a_write_that_fails_leaves_no_folder(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tofcorr.training.result.export_torchscript", full)
+    monkeypatch.setattr("tofcorr.training.run.export_torchscript", full)
     with pytest.raises(OSError, match="No space left"):
         trained.result.save(tmp_path / "new" / "run")
     assert list(tmp_path.iterdir()) == []

@@ -22,12 +22,12 @@ from tofcorr.training.support import recording_support
         (5.0, 4.5, None),  # 2.2 mm, half of the noise
         (1.6, 0.8, None),  # 1.4 mm
         (3.0, 3.5, None),
-        (None, 3.0, None),
+        (math.nan, 3.0, None),
         (5.0, math.nan, None),
     ],
 )
 def test_an_error_beyond_the_noise_is_named_where_it_is_large(
-    held_out: float | None, noise: float, words: str | None
+    held_out: float, noise: float, words: str | None
 ) -> None:
     """A wedge before the lens moved the hand-eye by 14 mm; the run was `good` and said 3.7."""
     found = beyond_noise(held_out, noise)

@@ -10,9 +10,9 @@ from tofcorr.files import NewPath, ReplacedFile
 
 if TYPE_CHECKING:
     from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
-    from tofcorr.training.options import TrainingOptions
+    from tofcorr.training.calibration import TrainingOptions
 
-_TRAINING = "training.options:TrainingOptions"
+_TRAINING = "training.calibration:TrainingOptions"
 _EVALUATION = "comparison.options:EvaluationOptions"
 _SELECTION = "comparison.options:SelectionOptions"
 

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tofcorr.training.advice import PosePlan
-    from tofcorr.training.options import TrainingOptions
+    from tofcorr.training.calibration import TrainingOptions
 
-_TRAINING = "training.options:TrainingOptions"
+_TRAINING = "training.calibration:TrainingOptions"
 _POSE = {"type": NumberList(7), "metavar": "X,Y,Z,QX,QY,QZ,QW"}
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, ScalarFormatter
 
-from tofcorr.comparison.experiment import Experiment, held_out_experiment
+from tofcorr.comparison.experiment import METRICS, Experiment, held_out_experiment, protocols
 from tofcorr.comparison.options import (
     BEFORE,
     HAND_EYE_ONLY,
@@ -21,79 +21,17 @@ from tofcorr.comparison.options import (
     comparability_notes,
     masks_of,
 )
-from tofcorr.comparison.splits import protocols
-from tofcorr.comparison.statistics import Estimate, estimate, or_none
-from tofcorr.comparison.table import Table
+from tofcorr.comparison.statistics import Estimate, Table
 from tofcorr.files import StagedFolder
 from tofcorr.options import dump_yaml, resolve_options
-from tofcorr.pixels.dataset import Dataset, Recordings, hand_eye_is_free, opened, resolved_planes
-from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import bar
 from tofcorr.training.figures import save_figure
 from tofcorr.training.monitor import event_writer
+from tofcorr.training.report import number_or_none
 from tofcorr.version import __version__
-
-METRICS: dict[str, Callable[[dict[str, FrameErrors]], float]] = {
-    "mean_abs_mm": lambda errors: errors["to_plane"].mean_abs_mm(),
-    "rms_mm": lambda errors: errors["to_plane"].rms_mm(),
-    "rms_along_ray_mm": lambda errors: errors["along_ray"].rms_mm(),
-    "rms_z_mm": lambda errors: errors["in_z"].rms_mm(),
-}
-
-
-@dataclass(frozen=True)
-class SetEvaluation:
-    """All models on one set of images.
-
-    Attributes:
-        name: The set's name.
-        dataset: Its recordings.
-        options: Models and protocols.
-        experiment: The models fitted, and what was held out.
-        values: For each protocol, metric and column, one value a split, shape (S,), millimetres.
-    """
-
-    name: str
-    dataset: Dataset
-    options: EvaluationOptions
-    experiment: Experiment
-    values: dict[str, dict[str, dict[str, np.ndarray]]]
-
-    @property
-    def hand_eye_estimated(self) -> bool:
-        """Whether the hand-eye transform was an unknown."""
-        return hand_eye_is_free(self.dataset, self.options.hand_eye)
-
-    @property
-    def targets(self) -> dict[str, int]:
-        """How many images show which target."""
-        names, counts = np.unique(self.dataset.targets, return_counts=True)
-        return dict(zip(names.tolist(), counts.tolist(), strict=True))
-
-    @property
-    def hand_eye(self) -> dict[str, list[list[float]]]:
-        """tool_from_camera of each column, fitted to the first split's training frames."""
-        first = self.experiment.models[0]
-        return {name: one.model.hand_eye().detach().tolist() for name, one in first.items()}
-
-    def estimate(
-        self, protocol: str, metric: str, column: str, less: str | None = None
-    ) -> Estimate:
-        """Return the mean over the splits of a protocol, with its interval, millimetres.
-
-        Args:
-            protocol: How images were held out.
-            metric: What is averaged.
-            column: The model.
-            less: Another one, whose values are subtracted: a paired t-test.
-        """
-        values = self.values[protocol][metric]
-        taken_off = 0.0 if less is None else values[less]
-        share = self.options.repeats.test_fraction
-        overlap = share / (1 - share) if protocol == "repeats" else 0.0
-        return estimate(values[column] - taken_off, overlap)
 
 
 @dataclass(frozen=True, repr=False)
@@ -106,32 +44,30 @@ class EvaluationResult:
         headlines: What makes a recording doubtful, a sentence each.
     """
 
-    sets: Sequence[SetEvaluation]
+    sets: Sequence[Experiment]
     options: EvaluationOptions
     headlines: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Return what is doubtful, tables, notes and warnings."""
         warnings = [f"Warning: {text}" for text in self.warnings]
-        return "\n\n".join([*self.headlines, *self._page([t.text() for t in self.tables()])]) + (
-            "\n\n" + "\n\n".join(warnings) if warnings else ""
-        )
-
-    @property
-    def warnings(self) -> list[str]:
-        """What limits the numbers, one sentence each, with the set's name."""
-        return [f"{one.name}: {text}" for one in self.sets for text in one.experiment.warnings]
-
-    def _page(self, tables: Sequence[str]) -> list[str]:
-        notes = comparability_notes(self.options)
-        return [*tables, *([" ".join(notes)] if notes else [])]
+        return "\n\n".join([*self._page([table.text() for table in self.tables()]), *warnings])
 
     def markdown(self) -> str:
         """Return tables, notes and warnings as a page of Markdown."""
         page = self._page([table.markdown() for table in self.tables()])
         warnings = "\n".join(f"- {text}" for text in self.warnings)
         page += ["Warnings:", warnings] if warnings else []
-        return "\n\n".join(["# Evaluation", *self.headlines, *page]) + "\n"
+        return "\n\n".join(["# Evaluation", *page]) + "\n"
+
+    def _page(self, tables: Sequence[str]) -> list[str]:
+        notes = " ".join(comparability_notes(self.options))
+        return [*self.headlines, *tables, *([notes] if notes else [])]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What limits the numbers, one sentence each, with the set's name."""
+        return [f"{one.name}: {text}" for one in self.sets for text in one.warnings]
 
     def to_mapping(self) -> dict[str, Any]:
         """Return every number as plain values, unknown ones as None, as in `evaluation.json`."""
@@ -146,43 +82,90 @@ class EvaluationResult:
             "outlier_window_mm": options.outlier_window_mm,
             "measured_on": masks_of(options).to_mapping() | {"planes": options.planes},
             "notes": comparability_notes(options),
-            "sets": [_set_mapping(one, options.columns) for one in self.sets],
+            "sets": [
+                {
+                    "name": one.name,
+                    "frames": one.dataset.num_frames,
+                    "targets": one.targets,
+                    "pixels": one.fitter.num_pixels,
+                    "left_out": one.left_out,
+                    "hand_eye_estimated": one.hand_eye_estimated,
+                    "hand_eye": one.hand_eye,
+                    "held_out": {
+                        protocol: self._held_out(one, protocol) for protocol in one.splits
+                    },
+                    "warnings": one.warnings,
+                }
+                for one in self.sets
+            ],
         }
+
+    def _held_out(self, one: Experiment, protocol: str) -> dict[str, Any]:
+        """Return the numbers of one set and protocol as plain values."""
+        splits, tests = list(one.splits[protocol].values()), []
+        for metric in METRICS:
+            for first, second in pairs(self.options.columns) if len(splits) > 1 else []:
+                found = self._estimate(one, protocol, metric, first, second)
+                tests.append(
+                    {
+                        "metric": metric,
+                        "first": first,
+                        "second": second,
+                        "first_minus_second_mm": found.to_mapping(),
+                        "p_value": number_or_none(found.p_value),
+                        "degrees_of_freedom": found.degrees_of_freedom,
+                        "significant": found.significant,
+                    }
+                )
+        return {
+            "test_frames": [test.tolist() for test in splits],
+            "error_mm": {
+                metric: {
+                    column: self._estimate(one, protocol, metric, column).to_mapping()
+                    | {"splits": [number_or_none(value) for value in values.tolist()]}
+                    for column, values in by_column.items()
+                }
+                for metric, by_column in one.values[protocol].items()
+            },
+            "paired_tests": tests,
+        }
+
+    def _estimate(
+        self, one: Experiment, protocol: str, metric: str, column: str, less: str | None = None
+    ) -> Estimate:
+        """Return the estimate of a set, allowing for what random splits have in common."""
+        share = self.options.repeats.test_fraction
+        overlap = share / (1 - share) if protocol == "repeats" else 0.0
+        return one.estimate(protocol, metric, column, less, overlap)
 
     def plot_comparison(self) -> Figure:
         """Draw the held-out mean absolute error of each model and set, with 95 % intervals."""
-        options, columns = self.options, self.options.columns
-        figure = Figure(
-            figsize=(max(6.0, 1.2 * len(columns) * len(self.sets) ** 0.7), 4.4),
-            layout="constrained",
-        )
-        axes = figure.subplots()
-        group = 0.8 / len(columns)
+        options, columns, sets = self.options, self.options.columns, self.sets
+        width = max(6, len(columns) * (1 + len(sets)) / 2)
+        figure = Figure(figsize=(width, 5), layout="constrained")
+        axes, protocol = figure.subplots(), "folds" if options.folds else "half"
         for k, column in enumerate(columns):
-            protocol: str = "folds" if options.folds else "half"
-            found = [one.estimate(protocol, "mean_abs_mm", column) for one in self.sets]
-            place = np.arange(len(found)) + (k - (len(columns) - 1) / 2) * group
+            found = [one.estimate(protocol, "mean_abs_mm", column) for one in sets]
+            # Beside one another, on four fifths of the room of a set.
+            place = np.arange(len(sets)) + ((k + 1 / 2) / len(columns) - 1 / 2) * 4 / 5
             means = np.array([one.mean for one in found])
             spread = np.nan_to_num([one.half_width for one in found])
-            # On a logarithmic axis an interval that reaches zero ends at a fiftieth of its mean.
-            down = np.minimum(spread, 0.98 * means)
+            # On a logarithmic axis an interval that reaches zero ends near it.
+            down = np.minimum(spread, means * (1 - 1 / 50))
             colour = {0: "0.6", 1: "0.35"}.get(k, f"C{k - 2}")
             style = {"fmt": "o", "color": colour, "capsize": 3, "label": column}
             axes.errorbar(place, means, (down, spread), **style)
             for x, mean in zip(place, means, strict=True):
                 axes.annotate(f" {mean:.1f}", (x, mean), fontsize=8, color=colour, va="bottom")
-        axes.set_yscale("log")
+        axes.set(yscale="log", ylabel="held-out mean absolute error [mm]")
         axes.yaxis.set_major_formatter(ScalarFormatter())
-        axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.6)))
-        axes.set_xticks(np.arange(len(self.sets)), [one.name for one in self.sets])
-        axes.set_ylabel("held-out mean absolute error [mm]")
+        axes.yaxis.set_minor_formatter(LogFormatter())
+        axes.set_xticks(np.arange(len(sets)), [one.name for one in sets])
         folds = f"{options.folds}-fold cross-validation, 95 % intervals"
         how = folds if options.folds else "one split"
         axes.set_title(f"Models on images they were not fitted to ({how})", fontsize=10)
         figure.legend(loc="outside lower center", fontsize=8, ncols=len(columns))
-        axes.grid(axis="y", alpha=0.25)
-        axes.set_axisbelow(True)
-        axes.set_xlim(-0.6, len(self.sets) - 0.4)
+        axes.grid(axis="y", color="0.9")
         return figure
 
     def write(self, folder: Path) -> None:
@@ -242,7 +225,8 @@ class EvaluationResult:
     def _repeats_table(self, metric: str, kind: str) -> Table:
         rows, repeats = [], self.options.repeats
         for one in self.sets:
-            found = [one.estimate("repeats", metric, column) for column in self.options.columns]
+            columns = self.options.columns
+            found = [self._estimate(one, "repeats", metric, column) for column in columns]
             rows.append([one.name, *(f"{e.mean:.2f} ± {e.standard_deviation:.2f}" for e in found)])
             ends = [f"{low:.2f}–{high:.2f}" for low, high in (e.interval for e in found)]
             rows.append(["  95 % interval", *ends])
@@ -258,7 +242,7 @@ class EvaluationResult:
         rows, dof = [], 0
         for one in self.sets:
             for first, second in main_pairs(self.options.columns):
-                found = one.estimate(protocol, metric, first, less=second)
+                found = self._estimate(one, protocol, metric, first, second)
                 dof = found.degrees_of_freedom
                 share = abs(found.mean) / one.estimate(protocol, metric, first).mean
                 better = f"{second if found.mean > 0 else first} better by {100 * share:.0f} %"
@@ -328,7 +312,7 @@ def evaluate_set(
     options: EvaluationOptions,
     progress: Callable[[], object] | None = None,
     inspection: Inspection | None = None,
-) -> SetEvaluation:
+) -> Experiment:
     """Fit all models to the training frames of every split, and measure the frames held out.
 
     Args:
@@ -345,18 +329,7 @@ def evaluate_set(
     """
     options = options.for_recordings(dataset.recordings).against_garbage(inspection)
     drawn, baselines = protocols(dataset, options), (BEFORE, HAND_EYE_ONLY)
-    found = held_out_experiment(dataset, options, drawn, inspection, progress, baselines)
-    values = {
-        protocol: {
-            metric: {
-                column: np.array([measure(split[column]) for split in splits])
-                for column in options.columns
-            }
-            for metric, measure in METRICS.items()
-        }
-        for protocol, splits in found.errors.items()
-    }
-    return SetEvaluation(name, dataset, options, found, values)
+    return held_out_experiment(name, dataset, options, drawn, inspection, progress, baselines)
 
 
 def set_names(paths: Sequence[Path | str]) -> list[str]:
@@ -384,58 +357,3 @@ def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
 
 def _interval(found: Estimate) -> str:
     return f"{found.mean:.2f} ± {found.half_width:.2f}"
-
-
-def _set_mapping(one: SetEvaluation, columns: list[str]) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "frames": one.dataset.num_frames,
-        "targets": one.targets,
-        "pixels": one.experiment.fitter.num_pixels,
-        "left_out": one.experiment.left_out,
-        "hand_eye_estimated": one.hand_eye_estimated,
-        "hand_eye": one.hand_eye,
-        "held_out": {
-            protocol: _protocol_mapping(one, protocol, columns) for protocol in one.values
-        },
-        "warnings": one.experiment.warnings,
-    }
-
-
-def _protocol_mapping(one: SetEvaluation, protocol: str, columns: list[str]) -> dict[str, Any]:
-    splits = one.experiment.splits[protocol].values()
-    tested = pairs(columns) if len(splits) > 1 else []
-    return {
-        "test_frames": [split.test.tolist() for split in splits],
-        "error_mm": {
-            metric: {
-                column: _estimate_mapping(one.estimate(protocol, metric, column))
-                | {"splits": [or_none(value) for value in values.tolist()]}
-                for column, values in by_column.items()
-            }
-            for metric, by_column in one.values[protocol].items()
-        },
-        "paired_tests": [
-            {"metric": metric, "first": first, "second": second}
-            | _test_mapping(one.estimate(protocol, metric, first, less=second))
-            for metric in METRICS
-            for first, second in tested
-        ],
-    }
-
-
-def _test_mapping(found: Estimate) -> dict[str, Any]:
-    return {
-        "first_minus_second_mm": _estimate_mapping(found),
-        "p_value": or_none(found.p_value),
-        "degrees_of_freedom": found.degrees_of_freedom,
-        "significant": found.significant,
-    }
-
-
-def _estimate_mapping(found: Estimate) -> dict[str, Any]:
-    return {
-        "mean": or_none(found.mean),
-        "ci": [or_none(end) for end in found.interval],
-        "standard_deviation": or_none(found.standard_deviation),
-    }

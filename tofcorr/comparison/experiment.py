@@ -7,36 +7,165 @@ ranges that scale a term's variable and place a curve's knots, and the masks com
 which say which pixels the comparison is about.
 """
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.comparison.options import BEFORE, ComparedModel, ComparisonOptions, masks_of
-from tofcorr.comparison.splits import Splits, without_frames
+from tofcorr.comparison.options import (
+    BEFORE,
+    ComparedModel,
+    ComparisonOptions,
+    EvaluationOptions,
+    SelectionOptions,
+    masks_of,
+)
+from tofcorr.comparison.statistics import Estimate, estimate
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.data.recording import planes_in_tool
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
-from tofcorr.estimation.moments import ImageMoments, Parameters
+from tofcorr.error_terms.model import ErrorModelOptions, Pixels
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.planes import estimate_walls
-from tofcorr.fit.core import minimise
-from tofcorr.fit.fitting import calibrated, fit
-from tofcorr.fit.problem import Start, build_model, refuse_missing_inputs
-from tofcorr.fit.walls import FoundWalls, name_walls, recorded_walls, walls_alone, with_every_wall
-from tofcorr.pixels.dataset import Dataset, covered_domain, recorded_hand_eye
+from tofcorr.fit.fitting import fit, hand_eye_alone
+from tofcorr.fit.problem import FitOptions, Problem, build_model, refuse_missing_inputs
+from tofcorr.fit.walls import FoundWalls, recorded_walls, walls_alone, with_every_wall
+from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.pixels.dataset import (
+    Dataset,
+    SplitOptions,
+    covered_domain,
+    folds,
+    hand_eye_is_free,
+    recorded_hand_eye,
+    split_frames,
+)
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.pixels.sample import MaskOptions, pixels_of_image, usable_pixels
 from tofcorr.plausibility.finding import Inspection
+from tofcorr.training.calibration import TrainingOptions, without_correction
 from tofcorr.training.judgement import frames_left_out, left_out_mapping, left_out_words
-from tofcorr.training.options import TrainingOptions
 
 KINDS = ("to_plane", "along_ray", "in_z")
 """Kinds of error: the distance of the corrected points to the target's plane, which is what is
 fitted; corrected minus true distance along the viewing ray, larger at oblique rays; corrected minus
 true depth along the optical axis, at the same ray."""
+
+
+Splits = dict[str, dict[str, np.ndarray]]
+"""The frames held out (global numbers), by protocol or by what their groups are groups of, and then
+by name; all others are fitted. Images of one pose stay together."""
+
+
+def protocols(dataset: Dataset, options: EvaluationOptions) -> Splits:
+    """Return the splits of each protocol that was asked for; the half split always.
+
+    A random half split (Table 1 of Abdo and Borgeat 2010), k-fold cross-validation by image (their
+    Table 2) and repeated random splits.
+
+    Raises:
+        CalibrationDataError: There are too few poses.
+    """
+
+    def drawn(fraction: float, seed: int) -> np.ndarray:
+        return split_frames(dataset, SplitOptions(test_fraction=fraction, seed=seed))[1]
+
+    found: Splits = {"half": {"half": drawn(options.test_fraction, options.seed)}}
+    if options.folds:
+        found["folds"] = _by_image(dataset, options)
+    repeats = options.repeats
+    if repeats.number:
+        seeds = np.random.SeedSequence(options.seed).generate_state(repeats.number)
+        found["repeats"] = {
+            f"repeat {k}": drawn(repeats.test_fraction, int(seed))
+            for k, seed in enumerate(seeds, start=1)
+        }
+    return found
+
+
+def groupings(dataset: Dataset, options: SelectionOptions) -> tuple[Splits, dict[str, str]]:
+    """Return the groups of frames to hold out in turn, and why a grouping is not possible.
+
+    The groups are images, bands of distance, or targets.
+
+    Raises:
+        CalibrationDataError: None of them is possible.
+    """
+    found: Splits = {}
+    skipped: dict[str, str] = {}
+    poses = dataset.pose_groups()
+    for by in options.by:
+        try:
+            groups = _GROUPS[by](dataset, options)
+        except CalibrationDataError as error:
+            skipped[by] = str(error)
+            continue
+        left = {name: len(np.unique(np.delete(poses, test))) for name, test in groups.items()}
+        scarce = min(left, key=left.__getitem__)
+        if len(groups) < 2:
+            skipped[by] = f"the recording has one {by} only."
+        # Three tilted views are the least that determine a hand-eye transform from planes; the fit
+        # itself refuses what more unknowns need.
+        elif left[scarce] < 3:
+            skipped[by] = (
+                f"without {scarce} {left[scarce]} poses are left to fit, and 3 are needed."
+            )
+        else:
+            found[by] = groups
+    if not found:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: no images can be held out to compare the models: "
+            + " ".join(skipped.values())
+        )
+    return found, skipped
+
+
+def _by_image(
+    dataset: Dataset, options: EvaluationOptions | SelectionOptions
+) -> dict[str, np.ndarray]:
+    tests = folds(dataset, options.folds, options.seed)
+    return {f"fold {k}": frames for k, frames in enumerate(tests, start=1)}
+
+
+def _by_distance(dataset: Dataset, options: SelectionOptions) -> dict[str, np.ndarray]:
+    # Each frame's median measured distance; no usable pixel: infinite.
+    distance = np.full(dataset.num_frames, np.inf)
+    for batch in dataset.batches():
+        for k, frame in enumerate(batch.indices.tolist()):
+            usable = batch.radial_distance[k][batch.valid[k]]
+            distance[frame] = float(usable.median()) if usable.numel() else np.inf
+    poses = dataset.pose_groups()
+    of_pose = np.array([np.median(distance[poses == pose]) for pose in range(poses.max() + 1)])
+    order = np.argsort(of_pose, kind="stable")
+    return {
+        f"{of_pose[band].min():.2f} to {of_pose[band].max():.2f} m": np.flatnonzero(
+            np.isin(poses, band)
+        )
+        for band in np.array_split(order, min(options.distance_bands, len(order)))
+    }
+
+
+def _by_target(dataset: Dataset, _: SelectionOptions) -> dict[str, np.ndarray]:
+    names = np.unique(dataset.targets)
+    return {str(name): np.flatnonzero(dataset.targets == name) for name in names}
+
+
+_GROUPS = {"image": _by_image, "distance": _by_distance, "target": _by_target}
+
+
+def without_frames(
+    splits: Mapping[str, np.ndarray], frames: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """Return the splits without some frames, and without those that then hold nothing out.
+
+    Frames that disagree with all others are taken out of splits that were drawn with them, as a
+    training does: so the half split is that of a training.
+    """
+    kept = {name: np.setdiff1d(test, frames) for name, test in splits.items()}
+    return {name: test for name, test in kept.items() if len(test) or not len(splits[name])}
 
 
 @dataclass(frozen=True)
@@ -54,12 +183,23 @@ class FittedModel:
     planes: Dataset | None = None
 
 
+METRICS: dict[str, Callable[[dict[str, FrameErrors]], float]] = {
+    "mean_abs_mm": lambda errors: errors["to_plane"].mean_abs_mm(),
+    "rms_mm": lambda errors: errors["to_plane"].rms_mm(),
+    "rms_along_ray_mm": lambda errors: errors["along_ray"].rms_mm(),
+    "rms_z_mm": lambda errors: errors["in_z"].rms_mm(),
+}
+
+
 @dataclass(frozen=True)
 class Experiment:
-    """Models, each measured on frames that it was not fitted to.
+    """Models on one set of images, each measured on frames that it was not fitted to.
 
     Attributes:
-        splits: What was fitted and held out.
+        name: The set's name.
+        dataset: Its recordings.
+        options: The models, as the recordings made them.
+        splits: What was held out.
         models: By split as in `splits`, and by column.
         errors: The same of their errors on the frames held out, by kind.
         fitter: What fitted them, and the pixels that measure them.
@@ -68,6 +208,9 @@ class Experiment:
         warnings: What limits the numbers, one sentence each.
     """
 
+    name: str
+    dataset: Dataset
+    options: ComparisonOptions
     splits: Splits
     models: list[dict[str, FittedModel]]
     errors: dict[str, list[dict[str, dict[str, FrameErrors]]]]
@@ -75,8 +218,51 @@ class Experiment:
     left_out: list[dict[str, Any]]
     warnings: list[str]
 
+    @property
+    def hand_eye_estimated(self) -> bool:
+        """Whether the hand-eye transform was an unknown."""
+        return hand_eye_is_free(self.dataset, self.options.hand_eye)
+
+    @property
+    def targets(self) -> dict[str, int]:
+        """How many images show which target."""
+        names, counts = np.unique(self.dataset.targets, return_counts=True)
+        return dict(zip(names.tolist(), counts.tolist(), strict=True))
+
+    @property
+    def hand_eye(self) -> dict[str, list[list[float]]]:
+        """tool_from_camera of each column, fitted to the first split's training frames."""
+        return {k: one.model.hand_eye().detach().tolist() for k, one in self.models[0].items()}
+
+    @cached_property
+    def values(self) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+        """For each protocol, metric and column, one value a split, shape (S,), millimetres."""
+        return {
+            protocol: {
+                metric: {k: np.array([measure(one[k]) for one in splits]) for k in self.models[0]}
+                for metric, measure in METRICS.items()
+            }
+            for protocol, splits in self.errors.items()
+        }
+
+    def estimate(
+        self, protocol: str, metric: str, column: str, less: str | None = None, overlap: float = 0.0
+    ) -> Estimate:
+        """Return the mean over the splits of a protocol, with its interval, millimetres.
+
+        Args:
+            protocol: How images were held out.
+            metric: What is averaged.
+            column: The model.
+            less: Another one, whose values are subtracted: a paired t-test.
+            overlap: Of the splits, see `statistics.estimate`.
+        """
+        values = self.values[protocol][metric]
+        return estimate(values[column] - (0.0 if less is None else values[less]), overlap)
+
 
 def held_out_experiment(
+    name: str,
     dataset: Dataset,
     options: ComparisonOptions,
     splits: Splits,
@@ -90,9 +276,10 @@ def held_out_experiment(
     own masks leave.
 
     Args:
+        name: The set's name.
         dataset: The recordings.
         options: The models.
-        splits: What is fitted and held out.
+        splits: What is held out.
         inspection: What was odd about the recordings. Frames that disagree with all others are
             left out, as a training leaves them out; None: none are.
         progress: Called after each fit.
@@ -101,22 +288,24 @@ def held_out_experiment(
     Raises:
         CalibrationDataError: A model needs what a recording lacks, or no pixel is usable.
     """
-    left_out: tuple[int, ...] = ()
+    frames, left_out = np.arange(dataset.num_frames), ()
     if inspection is not None:
-        drawn = [split.train for own in splits.values() for split in own.values()]
+        drawn = [np.setdiff1d(frames, test) for own in splits.values() for test in own.values()]
         left_out = frames_left_out(inspection, drawn)
         splits = {kind: without_frames(own, left_out) for kind, own in splits.items()}
     fitter = ModelFitter(dataset, options, progress, left_out)
-    models = [
-        {name: fitter.bare(name, *split) for name in baselines}
-        | {model.name: fitter.fit(model, *split) for model in options.models}
-        for own in splits.values()
-        for split in own.values()
-    ]
+    models = []
+    for test in (test for own in splits.values() for test in own.values()):
+        train = np.setdiff1d(frames, [*left_out, *test])
+        bare = {column: fitter.bare(column, train, test) for column in baselines}
+        models.append(bare | {one.name: fitter.fit(one, train, test) for one in options.models})
     in_a_row = [one for columns in models for one in columns.values()]
     found = iter(held_out_errors(fitter.measured, in_a_row, options.device))
     by_split = iter([{column: next(found) for column in columns} for columns in models])
     return Experiment(
+        name=name,
+        dataset=dataset,
+        options=options,
         splits=splits,
         models=models,
         errors={kind: [next(by_split) for _ in own] for kind, own in splits.items()},
@@ -192,19 +381,22 @@ class ModelFitter:
         """
         found = None
         if name == BEFORE:
-            model = self._without_correction(recorded_hand_eye(self._dataset))
+            model = without_correction(self.domain, recorded_hand_eye(self._dataset))
             if self._dataset.planes_are_estimated:
-                found = walls_alone(self.measured, name_walls(self._dataset), train, model)
+                found = walls_alone(self.measured, train, model)
         else:
             moments = self._geometry.images(train.tolist()).columns([])
-            start = Start.of(self.measured, self._options.hand_eye)(moments)
-            best = minimise(moments, start, self._options.solver).parameters
+            options = FitOptions(
+                model=ErrorModelOptions(),
+                hand_eye=self._options.hand_eye,
+                solver=self._options.solver,
+            )
+            best = hand_eye_alone(Problem(self.measured, train, options, self.domain), moments)
             if self._options.planes == "unknown":
-                named = name_walls(self._dataset)
-                walls, numbers = recorded_walls(self._dataset, train, named)
-                best, walls = estimate_walls(moments, best, walls)
-                found = FoundWalls(named, walls, numbers)
-            model = self._without_correction(best.tool_from_camera)
+                found = recorded_walls(self._dataset, train)
+                best, walls = estimate_walls(moments, best, found.walls)
+                found = replace(found, walls=walls)
+            model = without_correction(self.domain, best.tool_from_camera)
         return FittedModel(model, held_out, self._judged_against(found, name, held_out, model))
 
     def _usable(self, training: TrainingOptions, train: np.ndarray) -> Dataset:
@@ -228,18 +420,13 @@ class ModelFitter:
             return None
         if self._dataset.planes_are_estimated:
             return with_every_wall(self.measured, found, model)
-        unseen = set(found.named.of_frame[held_out].tolist()) - set(found.numbers.tolist())
+        unseen = set(found.of_frame[held_out].tolist()) - set(found.numbers.tolist())
         for wall in sorted(unseen):
             self.warnings.append(
-                f"{name}: no training image shows the wall '{found.named.names[wall]}'; its "
+                f"{name}: no training image shows the wall '{found.names[wall]}'; its "
                 "held-out images are judged against the recorded plane."
             )
         return found.put_into(self._dataset)
-
-    def _without_correction(self, tool_from_camera: Tensor) -> CalibrationModel:
-        nothing = ErrorModel(ErrorModelOptions(), self.domain)
-        known = Parameters(tool_from_camera, nothing.coefficient_vector(), hand_eye_is_free=False)
-        return calibrated(nothing, known)
 
 
 def held_out_errors(
@@ -272,8 +459,9 @@ def held_out_errors(
 
 def _planes_in_tool(dataset: Dataset) -> Tensor:
     """Return the planes n . x + d = 0 of a data set's frames in the tool frame, (N, 4)."""
-    planes = [planes_in_tool(recording) for recording in dataset.recordings]
-    return torch.cat([torch.cat([normal, d[:, None]], dim=1) for normal, d in planes])
+    names = "normal_world", "offset", "world_from_tool"
+    normal, offset = plane_in_frame(*(dataset.column(name) for name in names))
+    return torch.cat([normal, offset[:, None]], dim=1)
 
 
 @torch.no_grad()

@@ -12,10 +12,9 @@ from tofcorr.estimation.solvers import SolverOptions
 from tofcorr.options import Options, resolve_options
 from tofcorr.pixels.dataset import HandEyeOptions, PlaneChoice, resolved_planes
 from tofcorr.pixels.sample import MaskOptions
-from tofcorr.plausibility.checks.geometry import FAR_OFF
 from tofcorr.plausibility.finding import Inspection
-from tofcorr.training.judgement import against_garbage
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.judgement import against_garbage, masks_against_garbage
 
 DECIDED_BY_THE_COMPARISON = ("split", "advice", "device")
 """Training options that a model cannot set: the comparison decides them for all models."""
@@ -117,10 +116,9 @@ class ComparisonOptions(MaskOptions):
         fitted to it with robust weights. A model that chooses its pixels or robust weights keeps
         them, and so do options that choose the pixels.
         """
-        chosen = self.mask != "recording" or self.outlier_window_mm is not None
-        if inspection is None or not inspection.garbage_bends or chosen:
+        masks = {} if inspection is None else masks_against_garbage(self, inspection)
+        if inspection is None or not masks:
             return self
-        masks = {"mask": "ransac", "mask_tolerance_mm": 1e3 * FAR_OFF}
         models = tuple(against_garbage(model, inspection) for model in self.models)
         return self.model_copy(update=masks | {"models": models})
 

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from tofcorr.comparison.experiment import Experiment, held_out_experiment
+from tofcorr.comparison.experiment import Experiment, groupings, held_out_experiment
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
-from tofcorr.comparison.splits import groupings
-from tofcorr.comparison.statistics import Ranking, or_none, rank
-from tofcorr.comparison.table import Table
+from tofcorr.comparison.statistics import Ranking, Table, rank
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.files import StagedFolder
@@ -27,7 +25,8 @@ from tofcorr.pixels.sample import usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import bar
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.report import number_or_none
 
 # Unknowns that a residual network counts for: more than any curve has, so that it is chosen only
 # where no curve comes within one standard error of it. Its true number would do the same.
@@ -95,15 +94,12 @@ class SelectionResult:
 
     def __repr__(self) -> str:
         """Return what is doubtful, the choice, a table for each grouping, and warnings."""
-        head = [self.headline] if self.headline else []
-        tables = [table.text() for table in self.tables()]
-        return "\n\n".join([*head, self.verdict, *tables, *self._notes()])
+        return self._page([table.text() for table in self.tables()])
 
     def markdown(self) -> str:
         """Return the same as a page of Markdown."""
-        head = ["# Choice of a model", *([self.headline] if self.headline else []), self.verdict]
-        tables = [table.markdown() for table in self.tables()]
-        return "\n\n".join([*head, *tables, *self._notes()]) + "\n"
+        page = self._page([table.markdown() for table in self.tables()])
+        return f"# Choice of a model\n\n{page}\n"
 
     def tables(self) -> list[Table]:
         """Return a table for each grouping, the model with the smallest error first."""
@@ -112,14 +108,31 @@ class SelectionResult:
             Table(
                 f"{_HEADINGS[by]}: {metric} error, mm",
                 ["model", "unknowns", "error", "behind the best", ""],
-                _rows(ranking),
+                [
+                    self._row(ranking, name)
+                    for name in sorted(ranking.errors, key=lambda one: ranking.errors[one].mean)
+                ],
                 f"Held out in turn: {'; '.join(self.experiment.splits[by])}.",
             )
             for by, ranking in self.rankings.items()
         ]
 
-    def _notes(self) -> list[str]:
+    def _row(self, ranking: Ranking, name: str) -> list[str]:
+        one, behind = ranking.errors[name], ranking.behind[name]
+        low, high = behind.interval
         return [
+            name,
+            str(ranking.complexity[name]),
+            f"{one.mean:.2f} ± {one.standard_error:.2f}",
+            "best" if name == ranking.best else f"{behind.mean:.2f} [{low:.2f}, {high:.2f}]",
+            "winner" if name == ranking.winner else "tie" if name in ranking.ties else "",
+        ]
+
+    def _page(self, tables: list[str]) -> str:
+        parts = [
+            *([self.headline] if self.headline else []),
+            self.verdict,
+            *tables,
             *comparability_notes(self.options),
             *(f"Not held out by {by}: {why}" for by, why in self.skipped.items()),
             *(f"Warning: {warning}" for warning in self.experiment.warnings),
@@ -127,6 +140,7 @@ class SelectionResult:
             "standard error. Behind the best: paired difference, pose by pose, with its 95 % "
             "interval.",
         ]
+        return "\n\n".join(parts)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return every number as plain values, as in `selection.json`."""
@@ -140,11 +154,23 @@ class SelectionResult:
             "verdict": self.verdict,
             "by": {
                 by: {
-                    "held_out": {name: len(own.test) for name, own in found.splits[by].items()},
+                    "held_out": {name: len(test) for name, test in found.splits[by].items()},
                     "best": ranking.best,
                     "winner": ranking.winner,
                     "ties": ranking.ties,
-                    "models": {name: _model_mapping(ranking, name) for name in ranking.errors},
+                    "models": {
+                        name: {
+                            "unknowns": ranking.complexity[name],
+                            "error_mm": one.mean,
+                            "error_se_mm": number_or_none(one.standard_error),
+                            "behind_best_mm": ranking.behind[name].mean,
+                            "behind_best_se_mm": number_or_none(
+                                ranking.behind[name].standard_error
+                            ),
+                            "behind_best_ci95_mm": ranking.behind[name].to_mapping()["ci"],
+                        }
+                        for name, one in ranking.errors.items()
+                    },
                 }
                 for by, ranking in self.rankings.items()
             },
@@ -159,16 +185,14 @@ class SelectionResult:
     def plot_ranking(self) -> Figure:
         """Draw by how much each model is behind the best, with 95 % intervals, by grouping."""
         rankings, names = self.rankings, list(self.decisive.errors)
-        figure = Figure(
-            figsize=(2.0 + 3.2 * len(rankings), 1.6 + 0.35 * len(names)), layout="constrained"
-        )
+        size = 2 + 3 * len(rankings), 2 + len(names) / 3
+        figure = Figure(figsize=size, layout="constrained")
         panels = figure.subplots(1, len(rankings), sharey=True, squeeze=False)[0]
         for axes, (by, ranking) in zip(panels, rankings.items(), strict=True):
             for place, (name, one) in enumerate(ranking.behind.items()):
-                colour = "C2" if name == ranking.winner else "0.4"
-                half_width = np.nan_to_num(one.half_width)
-                axes.errorbar(one.mean, place, xerr=half_width, fmt="o", color=colour, capsize=3)
-            axes.axvline(0.0, color="0.7", linewidth=1, zorder=0)
+                style = {"fmt": "o", "color": "C2" if name == ranking.winner else "0.4"}
+                axes.errorbar(one.mean, place, xerr=np.nan_to_num(one.half_width), **style)
+            axes.axvline(0, color="0.7", zorder=0)
             axes.set_yticks(np.arange(len(names)), names)
             axes.set_title(f"{by}s held out: {ranking.winner} wins", fontsize=10)
             axes.set_xlabel("error minus that of the best [mm]")
@@ -238,7 +262,7 @@ def rank_models(
     options = options.for_recordings(dataset.recordings).against_garbage(inspection)
     # The masks alone say which pixels the groups look at.
     splits, skipped = groupings(usable_pixels(dataset, options, robust=False), options)
-    found = held_out_experiment(dataset, options, splits, inspection, progress)
+    found = held_out_experiment("", dataset, options, splits, inspection, progress)
     complexity = {
         model.name: _complexity(options.training(model), found.fitter.domain, dataset)
         for model in options.models
@@ -270,34 +294,5 @@ def _complexity(training: TrainingOptions, domain: Domain, dataset: Dataset) -> 
     if training.model.with_columns() != training.model:
         unknowns += domain.height * domain.width
     if training.planes == "unknown":
-        unknowns += 3 * len(name_walls(dataset).names)
+        unknowns += 3 * len(name_walls(dataset)[1])
     return unknowns + (training.residual is not None) * _NETWORK_UNKNOWNS
-
-
-def _rows(ranking: Ranking) -> list[list[str]]:
-    rows = []
-    for name, one in sorted(ranking.errors.items(), key=lambda item: item[1].mean):
-        behind = ranking.behind[name]
-        low, high = behind.interval
-        rows.append(
-            [
-                name,
-                str(ranking.complexity[name]),
-                f"{one.mean:.2f} ± {one.standard_error:.2f}",
-                "best" if name == ranking.best else f"{behind.mean:.2f} [{low:.2f}, {high:.2f}]",
-                "winner" if name == ranking.winner else "tie" if name in ranking.ties else "",
-            ]
-        )
-    return rows
-
-
-def _model_mapping(ranking: Ranking, name: str) -> dict[str, Any]:
-    one, behind = ranking.errors[name], ranking.behind[name]
-    return {
-        "unknowns": ranking.complexity[name],
-        "error_mm": one.mean,
-        "error_se_mm": or_none(one.standard_error),
-        "behind_best_mm": behind.mean,
-        "behind_best_se_mm": or_none(behind.standard_error),
-        "behind_best_ci95_mm": [or_none(end) for end in behind.interval],
-    }

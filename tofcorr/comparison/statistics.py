@@ -1,15 +1,17 @@
-"""Means of held-out errors with their intervals, paired comparisons, and the ranking of models."""
+"""Means of held-out errors with their intervals, the ranking of models, and tables of both."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import isfinite, nan, sqrt
+from math import nan, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tofcorr.estimation.robust import student_quantile, student_tail
+from tofcorr.training.report import number_or_none
 
-CONFIDENCE = 0.95
-"""Confidence level of every interval and test of a comparison; the usual convention."""
+_LEVEL = 0.05
+"""What every interval of a comparison leaves out, and the level of its tests; the usual one."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +37,20 @@ class Estimate:
     @property
     def significant(self) -> bool:
         """Whether the interval excludes zero."""
-        return self.p_value < 1 - CONFIDENCE
+        return self.p_value < _LEVEL
 
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % interval."""
         return self.mean - self.half_width, self.mean + self.half_width
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return mean, interval and standard deviation for JSON; None where unknown."""
+        return {
+            "mean": number_or_none(self.mean),
+            "ci": [number_or_none(end) for end in self.interval],
+            "standard_deviation": number_or_none(self.standard_deviation),
+        }
 
 
 def estimate(values: np.ndarray, overlap: float = 0.0) -> Estimate:
@@ -61,7 +71,7 @@ def estimate(values: np.ndarray, overlap: float = 0.0) -> Estimate:
     error = deviation * sqrt(1 / len(values) + overlap)
     # Two columns that are equal in every split have no difference to test.
     p_value = 2 * student_tail(abs(mean) / error, dof) if error > 0 else float(mean == 0)
-    half_width = student_quantile((1 + CONFIDENCE) / 2, dof) * error
+    half_width = student_quantile(1 - _LEVEL / 2, dof) * error
     return Estimate(mean, deviation, error, half_width, p_value, dof)
 
 
@@ -121,6 +131,37 @@ def rank(errors: Mapping[str, np.ndarray], complexity: Mapping[str, int], groups
     return Ranking(own, behind, complexity, best, winner, ties)
 
 
-def or_none(value: float) -> float | None:
-    """Return None for what JSON does not have: NaN and infinity."""
-    return value if isfinite(value) else None
+class Table(NamedTuple):
+    """Cells with a title above and a note below.
+
+    Attributes:
+        title: What the table shows.
+        header: Headings of the columns.
+        rows: Cells, as many a row as there are headings.
+        note: What the numbers are and how they were found.
+    """
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    note: str
+
+    def text(self) -> str:
+        """Return the table as text, the first column aligned left and the others right."""
+        lines = [self.header, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        aligned = [
+            "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip()
+            for line in lines
+        ]
+        rule = "-" * (sum(widths) + 2 * len(widths) - 2)
+        return "\n".join([self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note])
+
+    def markdown(self) -> str:
+        """Return a Markdown table."""
+        rule = [":--", *["--:"] * (len(self.header) - 1)]
+        lines = [
+            f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |"
+            for line in [self.header, rule, *self.rows]
+        ]
+        return "\n".join([f"**{self.title}**", "", *lines, "", self.note])

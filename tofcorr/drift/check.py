@@ -124,6 +124,7 @@ def check_drift(
     """
     _refuse_unfit(state, dataset, wall)
     known = reference or unknown_reference(state, wall_is_known=wall == "recorded")
+    known = known if dataset.has_amplitude else replace(known, noise=None)
     sums = OffsetSums(state, dataset, wall, known)
     if not list(through(sums.read(), "checking", total=dataset.num_frames)):
         raise CalibrationDataError(

@@ -28,10 +28,10 @@ from tofcorr.estimation.linear import Curvature, GroupSums, inverse, reduced
 from tofcorr.estimation.robust import f_tail, student_quantile
 from tofcorr.fit.linear_image import (
     BOWS,
-    Correlation,
-    FormFunctions,
-    LinearImage,
-    Linearisation,
+    LinearPixels,
+    block_squares,
+    design_effect,
+    linearised,
     wall_moves,
 )
 from tofcorr.fit.reference import Reference, own_noise, pixel_weights, repeated, view_of
@@ -110,15 +110,13 @@ class OffsetSums:
         self._images: list[ImageDrift] = []
         self._products: list[Tensor] = []
         self._count: list[int] = []
-        self._correlation = Correlation()
+        self._squares = torch.zeros(())
 
     def read(self) -> Iterator[int]:
         """Correct the images and add those with enough usable pixels; yield their numbers."""
         rays, error = self._dataset.ray_directions(), self._state.model().error
         off_wall, domain = off_the_wall(rays), self._state.domain
-        linear = Linearisation(
-            error, FormFunctions(domain), rays, twist=self._state.hand_eye_estimated
-        )
+        twist = self._state.hand_eye_estimated
         # Without a robot the recorded planes are in the camera's own coordinates.
         fixed = torch.eye(4, dtype=torch.float64)
         hand_eye = self._state.tool_from_camera if self._dataset.moves else fixed
@@ -138,7 +136,9 @@ class OffsetSums:
                 plane = shown = -planes[k] / size[k], 1 / size[k]
                 if self._wall != "per_image":
                     plane = plane_in_frame(batch.normal_tool[k], batch.offset_tool[k], hand_eye)
-                image = linear(batch, k, some_pixels(used, 5_000, frame), plane, shown)
+                some = some_pixels(used, 5_000, frame)
+                pixels, ray = pixels_of_image(batch, k, some), rays.flatten(0, 1)[some]
+                image = linearised(error, pixels, ray, plane, shown, twist=twist, domain=domain)
                 pose = poses[frame] @ hand_eye
                 one = [wall_moves(image.points, plane[0], pose)] if self._wall == "one" else []
                 self._add(image, one)
@@ -148,7 +148,7 @@ class OffsetSums:
                 self._images.append(ImageDrift(frame, math.nan, flatness, len(used)))
                 yield frame
 
-    def _add(self, image: LinearImage, one_wall: list[Tensor]) -> None:
+    def _add(self, image: LinearPixels, one_wall: list[Tensor]) -> None:
         """Add an image: offset, shared wall, its bow, calibration, own wall, residual."""
         known = self._reference
         columns = torch.cat(
@@ -164,7 +164,7 @@ class OffsetSums:
             dim=1,
         )
         weight = pixel_weights(known.noise, image)
-        self._correlation.add(image, weight)
+        self._squares = self._squares + block_squares(image, weight)
         self._products.append(columns.T @ (weight[:, None] * columns))
         self._count.append(len(columns))
         self.views.append(view_of(image))
@@ -183,7 +183,7 @@ class OffsetSums:
             len(reference.random_variance),
         )
         # Pixels that are alike count as fewer, which is as if each were as much noisier.
-        noise = own_noise(sums) * self._correlation.design_effect()
+        noise = own_noise(sums) * design_effect(self._squares)
         precision = 1 / reference.random_variance
         if self._wall == "per_image":
             precision[:3] = 0.0

@@ -1,4 +1,23 @@
-"""Fits one model to some frames of a data set, in named steps."""
+r"""Fits one model to some frames of a data set: moments, least loss, walls, and what else moves it.
+
+`fit` reads the pixels into moments (`prepare`), minimises the loss (`solve`), holds directions that
+the images do not determine, solves again where the walls are unknown, and adds what does not go
+through moments (`finish`): covariance, fixed pattern, residual network, and the noise's shift.
+
+*The noise's shift.* The error terms are functions of the measured distance D, which has noise of
+variance s^2. A pixel's squared residual therefore contains, beyond the noise of its plane distance,
+
+.. math:: s^2 \Big(\cos\theta\,\big(1 - \textstyle\sum_k \beta_k f_k'(D)\big)\Big)^2 ,
+
+which is smaller where the correction shrinks all distances. The fit does so a little, and the
+hand-eye transform makes up for it, above all along the viewing direction. No scatter between poses
+shows that: it is the same in all of them. The expected term is a quadratic form like the moments,
+with the columns' derivatives in place of the columns (the corrected score of Nakamura 1990), so one
+Newton step without it says how far the least loss has moved.
+
+Hand-eye transform, coefficients and estimated walls are moved back together: one makes up for the
+other, and only together do they put corrected points on the planes.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,137 +26,48 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.model import CalibrationModel, HandEye
-from tofcorr.error_terms.base import Domain
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.base import Domain, Term
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.linear import solvable
-from tofcorr.estimation.moments import ImageMoments, Parameters
-from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.planes import Walls, estimate_walls
-from tofcorr.estimation.solvers import Watcher
-from tofcorr.estimation.uncertainty import jackknife_covariance
-from tofcorr.fit.core import Core, Held, hold, minimise, solve
-from tofcorr.fit.noise_shift import NoiseShift, noise_of, without_noise_shift
-from tofcorr.fit.problem import FitOptions, Problem, Start, build_model
-from tofcorr.fit.residual import (
-    FittedCore,
-    ResidualOutcome,
-    fit_residual,
+from tofcorr.estimation.linear import Curvature, solvable
+from tofcorr.estimation.moments import (
+    ImageMoments,
+    MomentObjective,
+    Objective,
+    Parameters,
+    Prior,
+    WithPrior,
 )
-from tofcorr.fit.result import Fit
-from tofcorr.fit.walls import FoundWalls, name_walls, recorded_walls
-from tofcorr.fit.weighting import PixelWeights, first_weights, weighted_moments
-from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
-from tofcorr.pixels.sample import cosine_of_incidence, distance_to_plane, draw_pixels
-
-
-def fixed_pattern(
-    dataset: Dataset,
-    frames: Sequence[int] | np.ndarray,
-    model: CalibrationModel,
-    spread: float | None = None,
-    device: str = "cpu",
-) -> tuple[Tensor, float]:
-    """Return the pixels' offsets (H, W) in metres, and their standard deviation.
-
-    Args:
-        dataset: The recordings.
-        frames: Global numbers of the frames fitted.
-        model: The fitted model; its own pattern must be zero.
-        spread: Standard deviation tau of the offsets, metres; None: from the data, as the variance
-            of the means beyond their own uncertainty (empirical Bayes).
-        device: Where to compute.
-    """
-    rays = dataset.ray_directions()
-    # Sums over the frames: c r, c^2, r^2 and the count.
-    total = rays.new_zeros(4, *rays.shape[:2])
-    for batch in dataset.batches(frames, device):
-        here = rays.to(device)
-        found = distance_to_plane(model, batch, here)
-        cosine = cosine_of_incidence(model, batch, here)
-        sums = torch.stack([cosine * found, cosine**2, found**2, torch.ones_like(found)])
-        total += (sums * batch.valid.to(found)).sum(dim=1).cpu()
-    product, square, residual, number = total
-    seen = square > 0
-    mean = torch.where(seen, product / square.clamp(min=1e-300), 0.0)
-    within = (residual - mean * product).clamp(min=0)
-    variance = within.sum() / (number - 1).clamp(min=0).sum().clamp(min=1)
-    own = torch.where(seen, variance / square.clamp(min=1e-300), torch.inf)
-    if spread is None:
-        excess = mean[seen].square().mean() - own[seen].mean() if bool(seen.any()) else mean.sum()
-        spread = float(excess.clamp(min=0).sqrt())
-    return mean * spread**2 / (spread**2 + own).clamp(min=1e-300), spread
-
-
-def with_pattern(problem: Problem, core: Core) -> CalibrationModel:
-    """Return the model of a fitted core, with its fixed pattern if the options ask for one."""
-    error = core.error_model(problem.domain)
-    model = calibrated(error, core.solution.parameters)
-    if error.fixed_pattern is not None:
-        spread = error.fixed_pattern.options.spread_mm  # type: ignore[attr-defined]
-        known = None if spread == "auto" else spread * 1e-3
-        device = problem.options.device
-        offset, _ = fixed_pattern(problem.dataset, problem.frames, model, known, device)
-        error.fixed_pattern.offset.copy_(offset)
-    return model
-
-
-def refuse_diverged(parameters: Parameters) -> None:
-    """Refuse a hand-eye transform that the solver moved so far that it is no rotation any more.
-
-    Raises:
-        CalibrationDataError: The frames do not determine it, and its estimate grew without bounds.
-    """
-    rotation = parameters.tool_from_camera[:3, :3].detach()
-    off = rotation @ rotation.T - torch.eye(3).to(rotation)
-    # Rounding makes 1e-15 for a step of any sensible size; only one of a million turns makes more.
-    if bool((off.abs() < 1e-6).all()):
-        return
-    raise CalibrationDataError(
-        "The frames do not determine the hand-eye transform: its estimate grew without bounds. "
-        "Record more poses, near and far and tilted to all sides, or choose a model of fewer terms."
-    )
-
-
-def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
-    """Join an error model, its coefficients set, and the hand-eye transform of the parameters."""
-    hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
-    hand_eye.rebase(parameters.tool_from_camera)
-    return CalibrationModel(error, hand_eye)
-
-
-def completed(
-    problem: Problem, held: Held, weights: PixelWeights | None
-) -> tuple[
-    Problem, Core, CalibrationModel, ResidualOutcome | None, DistanceNoise | None, NoiseShift | None
-]:
-    """Decide on the residual network, take the noise's shift off, and add the fixed pattern.
-
-    Returns:
-        The problem, on the walls that go with the core; the core, without what the noise of the
-        distances moves; its model, with fixed pattern and network; how the network was decided on,
-        the noise and what it moves, each None if unknown.
-    """
-    noise, outcome = noise_of(problem, weights), None
-    residual, core = problem.options.residual, held.core
-    if residual is not None:
-        error, frames = with_pattern(problem, core).error, np.sort(problem.frames)
-        outcome = fit_residual(
-            FittedCore(error, core.moments, core.solution.parameters, core.smoothness),
-            draw_pixels(problem.dataset, frames, residual.pixels, residual.network.seed),
-            problem.dataset.pose_groups()[frames],
-            problem.domain,
-            residual,
-        )
-        if outcome.network is not None:
-            error.residual = outcome.network
-            error.set_coefficient_vector(outcome.parameters.coefficients)
-            model = calibrated(error, outcome.parameters)
-            _, core, shift = without_noise_shift(problem, held, weights, noise, network=True)
-            return problem, core, model, outcome, noise, shift
-    problem, core, shift = without_noise_shift(problem, held, weights, noise, network=False)
-    return problem, core, with_pattern(problem, core), outcome, noise, shift
+from tofcorr.estimation.noise import DistanceNoise
+from tofcorr.estimation.planes import estimate_walls, joint_image_equations
+from tofcorr.estimation.regularisation import (
+    penalties_of,
+    smoothness,
+    time_constant,
+    total_weight,
+    with_strengths,
+)
+from tofcorr.estimation.solvers import Solution, Watcher, minimise
+from tofcorr.estimation.uncertainty import (
+    PRIOR_SIGMA,
+    effective_variance,
+    jackknife_covariance,
+    observability,
+    prior_on_undetermined,
+)
+from tofcorr.fit.problem import Core, Fit, FitOptions, Problem, ResidualOutcome, Shift, build_model
+from tofcorr.fit.residual import fit_residual
+from tofcorr.fit.walls import recorded_walls
+from tofcorr.fit.weighting import PixelWeights, first_weights
+from tofcorr.pixels.dataset import Dataset, thread_number
+from tofcorr.pixels.sample import (
+    cosine_of_incidence,
+    distance_to_plane,
+    estimate_noise,
+    pixels_of_image,
+)
 
 
 def fit(
@@ -149,13 +79,18 @@ def fit(
     resumed: Parameters | None = None,
     moments: ImageMoments | None = None,
 ) -> Fit:
-    """Fit one model to some frames: one pass over the pixels, then the solver on the moments.
+    """Fit one model to frames, from one pass over their pixels.
+
+    Where walls are unknown, they are estimated from the moments of that same pass. Robust weights
+    need a pass more for each time they are computed. A penalty whose strength is left open gets the
+    strength that predicts held-out poses best, a warm-up the time constant that reduces the loss
+    most. The residual network comes last and needs one more pass, in which a few thousand pixels
+    are drawn.
 
     A direction that the images do not determine is held near the start by a weak prior, or
     refused, as the options say.
 
-    Where the noise of the measured distances is known, what it moves is taken off the estimate, as
-    `noise_shift` says.
+    Where the noise of the measured distances is known, what it moves is taken off the estimate.
 
     Args:
         dataset: The recordings.
@@ -172,9 +107,8 @@ def fit(
             determine a direction and the options refuse that, or they determine nothing.
     """
     with solvable(dataset.first.path, "fit"), thread_number(1):
-        start = Start.of(dataset, options.hand_eye, resumed)
-        problem = Problem(dataset, np.asarray(frames), options, domain, start, watcher)
-        return finish(*solved(problem, moments))
+        problem = Problem(dataset, np.asarray(frames), options, domain, watcher, resumed)
+        return _with_covariance(*_solved(problem, moments))
 
 
 def fit_model(
@@ -182,11 +116,8 @@ def fit_model(
 ) -> CalibrationModel:
     """Return the model that `fit` finds, without its covariance; arguments and errors as there."""
     with solvable(dataset.first.path, "fit"), thread_number(1):
-        start = Start.of(dataset, options.hand_eye)
-        problem = Problem(dataset, np.asarray(frames), options, domain, start)
-        problem, held, weights = solved(problem)
-        refuse_diverged(held.core.solution.parameters)
-        return completed(problem, held, weights)[2]
+        problem = Problem(dataset, np.asarray(frames), options, domain)
+        return _completed(*_solved(problem))[2]
 
 
 def fit_hand_eye(
@@ -198,134 +129,219 @@ def fit_hand_eye(
     """
     with solvable(dataset.first.path, "fit"), thread_number(1):
         none = options.model_copy(update={"model": ErrorModelOptions(terms=())})
-        start = Start.of(dataset, options.hand_eye)
-        problem = Problem(dataset, np.asarray(frames), none, domain, start)
-        return without_terms(problem, prepare(problem)[0])
+        problem = Problem(dataset, np.asarray(frames), none, domain)
+        return hand_eye_alone(problem, prepare(problem)[0])
 
 
-def solved(
-    problem: Problem, moments: ImageMoments | None = None
-) -> tuple[Problem, Held, PixelWeights | None]:
-    """Take all steps to the fitted core.
+def hand_eye_alone(problem: Problem, moments: ImageMoments) -> Parameters:
+    """Fit the hand-eye transform alone to moments of the problem's frames.
 
-    Args:
-        problem: What to fit.
-        moments: As in `fit`.
-
-    Returns:
-        The problem, on the walls found where they are unknown, its core, and the pixels' weights.
+    Raises:
+        CalibrationDataError: The frames do not determine it.
     """
-    weights = None
+    geometry = moments.columns([])
+    found = _minimum(problem, geometry, replace(problem, resumed=None).start(geometry)).parameters
+    refuse_diverged(found)
+    return found
+
+
+def _minimum(
+    problem: Problem,
+    moments: ImageMoments,
+    start: Parameters,
+    prior: Prior | None = None,
+    watcher: Watcher | None = None,
+) -> Solution:
+    """Minimise the point-to-plane loss of the moments with the solver that the options name."""
+    objective: Objective = MomentObjective(moments)
+    if prior is not None:
+        objective = WithPrior(objective, prior)
+    return minimise(objective, start, problem.options.solver, watcher)
+
+
+def _solved(
+    problem: Problem, moments: ImageMoments | None = None
+) -> tuple[Problem, Core, PixelWeights | None]:
+    """Take all steps to the fitted core; return it, the problem on its walls, and the weights."""
     if moments is None:
         moments, weights = prepare(problem)
-    elif problem.options.weights.noise:
-        weights = first_weights(problem.dataset, problem.frames, noise=True, loss="none")
-    held = hold(problem, solve(problem, moments))
-    if resolved_planes(problem.options.planes, problem.dataset.recordings) == "unknown":
-        problem, moments = on_found_walls(problem, held.core, moments)
-        held = hold(problem, solve(problem, moments))
-    return problem, held, weights
+    else:
+        noise = problem.options.weights.noise
+        weights = first_weights(problem.dataset, problem.frames, noise, "none")
+    problem, core = _on_walls(problem, moments)
+    refuse_diverged(core.solution.parameters)
+    return problem, core, weights
 
 
 def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
     """Read the pixels once, or once for each pass of robust weights.
 
+    Robust weights depend on the fit, and the fit on them. Both are computed in turn, with a pass
+    over the pixels each time, until the fit no longer changes.
+
     Returns:
         The moments of the frames, and the weights of the pixels; None if all have the same.
     """
-    options, quiet = problem.options, replace(problem, watcher=None)
-    walls = recorded_walls_of(problem)
-
-    def on_recorded_walls(moments: ImageMoments) -> ImageMoments:
-        return moments if walls is None else walls.seen_by(moments)
-
-    def modelled(moments: ImageMoments) -> tuple[CalibrationModel, Dataset]:
-        here, moments = quiet, on_recorded_walls(moments)
-        core = solve(here, moments)
-        if walls is not None:
-            # Distances to a plane that is a mere guess would make every pixel an outlier.
-            here, moments = on_found_walls(here, core, moments)
-            core = solve(here, moments)
-        model = calibrated(core.error_model(problem.domain), core.solution.parameters)
-        return model, here.dataset
-
-    _, design = build_model(problem.dataset, options.model, problem.domain)
-    moments, weights = weighted_moments(
-        problem.dataset, problem.frames, design, options.weights, modelled, options.device
-    )
-    return on_recorded_walls(moments), weights
-
-
-def recorded_walls_of(problem: Problem) -> Walls | None:
-    """Return the walls as recorded if they are a mere start; None if they are known."""
-    if resolved_planes(problem.options.planes, problem.dataset.recordings) == "known":
-        return None
-    named = name_walls(problem.dataset)
-    return recorded_walls(problem.dataset, problem.frames, named)[0]
+    frames, options, seen = problem.frames, problem.options, problem.dataset
+    _, design = build_model(seen, options.model, problem.domain)
+    walls = recorded_walls(seen, frames).walls if problem.estimates_walls else None
+    weights = first_weights(seen, frames, options.weights.noise, options.weights.robust)
+    moments = seen.moments(design, frames, weights, options.device)
+    before = None
+    for _ in range(0 if options.weights.robust == "none" else options.weights.passes):
+        # Distances to a plane that is a mere guess would make every pixel an outlier.
+        quiet = replace(problem, watcher=None)
+        moments = moments if walls is None else walls.seen_by(moments)
+        here, core = _on_walls(quiet, moments, held=False)
+        best, seen = core.solution.parameters, here.dataset
+        now = torch.cat([best.tool_from_camera.flatten(), best.coefficients])
+        # In metres, or without unit the entries of the rotation: far below any standard error.
+        if before is not None and float((now - before).abs().max()) < options.solver.tolerance:
+            break
+        before, model = now, calibrated(ErrorModel(core.options, problem.domain), best)
+        assert weights is not None
+        weights = weights.updated(seen, frames, model)
+        moments = seen.moments(design, frames, weights, options.device)
+    return moments if walls is None else walls.seen_by(moments), weights
 
 
-def find_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray, core: Core) -> FoundWalls:
-    """Estimate the walls of some frames together with the unknowns of a fitted core.
+def _on_walls(
+    problem: Problem, moments: ImageMoments, *, held: bool = True
+) -> tuple[Problem, Core]:
+    """Solve; where the walls are unknown, estimate them with the unknowns, and solve on them."""
+    core = solve(problem, moments, held=held)
+    if not problem.estimates_walls:
+        return problem, core
+    found, best = recorded_walls(problem.dataset, problem.frames), core.solution.parameters
+    prior = None if core.smoothness is None else core.smoothness.equations(best)
+    found = replace(found, walls=estimate_walls(core.moments, best, found.walls, prior)[1])
+    problem = problem.on(found, resumed=best)
+    return problem, solve(problem, found.walls.seen_by(moments), held=held)
+
+
+def solve(problem: Problem, moments: ImageMoments, folds: int = 6, *, held: bool = True) -> Core:
+    """Find the hand-eye transform and the coefficients that minimise the loss of the moments.
 
     Args:
-        dataset: The recordings.
-        frames: Global numbers of the frames.
-        core: Fitted to them with the walls as recorded.
+        problem: What to fit.
+        moments: Of its frames, with exactly the model's image columns.
+        folds: Of the cross-validation that chooses the strength of a penalty; poses go to them in
+            turn, with all their images.
+        held: Whether directions that the images do not determine are looked for, and held.
 
     Raises:
-        CalibrationDataError: A wall has fewer than three of the frames.
+        CalibrationDataError: There is one, and the options ask to refuse it.
     """
-    named = name_walls(dataset)
-    walls, numbers = recorded_walls(dataset, frames, named)
-    best = core.solution.parameters
-    prior = None if core.smoothness is None else core.smoothness.equations(best)
-    _, walls = estimate_walls(core.moments, best, walls, prior)
-    return FoundWalls(named, walls, numbers)
-
-
-def on_found_walls(
-    problem: Problem, core: Core, moments: ImageMoments
-) -> tuple[Problem, ImageMoments]:
-    """Estimate the walls with the unknowns of a core; return problem and moments on them."""
-    walls = find_walls(problem.dataset, problem.frames, core)
-    start = problem.start.resumed_at(core.solution.parameters)
-    return problem.with_walls(walls, start), walls.walls.seen_by(moments)
-
-
-def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
-    """Add covariance, the hand-eye transform alone, fixed pattern and residual network.
-
-    What the noise of the distances moves is taken off the estimate.
-    """
-    optimum, walls = held.core.solution.parameters, problem.walls
-    refuse_diverged(optimum)
-    # At the least loss, where the gradients of the poses sum to zero.
-    covariance = jackknife_covariance(
-        held.core.moments,
-        optimum,
-        held.total_prior,
-        problem.numbered_poses(),
-        None if walls is None else walls.walls,
+    options, conditions = problem.options.model, problem.dataset.conditions(problem.frames)
+    if any(term.is_open("time_constants_s") for term in options.terms):
+        around = _minimum(problem, moments, problem.start(moments)).parameters
+        found = time_constant(moments, around, conditions[:, CONDITIONS.index("timestamp")])
+        terms = [
+            one.model_copy(update={"time_constants_s": (found,)})
+            if one.is_open("time_constants_s")
+            else one
+            for one in options.terms
+        ]
+        options = options.model_copy(update={"terms": tuple(terms)})
+    model = ErrorModel(options, problem.domain)
+    frame_terms: list[Term] = list(model.condition_terms)  # type: ignore[arg-type]
+    if frame_terms:
+        functions = torch.cat([term.basis(conditions) for term in frame_terms])  # type: ignore[operator]
+        symbols = [symbol for term in frame_terms for symbol in term.symbols]
+        moments = moments.with_conditions(functions.T, symbols)
+    start, poses = _start(problem, moments, model), problem.poses()
+    held_out = [(poses % folds == k).nonzero()[:, 0].tolist() for k in range(folds)]
+    penalties = with_strengths(penalties_of(model), moments, start, held_out)
+    strengths = {one.name: float(one.strength) for one in penalties}
+    chosen = iter([strengths[term.symbols[0]] for term, _ in model.penalised()])
+    terms = [
+        one.model_copy(update={"strength": next(chosen)})
+        if "strength" in one.found_in_data
+        else one
+        for one in options.terms
+    ]
+    core = Core(
+        options=options.model_copy(update={"terms": tuple(terms)}),
+        moments=moments,
+        start=start,
+        smoothness=(prior := smoothness(penalties, total_weight(moments), start)),
+        solution=_minimum(problem, moments, start, prior, problem.watcher),
     )
-    hand_eye_only = without_terms(problem, held.core.moments)
-    problem, core, model, outcome, noise, shift = completed(problem, held, weights)
-    solution = core.solution
-    if outcome is not None and outcome.kept:
-        optimum = outcome.parameters
-        solution = replace(solution, parameters=optimum)
+    return _hold(problem, core) if held else core
+
+
+def _start(problem: Problem, moments: ImageMoments, model: ErrorModel) -> Parameters:
+    """Start penalised curves at zero: without the penalty the images hardly determine them."""
+    penalised = {symbol for term, _ in model.penalised() for symbol in term.symbols}
+    if not penalised:
+        return problem.start(moments)
+    others = [symbol for symbol in moments.symbols if symbol not in penalised]
+    found = problem.start(moments.columns(others))
+    coefficients = torch.zeros(moments.num_coefficients, dtype=torch.float64)
+    coefficients[[moments.symbols.index(symbol) for symbol in others]] = found.coefficients
+    return replace(found, coefficients=coefficients)
+
+
+def _hold(problem: Problem, core: Core) -> Core:
+    """Look for undetermined directions, and put a prior on them or refuse them."""
+    moments, best, smooth = core.moments, core.solution.parameters, core.smoothness
+    if smooth is not None:
+        smooth = smooth.rescaled(effective_variance(moments, best))
+    found = observability(moments, best, prior=smooth, walls=problem.estimated)
+    prior = prior_on_undetermined(found, problem.guess(moments))
+    core = replace(core, smoothness=smooth, observability=found, prior=prior)
+    if prior is None:
+        return core
+    if problem.options.free_directions == "refuse":
+        raise CalibrationDataError(
+            f"The images do not determine: {'; '.join(prior.names)}. Add views tilted about two "
+            "axes and a wider range of distances, keep the recorded hand-eye transform "
+            "(hand_eye.estimate: no), or set free_directions: prior."
+        )
+    return replace(core, solution=_minimum(problem, moments, core.start, core.total_prior))
+
+
+def refuse_diverged(parameters: Parameters) -> None:
+    """Refuse a hand-eye transform that the solver moved so far that it is no rotation any more.
+
+    Raises:
+        CalibrationDataError: The frames do not determine it, and its estimate grew without bounds.
+    """
+    rotation = parameters.tool_from_camera[:3, :3].detach()
+    off = rotation @ rotation.T - torch.eye(3).to(rotation)
+    # Rounding makes 1e-15 for a step of any sensible size; only one of millions of turns makes half
+    # of the digits wrong.
+    if bool((off.abs() < torch.finfo(rotation.dtype).eps ** 0.5).all()):
+        return
+    raise CalibrationDataError(
+        "The frames do not determine the hand-eye transform: its estimate grew without bounds. "
+        "Record more poses, near and far and tilted to all sides, or choose a model of fewer terms."
+    )
+
+
+def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
+    """Join an error model, given the coefficients, and the hand-eye transform of parameters."""
+    error.set_coefficient_vector(parameters.coefficients)
+    hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
+    hand_eye.rebase(parameters.tool_from_camera)
+    return CalibrationModel(error, hand_eye)
+
+
+def _with_covariance(problem: Problem, core: Core, weights: PixelWeights | None) -> Fit:
+    """Add the covariance, the hand-eye transform alone, and all that is not in the core."""
+    optimum, prior, poses = core.solution.parameters, core.total_prior, problem.poses()
+    # At the least loss, where the gradients of the poses sum to zero.
+    covariance = jackknife_covariance(core.moments, optimum, prior, poses, problem.estimated)
+    hand_eye_only = hand_eye_alone(problem, core.moments)
+    problem, core, model, outcome, noise, shift = _completed(problem, core, weights)
     return Fit(
+        **vars(core),
         model=model,
         domain=problem.domain,
-        solution=solution,
-        optimum=optimum,
+        optimum=core.solution.parameters if outcome is not None and outcome.kept else optimum,
         hand_eye_only=hand_eye_only,
         covariance=covariance,
-        moments=core.moments,
-        observability=held.observability,
-        prior=held.prior,
-        total_prior=held.total_prior,
-        poses=problem.numbered_poses(),
-        options=core.options,
+        poses=poses,
         residual=outcome,
         weights=weights,
         walls=problem.walls,
@@ -334,10 +350,169 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
     )
 
 
-def without_terms(problem: Problem, moments: ImageMoments) -> Parameters:
-    """Fit the hand-eye transform alone to moments."""
-    geometry = moments.columns([])
-    bare = problem.start.resumed_at(None)(geometry)
-    parameters = minimise(geometry, bare, problem.options.solver).parameters
-    refuse_diverged(parameters)
-    return parameters
+def _completed(
+    problem: Problem, core: Core, weights: PixelWeights | None
+) -> tuple[
+    Problem, Core, CalibrationModel, ResidualOutcome | None, DistanceNoise | None, Shift | None
+]:
+    """Decide on the residual network, take the noise's shift off, and add the fixed pattern.
+
+    Returns:
+        The problem, on the walls that go with the core; the core, without what the noise of the
+        distances moves; its model, with fixed pattern and network; how the network was decided on,
+        the noise and what it moves, each None if unknown.
+    """
+    noise = None if weights is None else weights.noise
+    if noise is None and problem.dataset.has_amplitude:
+        try:
+            noise = estimate_noise(problem.dataset, problem.frames)
+        except CalibrationDataError:
+            noise = None  # The recording does not determine it.
+    if problem.options.residual is None:
+        problem, core, shift = _without_noise_shift(problem, core, weights, noise)
+        return problem, core, _with_pattern(problem, core), None, noise, shift
+    error = _with_pattern(problem, core).error
+    outcome, network, best = fit_residual(problem, core, error, problem.options.residual)
+    with_network = network is not None
+    problem, core, shift = _without_noise_shift(problem, core, weights, noise, with_network)
+    if network is None:
+        return problem, core, _with_pattern(problem, core), outcome, noise, shift
+    error.residual = network
+    core = replace(core, solution=replace(core.solution, parameters=best))
+    return problem, core, calibrated(error, best), outcome, noise, shift
+
+
+def _with_pattern(problem: Problem, core: Core) -> CalibrationModel:
+    """Return the model of a core, with its fixed pattern (H, W), metres, if there is to be one.
+
+    The standard deviation tau of the offsets is that of the options or, by empirical Bayes, the
+    variance of their means beyond the means' own uncertainty.
+    """
+    dataset, device = problem.dataset, problem.options.device
+    model = calibrated(ErrorModel(core.options, problem.domain), core.solution.parameters)
+    pattern = model.error.fixed_pattern
+    if pattern is None:
+        return model
+    rays = dataset.ray_directions()
+    # Sums over the frames: c r, c^2, r^2 and the count.
+    total = rays.new_zeros(4, *rays.shape[:2])
+    for batch in dataset.batches(problem.frames, device):
+        here = rays.to(device)
+        found = distance_to_plane(model, batch, here)
+        cosine = cosine_of_incidence(model, batch, here)
+        sums = torch.stack([cosine * found, cosine**2, found**2, torch.ones_like(found)])
+        total += (sums * batch.valid.to(found)).sum(dim=1).cpu()
+    product, square, residual, number = total
+    seen = square > 0
+    mean = torch.where(seen, product / square, 0.0)
+    within = (residual - mean * product).clamp(min=0)
+    variance = within.sum() / (number - 1).clamp(min=0).sum().clamp(min=1)
+    own = torch.where(seen, variance / square, torch.inf)
+    spread = pattern.options.spread_mm  # type: ignore[attr-defined]
+    of_offsets = torch.as_tensor(0.0 if spread == "auto" else (1e-3 * spread) ** 2)
+    if spread == "auto" and bool(seen.any()):
+        of_offsets = (mean[seen].square().mean() - own[seen].mean()).clamp(min=0)
+    # Without spread and without uncertainty, the offsets are the means: zero.
+    pattern.offset.copy_((mean * of_offsets / (of_offsets + own)).nan_to_num())
+    return model
+
+
+def _without_noise_shift(
+    problem: Problem,
+    core: Core,
+    weights: PixelWeights | None,
+    noise: DistanceNoise | None,
+    with_network: bool = False,
+) -> tuple[Problem, Core, Shift | None]:
+    """Move an estimate back by what the noise of the distances has moved it.
+
+    It stays at the least loss, and the shift is only stated, where the options say so, where the
+    solver did not get there, and with a residual network, which is trained to the least loss too.
+
+    Returns:
+        The problem, on walls moved likewise where they were estimated; the core; and the shift,
+        None where it is unknown or nothing is estimated that it could move.
+    """
+    optimum, walls = core.solution.parameters, problem.estimated
+    if noise is None or not optimum.size:
+        return problem, core, None
+    images = joint_image_equations(core.moments, optimum, walls).total()
+    prior = None if core.total_prior is None else core.total_prior.equations(optimum)
+    expected = _expected_moments(problem, core, weights, noise)
+    excess = joint_image_equations(expected, optimum, walls).total()
+    # The noise is part of the loss: one that would make more was taken for too large. Of a camera
+    # that the fit took to the wall both are rounding, of either sign.
+    factor = (images.loss / excess.loss).nan_to_num().clamp(min=0, max=1)
+    # In these coordinates the curvature is 1 in every direction, of which the noise makes a share.
+    basis = Curvature(images.plus(prior).hessian).basis
+    share, turn = torch.linalg.eigh(basis.T @ (factor * excess.hessian) @ basis)
+    basis = basis @ turn
+    # No step is longer than ten times the first-order one. Chosen: a share of 0.7 (20 mm of noise,
+    # 12 poses) still gives the right step.
+    step = basis @ ((basis.T @ (factor * excess.gradient)) / (1 - share).clamp(min=1 / 10))
+    own, of_walls = step[: optimum.size], step[optimum.size :]
+    removed = problem.options.remove_noise_shift and core.solution.converged and not with_network
+    shift = None
+    if optimum.hand_eye_is_free:
+        shift = Shift("noise", "the noise of the distances", -own[:6], removed=removed)
+    if not removed:
+        return problem, core, shift
+    moments = core.moments
+    if problem.walls is not None:
+        found = problem.walls.walls.moved(of_walls)
+        problem = problem.on(replace(problem.walls, walls=found), problem.resumed)
+        moments = found.seen_by(moments)
+    solution = replace(core.solution, parameters=optimum.moved(own).detached())
+    return problem, replace(core, moments=moments, solution=solution), shift
+
+
+def _expected_moments(
+    problem: Problem,
+    core: Core,
+    weights: PixelWeights | None,
+    noise: DistanceNoise,
+    pixels: int = 50_000,
+    fewest_frames: int = 16,
+) -> ImageMoments:
+    """Return what the noise adds to the moments, estimated from some frames and pixels.
+
+    The shift of so many pixels is known far better than it needs to be.
+
+    Args:
+        problem: What was fitted.
+        core: At the least loss.
+        weights: Of the pixels.
+        noise: Of a measured distance.
+        pixels: About how many are read.
+        fewest_frames: In at least so many evenly spread frames.
+    """
+    data, error = problem.dataset, ErrorModel(core.options, problem.domain)
+    count = min(max(fewest_frames, pixels // (error.height * error.width)), len(problem.frames))
+    chosen = np.unique(np.linspace(0, len(problem.frames) - 1, count).astype(int))
+    rays, number = data.ray_directions().flatten(0, 1), iter(chosen.tolist())
+    gram = torch.zeros_like(core.moments.gram)
+    for batch in data.batches(problem.frames[chosen]):
+        weight = torch.ones_like(batch.radial_distance) if weights is None else weights(batch)
+        for k in range(len(batch.indices)):
+            used = batch.valid[k].flatten().nonzero()[:, 0]
+            some = used[:: max(1, len(used) * len(chosen) // pixels)]
+            at = pixels_of_image(batch, k, some)
+            # Without amplitude the variance is infinite; no camera errs by more than this prior.
+            variance = noise.variance(at.amplitude).clamp(max=PRIOR_SIGMA**2)
+            variance = variance * weight[k].flatten()[some]
+            own = (_slopes(error, at)[:, None, :] * rays[some].T).flatten(0, 1)
+            share = len(used) / max(len(some), 1) * len(problem.frames) / len(chosen)
+            gram[next(number), :-1, :-1] = share * (own * variance) @ own.T
+    return replace(core.moments, gram=gram)
+
+
+def _slopes(error: ErrorModel, pixels: Pixels) -> Tensor:
+    """Return the derivatives of the distance and of the model's columns by the distance, (C, M)."""
+
+    def columns(distance: Tensor) -> Tensor:
+        return error.columns_at(pixels._replace(radial_distance=distance))
+
+    one = torch.ones_like(pixels.radial_distance)
+    with torch.no_grad():
+        _, slopes = torch.func.jvp(columns, (pixels.radial_distance,), (one,))
+    return torch.cat([one[None], slopes])

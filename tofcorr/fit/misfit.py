@@ -15,76 +15,53 @@ error terms absorb it. So standard errors cannot hold it. With the model's colum
 """
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.recording import FrameBatch, Recording
-from tofcorr.error_terms.base import Term
-from tofcorr.estimation.accumulator import Design
-from tofcorr.estimation.linear import Added, AddedColumns, Curvature, NormalEquations, pose_products
+from tofcorr.error_terms.model import Pixels
+from tofcorr.estimation.linear import AddedColumns, Curvature, NormalEquations, pose_products
 from tofcorr.estimation.robust import student_quantile
-from tofcorr.fit.result import Assumption, Fit, Misfit
-from tofcorr.fit.walls import name_walls
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA
+from tofcorr.fit.linear_image import LinearPixels, linearised
+from tofcorr.fit.problem import Fit, Shift
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import moved_rays, phase_from_radial_distance, tangents
+from tofcorr.geometry.rays import moved_rays, phase_from_radial_distance, plane_in_frame, tangents
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.sample import distance_to_plane, thinned
+from tofcorr.pixels.sample import cosine_of_incidence, draw_pixels, thinned
 
-# Pixels looked at in all, and the least and the most of one frame. Measured: with 200 of each of 40
-# frames a focal length 1.5 % off is found with p = 1e-3 to 1e-10, with 400 with 1e-6 to 1e-16;
-# these take 0.07 s, twice as many 0.11 s.
-_ALL_PIXELS, _OF_FRAME = 16_000, (80, 400)
-# Largest error that a probe may stand for, root mean square, metres: what is larger is no error of
-# a camera, but two unknowns of opposite signs. And the least shift of the hand-eye transform that
-# is reported, metres or radians: no error of a usual camera is smaller. Chosen.
-_LARGEST, _LEAST = 0.05, 1e-3
+# Least shift of the hand-eye transform that is reported, metres or radians: no error of a usual
+# camera moves it by less. Chosen.
+_LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class MisfitPixels:
-    """M pixels of F frames beside a model of P unknowns.
+class MisfitPixels(LinearPixels):
+    """M pixels of F frames beside a model; its unknowns are followed by those of estimated walls.
 
     Attributes:
         frame: Place of each pixel's frame among those looked at, shape (M,).
-        residual: Signed distance of the corrected point to its plane, shape (M,), metres.
-        jacobian: Its derivatives by a step of `Parameters.moved`, then by the walls if they were
-            estimated, shape (M, P). The error terms are taken at the distance that the camera
-            should measure: that has no noise, which the residual has as well.
+        pose: The pose of each frame, shape (F,), counted from zero.
         weight: Of each pixel in the fit, shape (M,).
-        cosine: Between ray and normal, shape (M,), negative: the change of the residual with the
-            measured distance.
-        distance: To the plane along the ray, shape (M,), metres.
-        ray: Unit rays in the camera frame, shape (M, 3).
-        normal: Of the planes in the camera frame, shape (M, 3).
-        world: Where the rays meet the planes in the world, shape (M, 3), metres.
-        on_wall: The same along two directions of the wall, from its middle, shape (M, 2), metres.
+        on_wall: Where the rays meet the planes, along two directions of the wall, from its middle,
+            shape (M, 2), metres.
         amplitude: Shape (M,); NaN where none was recorded.
         before: What the same pixel measured in the frame before, shape (M,), metres; NaN: nothing.
         amplitude_before: Its amplitude there, shape (M,); NaN: unknown.
-        pose: The pose of each frame, shape (F,), counted from zero.
         depth_kind: Of the recording: an error of a ray leaves the depth as it was stored.
         modulation_frequency: Hz; None if unknown.
         walls_estimated: Whether the walls were estimated with the rest.
     """
 
     frame: Tensor
-    residual: Tensor
-    jacobian: Tensor
+    pose: Tensor
     weight: Tensor
-    cosine: Tensor
-    distance: Tensor
-    ray: Tensor
-    normal: Tensor
-    world: Tensor
     on_wall: Tensor
     amplitude: Tensor
     before: Tensor
     amplitude_before: Tensor
-    pose: Tensor
     depth_kind: str
     modulation_frequency: float | None
     walls_estimated: bool
@@ -94,176 +71,91 @@ class MisfitPixels:
         return moved_rays(self.ray, self.normal, self.distance, (x, y), self.depth_kind)
 
 
-def misfit_pixels(data: Dataset, fit: Fit, frames: np.ndarray) -> MisfitPixels | None:
+def misfit_pixels(
+    data: Dataset, fit: Fit, frames: np.ndarray, most_frames: int = 200
+) -> MisfitPixels | None:
     """Read some pixels of some frames, the same ones at each call.
+
+    Measured: with 200 pixels of each of 40 frames a focal length 1.5 % off is found with p = 1e-3
+    to 1e-10, with 400 with 1e-6 to 1e-16; these take 0.07 s, twice as many 0.11 s.
 
     Args:
         data: The recordings, with the walls of the fit.
         fit: The fitted model.
-        frames: Global numbers of the frames, increasing; of many, 200 evenly spread ones are read.
+        frames: Global numbers of the frames, increasing.
+        most_frames: Of more, so many evenly spread ones are read.
 
     Returns:
         The pixels; None if no ray meets its wall, which a fit that went astray has turned away.
     """
-    chosen = thinned(frames, 200)
-    number = int(np.clip(_ALL_PIXELS // len(chosen), *_OF_FRAME))
-    reader = _Reader(data, fit, number)
-    generator = torch.Generator().manual_seed(0)
-    parts: list[dict[str, Tensor]] = []
-    for recording, start, local in data.by_recording(chosen):
-        for batch in data.batches(start + local):
-            left = distance_to_plane(fit.model, batch, data.ray_directions())
-            parts += [
-                reader.pixels(recording, start, batch, left, k, generator)
-                for k in range(len(batch.indices))
-            ]
-    counts = torch.tensor([len(part["residual"]) for part in parts])
-    joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    if not len(joined["residual"]):
+    chosen, rays = thinned(frames, most_frames), data.ray_directions()
+    # At more than 80 degrees, what is computed from the geometry grows without bounds.
+    steepest = -math.cos(math.radians(80))
+    facing = data.without(lambda one: cosine_of_incidence(fit.model, one, rays) > steepest)
+    number = min(16_000, 400 * len(chosen))
+    sample = draw_pixels(facing, chosen, number, seed=0)
+    if not len(sample.frame):
         return None
-    joined["on_wall"] = joined["on_wall"] - joined["on_wall"].median(dim=0).values
+    hand_eye, of = fit.solution.parameters.tool_from_camera, chosen[sample.frame.numpy()]
+    to_tool = hand_eye.expand(len(of), 4, 4)
+    plane = plane_in_frame(sample.normal_tool, sample.offset_tool, to_tool)
+    seen = linearised(fit.model.error, sample.pixels, sample.ray, plane, twist=True)
+    pose, across = data.column("world_from_tool")[of] @ hand_eye, data.column("normal_world")[of]
+    world = torch.einsum("mij,mj->mi", pose[:, :3, :3], seen.points) + pose[:, :3, 3]
+    on_wall = torch.einsum("mkj,mj->mk", tangents(across), world)
+    unknowns = seen.unknowns
+    if fit.walls is not None:
+        # Two turns and a shift of each wall.
+        wall = torch.from_numpy(fit.walls.of_frame[of])
+        walls = torch.zeros(len(wall), int(wall.max()) + 1, 3).to(on_wall)
+        walls[torch.arange(len(wall)), wall] = torch.nn.functional.pad(on_wall, (0, 1), value=1.0)
+        unknowns = torch.cat([unknowns, walls.flatten(1)], dim=1)
+    unknown = torch.full_like(seen.residual, torch.nan)
+    depth_before, amplitude_before = _before(data, of, sample.pixels)
+    along_z = data.first.depth_kind == "z"
     return MisfitPixels(
-        **joined,
-        frame=torch.arange(len(parts)).repeat_interleave(counts),
+        **vars(seen) | {"unknowns": unknowns},
+        frame=sample.frame,
         pose=torch.from_numpy(np.unique(data.pose_groups()[chosen], return_inverse=True)[1]),
+        weight=torch.ones_like(unknown) if fit.weights is None else fit.weights.of_sample(sample),
+        on_wall=on_wall - on_wall.median(dim=0).values,
+        amplitude=sample.pixels.amplitude if data.has_amplitude else unknown,
+        before=depth_before / sample.ray[:, 2] if along_z else depth_before,
+        amplitude_before=amplitude_before,
         depth_kind=data.first.depth_kind,
         modulation_frequency=data.first.modulation_frequency,
         walls_estimated=fit.walls is not None,
     )
 
 
-class _Reader:
-    """Computes the pixels of one frame after another."""
+def _before(data: Dataset, of: np.ndarray, pixels: Pixels) -> Tensor:
+    """Return depth and amplitude of the same pixels in the frame before, (2, M); NaN: nothing.
 
-    def __init__(self, data: Dataset, fit: Fit, number: int) -> None:
-        self._data, self._fit, self._number = data, fit, number
-        self._rays = data.ray_directions()
-        self._model = fit.model.error
-        self._design = Design(self._model, fit.domain, self._rays)
-        self._hand_eye = fit.solution.parameters.tool_from_camera
-        self._wall = None if fit.walls is None else torch.from_numpy(name_walls(data).of_frame)
-
-    def pixels(
-        self,
-        recording: Recording,
-        start: int,
-        batch: FrameBatch,
-        left: Tensor,
-        k: int,
-        generator: torch.Generator,
-    ) -> dict[str, Tensor]:
-        """Return some pixels of one frame, as attributes of `MisfitPixels`.
-
-        Args:
-            recording: That of the frame.
-            start: Global number of its first frame.
-            batch: Frames of it.
-            left: Distances of their points to the planes, shape (B, H, W).
-            k: Which of them.
-            generator: Picks the pixels.
-        """
-        local = int(batch.indices[k]) - start
-        table, hand_eye = recording.frames, self._hand_eye
-        normal = batch.normal_tool[k] @ hand_eye[:3, :3]
-        offset = batch.normal_tool[k] @ hand_eye[:3, 3] + batch.offset_tool[k]
-        facing = self._rays.reshape(-1, 3) @ normal
-        # At more than 80 degrees, what is computed from the geometry grows without bounds.
-        seen = batch.valid[k].reshape(-1) & (facing < -0.17)
-        some = seen.nonzero()[:, 0]
-        some = some[torch.randperm(len(some), generator=generator)[: self._number]]
-        ray, cosine = self._rays.reshape(-1, 3)[some], facing[some]
-        distance = -offset / cosine
-        measured = batch.radial_distance[k].reshape(-1)[some]
-        amplitude = torch.full_like(measured, torch.nan)
-        if batch.amplitude is not None:
-            amplitude = batch.amplitude[k].reshape(-1)[some]
-        residual = left[k].reshape(-1)[some]
-        # What the camera should measure: the distance to the plane and its own error.
-        noiseless = measured - residual / cosine
-        columns = self._functions(batch, k, some, noiseless, amplitude)
-        points = ray * distance[:, None]
-        normals = normal.expand(len(some), 3)
-        world_from_camera = torch.from_numpy(table.world_from_tool[local]) @ hand_eye
-        world = points @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
-        across = tangents(torch.from_numpy(table.normal_world[local]))
-        turned = torch.linalg.cross(points, normals)
-        own = torch.cat([normals, turned, -cosine[:, None] * columns.T], dim=1)
-        before = local - 1 if local else None
-        jacobian = torch.cat([own, self._by_walls(batch.indices[k], world @ across.T)], dim=1)
-        return {
-            "residual": residual,
-            "jacobian": jacobian,
-            "weight": _weight(self._fit, batch, k, some),
-            "cosine": cosine,
-            "distance": distance,
-            "ray": ray,
-            "normal": normals,
-            "world": world,
-            "on_wall": world @ across.T,
-            "amplitude": amplitude,
-            "before": _distance_at(recording, before, some, ray),
-            "amplitude_before": _image_at(recording.amplitude, before, some),
-        }
-
-    def _functions(
-        self, batch: FrameBatch, k: int, some: Tensor, distance: Tensor, amplitude: Tensor
-    ) -> Tensor:
-        """Return what the coefficients multiply, at some measured distances, shape (K, M)."""
-        design = self._design
-        known = amplitude if self._data.has_amplitude else torch.ones_like(distance)
-        pixel = design.pixel_functions.flatten(1)[:, some][design.pixel]
-        signal = design.signal_functions(distance, known)[design.signal]
-        terms: list[Term] = list(self._model.condition_terms)  # type: ignore[arg-type]
-        assert batch.conditions is not None
-        of_frame = [term.basis(batch.conditions[k : k + 1]) for term in terms]  # type: ignore[operator]
-        return torch.cat([(signal * pixel)[1:], *(part.expand(-1, len(some)) for part in of_frame)])
-
-    def _by_walls(self, frame: Tensor, on_wall: Tensor) -> Tensor:
-        """Return the derivatives by two turns and a shift of each estimated wall, (M, 3 W)."""
-        if self._wall is None:
-            return on_wall.new_zeros(len(on_wall), 0)
-        found = on_wall.new_zeros(len(on_wall), int(self._wall.max()) + 1, 3)
-        found[:, self._wall[frame], :2] = on_wall
-        found[:, self._wall[frame], 2] = 1.0
-        return found.flatten(1)
-
-
-def _weight(fit: Fit, batch: FrameBatch, k: int, some: Tensor) -> Tensor:
-    if fit.weights is None:
-        return torch.ones(len(some), dtype=torch.float64)
-    return fit.weights(batch)[k].reshape(-1)[some]
-
-
-def _image_at(images: np.ndarray | None, frame: int | None, some: Tensor) -> Tensor:
-    """Return some pixels of one frame of an array; NaN without array or frame."""
-    if images is None or frame is None:
-        return torch.full((len(some),), torch.nan, dtype=torch.float64)
-    return torch.from_numpy(images[frame].reshape(-1)[some.numpy()].astype(np.float64))
-
-
-def _distance_at(recording: Recording, frame: int | None, some: Tensor, ray: Tensor) -> Tensor:
-    """Return what some pixels of one frame measured along their rays; NaN where nothing."""
-    depth = _image_at(recording.depth, frame, some)
-    depth = torch.where(depth > 0, depth, torch.nan)
-    return depth / ray[:, 2] if recording.depth_kind == "z" else depth
-
-
-class Probe(NamedTuple):
-    """One pattern.
-
-    Attributes:
-        name: For programs.
-        trace: What the residuals do: it follows "the residuals".
-        columns: What the residuals would be, shape (M, K); no unit is asked for.
+    Args:
+        data: The recordings.
+        of: Global number of each pixel's frame, shape (M,).
+        pixels: Their places.
     """
+    found, place = np.full((2, len(of)), np.nan), (pixels.rows.numpy(), pixels.columns.numpy())
+    rows, columns = (one.astype(int) for one in place)
+    start = 0
+    for recording in data.recordings:
+        own = (of > start) & (of < start + recording.num_frames)
+        at = of[own] - start - 1, rows[own], columns[own]
+        for line, images in zip(found, (recording.depth, recording.amplitude), strict=True):
+            line[own] = np.nan if images is None else images[at]
+        start += recording.num_frames
+    found[0, ~(found[0] > 0)] = np.nan
+    return torch.from_numpy(found)
 
-    name: str
-    trace: str
-    columns: Tensor
+
+Probes = dict[str, tuple[str, Tensor]]
+"""By name, what the residuals do (it follows "the residuals"), and what they would be, without a
+unit, shape (M, K)."""
 
 
 def _standard(values: Tensor) -> Tensor:
-    return (values - values.mean()) / values.std().clamp(min=1e-12)
+    return (values - values.mean()) / values.std().clamp(min=torch.finfo(torch.float64).eps)
 
 
 def _on_image(seen: MisfitPixels) -> tuple[Tensor, Tensor, Tensor]:
@@ -276,15 +168,15 @@ def _brightness(seen: MisfitPixels) -> Tensor | None:
     if not bool(seen.amplitude.isfinite().all()):
         return None
     # The logarithm of no amplitude is infinite: it is cut at a thousandth of the median.
-    return _standard(seen.amplitude.clamp(min=1e-3 * float(seen.amplitude.median())).log())
+    return _standard(seen.amplitude.clamp(min=float(seen.amplitude.median()) / 1000).log())
 
 
 def _error(seen: MisfitPixels, *values: Tensor) -> Tensor:
     """Return what errors of the distance (M,) do to the residual, shape (M, K)."""
-    return seen.cosine[:, None] * torch.stack(values, dim=1)
+    return seen.gain[:, None] * torch.stack(values, dim=1)
 
 
-def finer_forms(seen: MisfitPixels) -> list[Probe]:
+def finer_forms(seen: MisfitPixels) -> Probes:
     """Return errors over distance, pixel and amplitude that are finer than those of a usual model.
 
     What a smooth term cannot follow leaves some of itself in every other probe.
@@ -292,24 +184,24 @@ def finer_forms(seen: MisfitPixels) -> list[Probe]:
     u, (x, y, square), bright = _standard(seen.distance), _on_image(seen), _brightness(seen)
     place = x * y, square**2, x**3, y**3, x * x * y, x * y * y
     finely = "more finely than the model"
-    found = [
-        Probe("distance", f"follow the distance {finely}", _error(seen, u**4, u**5)),
-        Probe("pixel", f"follow the place in the image {finely}", _error(seen, *place)),
-    ]
+    found = {
+        "distance": (f"follow the distance {finely}", _error(seen, u**4, u**5)),
+        "pixel": (f"follow the place in the image {finely}", _error(seen, *place)),
+    }
     if bright is not None:
         trace = "follow the amplitude otherwise than the model"
-        found.append(Probe("amplitude", trace, _error(seen, bright, bright**2)))
+        found["amplitude"] = trace, _error(seen, bright, bright**2)
     return found
 
 
-def probes(seen: MisfitPixels) -> list[Probe]:
+def probes(seen: MisfitPixels) -> Probes:
     """Return the other probes that a recording allows."""
-    (x, y, square), u, facing = _on_image(seen), _standard(seen.distance), -seen.cosine
+    (x, y, square), u, facing = _on_image(seen), _standard(seen.distance), -seen.gain
     (s, t), when = seen.on_wall.unbind(dim=1), _standard(seen.frame.to(torch.float64))
     one, none, bright = torch.ones_like(x), torch.zeros_like(x), _brightness(seen)
     # Amplitude ratios are cut, so that single dark pixels do not decide.
     change = torch.where(seen.before.isfinite(), seen.before - seen.distance, 0.0)
-    light = (seen.amplitude_before / seen.amplitude).clamp(max=20.0).nan_to_num()
+    light = (seen.amplitude_before / seen.amplitude).clamp(max=20).nan_to_num()
 
     def of_phase(further: Tensor) -> Tensor:
         """Return the error by a weak signal of a longer path, in units of its share."""
@@ -353,20 +245,20 @@ def probes(seen: MisfitPixels) -> list[Probe]:
         phase = 4 * phase_from_radial_distance(seen.distance, seen.modulation_frequency)
         found["circular"] = ("repeat over the distance", error(phase.sin(), phase.cos()))
     if bright is not None:
-        ratio = seen.amplitude.median() / seen.amplitude.clamp(min=1e-12)
-        trace = "follow amplitude and distance together"
-        found["amplitude_by_distance"] = (trace, error(bright * u))
-        trace = "are those of light that strayed in the lens"
-        found["stray_light"] = (trace, error(ratio.clamp(max=20.0)))
-    return [Probe(name, *own) for name, own in found.items()]
+        ratio = (seen.amplitude.median() / seen.amplitude).clamp(max=20)
+        together = "follow amplitude and distance together"
+        found["amplitude_by_distance"] = (together, error(bright * u))
+        found["stray_light"] = ("are those of light that strayed in the lens", error(ratio))
+    return found
 
 
-def find_misfit(seen: MisfitPixels, fit: Fit) -> Misfit | None:
+def find_misfit(seen: MisfitPixels, fit: Fit, level: float = 0.05) -> Shift | None:
     """Look for an error that a fitted model lacks and that matters to the hand-eye transform.
 
     Args:
         seen: Some pixels of the frames, fitted or held out, beside the fitted model.
         fit: The fitted model, its hand-eye transform estimated.
+        level: Largest probability of a misfit by chance; that the interval leaves out.
 
     Returns:
         The least likely to be chance of those that would move the transform out of its interval.
@@ -377,59 +269,51 @@ def find_misfit(seen: MisfitPixels, fit: Fit) -> Misfit | None:
     # known beside them.
     if len(seen.pose.unique()) < 16:
         return None
-    # The interval is that of the report.
-    half = student_quantile(0.975, fit.covariance.degrees_of_freedom)
+    half = student_quantile(1 - level / 2, fit.covariance.degrees_of_freedom)
     half = half * fit.hand_eye_covariance.diagonal().clamp(min=0).sqrt()
     finer, others = finer_forms(seen), probes(seen)
-    groups = _fitted(seen, fit, others, finer), _fitted(seen, fit, finer, [])
+    groups = _shifts(seen, fit, others, finer), _shifts(seen, fit, finer, {})
     # The probability is that of any probe by chance, over all that were tried (Bonferroni).
     tried = sum(len(group) for group in groups)
     for group in groups:
-        judged = [
-            Misfit(probe.name, probe.trace, min(1.0, tried * moved.p_value), moved.shift[:6])
-            for probe, moved in group
-        ]
         counting = [
-            one
-            for one in judged
-            if one.p_value < 0.05
+            one._replace(p_value=p_value)
+            for one in group
+            if (p_value := min(1.0, tried * (one.p_value or 0.0))) < level
             and bool((one.twist.abs() > half).any())
-            and max(one.shift, one.turn) > _LEAST
+            and max(one.size) > _LEAST
         ]
         if counting:
-            return min(counting, key=lambda one: one.p_value)
+            return min(counting, key=lambda one: one.p_value or 0.0)
     return None
 
 
-def _fitted(
-    seen: MisfitPixels, fit: Fit, tried: list[Probe], beside: list[Probe]
-) -> list[tuple[Probe, Added]]:
-    """Fit each probe beside the model and all of some others; those that tell nothing are left out.
+def _shifts(seen: MisfitPixels, fit: Fit, tried: Probes, beside: Probes) -> list[Shift]:
+    """Fit each probe beside the model and all of some others; return what that moves.
 
-    Their values are root mean squares of the errors that they stand for.
+    Those that tell nothing are left out, and those that would be no error of a camera, but two
+    unknowns of opposite signs: larger than the widest prior.
     """
-    nuisances = [_unit(seen, one.columns) for one in beside]
-    columns = [_unit(seen, one.columns) for one in tried]
-    known = torch.cat([seen.jacobian, *nuisances], dim=1)
-    every = torch.cat([known, *columns, seen.residual[:, None]], dim=1)
+    # Of a root mean square error of the distance of 1.
+    least = torch.finfo(torch.float64).eps
+    scaled = [
+        columns / (columns / seen.gain[:, None]).square().mean(dim=0).sqrt().clamp(min=least)
+        for _, columns in (*beside.values(), *tried.values())
+    ]
+    every = torch.cat([seen.unknowns, *scaled, seen.residual[:, None]], dim=1)
     products = pose_products(every, seen.pose[seen.frame], seen.weight.clamp(min=0))
-    compared = AddedColumns(products, _prior(seen, fit, known.shape[1]))
+    known = seen.unknowns.shape[1] + sum(columns.shape[1] for columns in scaled[: len(beside)])
+    compared = AddedColumns(products, _prior(seen, fit, known))
     found, first = [], 0
-    for probe, own in zip(tried, columns, strict=True):
-        moved = compared(list(range(first, first + own.shape[1])))
-        first += own.shape[1]
-        if moved is not None and float(moved.values.abs().max()) < _LARGEST:
-            found.append((probe, moved))
+    for name, (trace, columns) in tried.items():
+        moved = compared(list(range(first, first + columns.shape[1])))
+        first += columns.shape[1]
+        if moved is not None and float(moved.values.abs().max()) < PRIOR_SIGMA:
+            found.append(Shift(name, trace, moved.shift[:6], moved.p_value))
     return found
 
 
-def _unit(seen: MisfitPixels, columns: Tensor) -> Tensor:
-    """Scale columns to a root mean square error of the distance of 1."""
-    size = (columns / seen.cosine[:, None]).square().mean(dim=0).sqrt()
-    return columns / size.clamp(min=1e-12)
-
-
-def assumptions(seen: MisfitPixels, fit: Fit, camera: CameraIntrinsics) -> tuple[Assumption, ...]:
+def assumptions(seen: MisfitPixels, fit: Fit, camera: CameraIntrinsics) -> tuple[Shift, ...]:
     """Return what errors of the intrinsics and of measured planes would do.
 
     Args:
@@ -442,49 +326,34 @@ def assumptions(seen: MisfitPixels, fit: Fit, camera: CameraIntrinsics) -> tuple
     one, none = torch.ones_like(x), torch.zeros_like(x)
     # Such errors remain after a careful calibration of the lens, and of a wall by touching it. With
     # a longer focal length rays come nearer the axis, with a shifted point they move the other way.
-    errors = [
-        ("focal_length", "focal length 0.1 % longer", -1e-3 * seen.moved_rays(x, y)),
-        (
-            "principal_point_right",
-            "principal point 1 px further right",
-            seen.moved_rays(-one / fx, none),
-        ),
-        (
-            "principal_point_down",
-            "principal point 1 px further down",
-            seen.moved_rays(none, -one / fy),
-        ),
-    ]
+    right, down = seen.moved_rays(-one / fx, none), seen.moved_rays(none, -one / fy)
+    errors = {
+        "focal_length": ("focal length 0.1 % longer", -seen.moved_rays(x, y) / 1000),
+        "principal_point_right": ("principal point 1 px further right", right),
+        "principal_point_down": ("principal point 1 px further down", down),
+    }
     if not seen.walls_estimated:
-        farther = torch.full_like(seen.residual, 1e-3)
-        errors.append(("plane_offset", "d of all planes 1 mm larger", farther))
-    columns = torch.stack([column for _, _, column in errors], dim=1)
-    found = [
-        Assumption(name, words, twist)
-        for (name, words, _), twist in zip(errors, _moved(seen, fit, columns).T, strict=True)
-    ]
-    if not seen.walls_estimated:
-        turned = _moved(seen, fit, math.radians(0.1) * seen.on_wall)
-        # About the axis where the camera moves most.
-        turned = turned @ torch.linalg.svd(turned[:3], full_matrices=False).Vh[0]
-        found.append(Assumption("plane_tilt", "all planes turned by 0.1 deg", turned))
+        errors["plane_offset"] = ("d of all planes 1 mm larger", one / 1000)
+        errors["plane_tilt"] = ("all planes turned by 0.1 deg", math.radians(1 / 10) * seen.on_wall)
+    weighted = seen.unknowns * seen.weight.clamp(min=0)[:, None]
+    hessian = weighted.T @ seen.unknowns
+    inverse = Curvature(hessian + _prior(seen, fit, len(hessian)).hessian).inverse[:6]
+    found = []
+    for name, (words, columns) in errors.items():
+        moved = -(inverse @ (weighted.T @ columns.view(len(one), -1)))
+        # Of turns about two axes, about the axis where the camera moves most.
+        worst = torch.linalg.svd(moved[:3], full_matrices=False).Vh[0]
+        found.append(Shift(name, words, moved @ (worst if len(worst) > 1 else worst.abs())))
     return tuple(found)
-
-
-def _moved(seen: MisfitPixels, fit: Fit, columns: Tensor) -> Tensor:
-    """Return how far the hand-eye transform moves by each column, shape (6, K)."""
-    weighted = seen.jacobian * seen.weight.clamp(min=0)[:, None]
-    hessian = weighted.T @ seen.jacobian
-    hessian = hessian + _prior(seen, fit, len(hessian)).hessian
-    return -(Curvature(hessian).inverse @ (weighted.T @ columns))[:6]
 
 
 def _prior(seen: MisfitPixels, fit: Fit, unknowns: int) -> NormalEquations:
     """Return the prior of the fit for all unknowns, by the share of the weight that was read."""
-    zero = torch.zeros(unknowns, unknowns, dtype=torch.float64)
+    zero, prior = torch.zeros(unknowns, unknowns, dtype=torch.float64), fit.total_prior
     none = NormalEquations(zero.sum(), zero.sum(dim=0), zero)
-    if fit.total_prior is None:
+    if prior is None:
         return none
-    own = fit.total_prior.equations(fit.solution.parameters)
-    share = seen.weight.sum() / fit.moments.gram[:, -1, -1].sum()
-    return none.plus(NormalEquations(*(share * part for part in own)))
+    share = float(seen.weight.sum() / fit.moments.gram[:, -1, -1].sum())
+    return none.plus(
+        replace(prior, variance=share * prior.variance).equations(fit.solution.parameters)
+    )

@@ -1,21 +1,33 @@
-"""One fitting problem: its options, what the model needs, where to start."""
+"""One fitting problem and its solution: the options, what a fit looks at, and what it found."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor
 
+from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.residual import ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import Design
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
-from tofcorr.estimation.solvers import SolverOptions, Watcher, initial_parameters, with_linear_part
-from tofcorr.fit.residual import ResidualOptions
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, Prior
+from tofcorr.estimation.noise import DistanceNoise
+from tofcorr.estimation.planes import Walls
+from tofcorr.estimation.robust import RobustLoss
+from tofcorr.estimation.solvers import (
+    Solution,
+    SolverOptions,
+    Watcher,
+    initial_parameters,
+    with_linear_part,
+)
+from tofcorr.estimation.uncertainty import Covariance, Observability
 from tofcorr.fit.walls import FoundWalls
-from tofcorr.fit.weighting import WeightOptions
+from tofcorr.fit.weighting import PixelWeights
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import (
     Dataset,
@@ -23,7 +35,48 @@ from tofcorr.pixels.dataset import (
     PlaneChoice,
     hand_eye_is_free,
     recorded_hand_eye,
+    resolved_planes,
 )
+
+
+class WeightOptions(Options):
+    """The weight of each pixel.
+
+    Attributes:
+        noise: Whether a pixel's weight is one over its noise variance, estimated from frames of
+            one pose, or else from neighbouring pixels.
+        robust: The robust loss: `huber` bounds the influence of an outlier, with `cauchy` that of
+            a gross one vanishes.
+        passes: Most passes of reweighting.
+    """
+
+    noise: bool = False
+    robust: RobustLoss = "none"
+    passes: PositiveInt = 20
+
+
+class ResidualOptions(Options):
+    """How the residual network is trained, and when it is kept.
+
+    Attributes:
+        network: Its size and bound.
+        pixels: How many pixels it is trained on, of all frames together.
+        iterations: Most iterations of L-BFGS, of each of the two stages.
+        weight_decay: Weight of the sum of squared network weights in a loss that is 1 without
+            the network.
+        joint: Whether hand-eye and coefficients are fitted once more together with the network.
+            Without this, errors that the core cannot describe bias them.
+        folds: Folds of the cross-validation that decides.
+        keep: `if_better` drops a network that does not help on held-out images; `always` keeps it.
+    """
+
+    network: ResidualNetworkOptions = ResidualNetworkOptions()
+    pixels: PositiveInt = 10_000
+    iterations: PositiveInt = 200
+    weight_decay: NonNegativeFloat = 1e-3
+    joint: bool = True
+    folds: int = Field(default=5, ge=2)
+    keep: Literal["if_better", "always"] = "if_better"
 
 
 class FitOptions(Options):
@@ -69,7 +122,15 @@ def build_model(
             frequency, a column of frames.csv; or its amplitudes are all the same.
     """
     refuse_missing_inputs(dataset, options)
-    _refuse_one_amplitude(dataset, options, domain)
+    amplitude = domain.amplitude
+    for term in options.terms:
+        # Where the amplitude never changes, no coefficient of such a term is determined.
+        if "amplitude" in term.needs and amplitude is not None and amplitude.low >= amplitude.high:
+            raise CalibrationDataError(
+                f"{dataset.first.path}: amplitude.npy holds {amplitude.low:g} in every pixel used, "
+                f"so it was not measured, and the term {term.kind} needs it. Remove the file and "
+                f"choose models without that term: {_DEPTH_ALONE}."
+            )
     error = ErrorModel(options, domain)
     return error, Design(error, domain, dataset.ray_directions())
 
@@ -96,71 +157,6 @@ def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
                 ) from None
 
 
-def _refuse_one_amplitude(dataset: Dataset, options: ErrorModelOptions, domain: Domain) -> None:
-    """Refuse a term of the amplitude where that never changes: no coefficient is determined."""
-    found = domain.amplitude
-    if found is None or found.low < found.high:
-        return
-    for term in options.terms:
-        if "amplitude" in term.needs:
-            raise CalibrationDataError(
-                f"{dataset.first.path}: amplitude.npy holds {found.low:g} in every pixel used, so "
-                f"it was not measured, and the term {term.kind} needs it. Remove the file and "
-                f"choose models without that term: {_DEPTH_ALONE}."
-            )
-
-
-@dataclass(frozen=True)
-class Start:
-    """Gives a start for the solver, whichever of the model's columns the moments hold.
-
-    Attributes:
-        recorded: tool_from_camera as the recording has it, shape (4, 4), float64, metres.
-        hand_eye_is_free: Whether the hand-eye transform is estimated.
-        tries_closed_form: Whether the closed form from plane normals is tried as well.
-        resumed: Where an earlier fit stood; None starts anew.
-    """
-
-    recorded: Tensor
-    hand_eye_is_free: bool
-    tries_closed_form: bool
-    resumed: Parameters | None = None
-
-    @staticmethod
-    def of(dataset: Dataset, options: HandEyeOptions, resumed: Parameters | None = None) -> "Start":
-        """Return the start that the recordings and the options give."""
-        return Start(
-            recorded=recorded_hand_eye(dataset),
-            hand_eye_is_free=hand_eye_is_free(dataset, options),
-            tries_closed_form=options.start == "auto",
-            resumed=resumed,
-        )
-
-    def resumed_at(self, parameters: Parameters | None) -> "Start":
-        """Return the start at parameters found earlier; None: without any."""
-        return replace(self, resumed=parameters)
-
-    def __call__(self, moments: ImageMoments) -> Parameters:
-        """Return where the solver starts on these moments.
-
-        The resumed parameters, if there are any with as many coefficients as the moments have
-        columns; otherwise the candidate of least loss.
-        """
-        resumed = self.resumed
-        if resumed is not None and resumed.coefficients.numel() == moments.num_coefficients:
-            return resumed
-        candidates = [with_linear_part(moments, self.guess(moments))]
-        if self.hand_eye_is_free and self.tries_closed_form:
-            candidates.append(initial_parameters(moments, self.recorded))
-        objective = MomentObjective(moments)
-        return min(candidates, key=lambda candidate: float(objective.loss(candidate)))
-
-    def guess(self, moments: ImageMoments) -> Parameters:
-        """Return the recorded hand-eye transform and no error: the centre of the prior."""
-        zero = torch.zeros(moments.num_coefficients, dtype=torch.float64)
-        return Parameters(self.recorded, zero, self.hand_eye_is_free)
-
-
 @dataclass(frozen=True)
 class Problem:
     """Everything that the steps of a fit look at, apart from the moments.
@@ -170,8 +166,8 @@ class Problem:
         frames: Global numbers of the frames to fit, shape (N,).
         options: Model, hand-eye, solver and device.
         domain: The ranges that scale the model's variables.
-        start: Where the solver starts.
         watcher: Called after each iteration of the solver.
+        resumed: Where an earlier fit stood; None starts anew.
         walls: The estimated walls; None as long as the recorded ones are used.
     """
 
@@ -179,22 +175,228 @@ class Problem:
     frames: np.ndarray
     options: FitOptions
     domain: Domain
-    start: Start
     watcher: Watcher | None = None
+    resumed: Parameters | None = None
     walls: FoundWalls | None = None
 
-    def conditions(self) -> Tensor:
-        """Return the frames' conditions, shape (N, C) in the order of `CONDITIONS`."""
-        return self.dataset.conditions(self.frames)
-
-    def poses(self) -> np.ndarray:
-        """Return the pose of each frame, shape (N,): integers, the same for frames of one pose."""
-        return self.dataset.pose_groups()[self.frames]
-
-    def numbered_poses(self) -> Tensor:
+    def poses(self) -> Tensor:
         """Return the pose of each frame, shape (N,), numbered from zero without gaps."""
-        return torch.from_numpy(np.unique(self.poses(), return_inverse=True)[1])
+        groups = self.dataset.pose_groups()[self.frames]
+        return torch.from_numpy(np.unique(groups, return_inverse=True)[1])
 
-    def with_walls(self, walls: FoundWalls, start: Start) -> "Problem":
-        """Return the problem on the walls found, started where the recorded walls led."""
-        return replace(self, dataset=walls.put_into(self.dataset), start=start, walls=walls)
+    @property
+    def estimates_walls(self) -> bool:
+        """Whether the recorded planes are a mere start."""
+        return resolved_planes(self.options.planes, self.dataset.recordings) == "unknown"
+
+    @property
+    def estimated(self) -> Walls | None:
+        """The estimated walls alone."""
+        return None if self.walls is None else self.walls.walls
+
+    def on(self, walls: FoundWalls, resumed: Parameters | None) -> "Problem":
+        """Return the problem on walls that were found, started at some parameters."""
+        data = walls.put_into(self.dataset)
+        return replace(self, dataset=data, walls=walls, resumed=resumed)
+
+    def guess(self, moments: ImageMoments) -> Parameters:
+        """Return the recorded hand-eye transform and no error: the centre of the prior."""
+        zero = torch.zeros(moments.num_coefficients, dtype=torch.float64)
+        free = hand_eye_is_free(self.dataset, self.options.hand_eye)
+        return Parameters(recorded_hand_eye(self.dataset), zero, free)
+
+    def start(self, moments: ImageMoments) -> Parameters:
+        """Return where the solver starts on these moments, whichever columns they hold.
+
+        The resumed parameters, if there are any with as many coefficients as the moments have
+        columns; otherwise the better of the recorded transform and a closed form.
+        """
+        resumed = self.resumed
+        if resumed is not None and resumed.coefficients.numel() == moments.num_coefficients:
+            return resumed
+        guess = self.guess(moments)
+        candidates = [with_linear_part(moments, guess)]
+        if guess.hand_eye_is_free and self.options.hand_eye.start == "auto":
+            candidates.append(initial_parameters(moments, guess.tool_from_camera))
+        objective = MomentObjective(moments)
+        return min(candidates, key=lambda candidate: float(objective.loss(candidate)))
+
+
+class ResidualOutcome(NamedTuple):
+    """How the residual network was decided on.
+
+    Attributes:
+        kept: Whether the model has it.
+        core_mm: RMS distance of held-out pixels to their planes without it, millimetres.
+        network_mm: The same with it.
+        p_value: One-sided, of a network that does not help.
+    """
+
+    kept: bool
+    core_mm: float
+    network_mm: float
+    p_value: float
+
+    def in_words(self) -> str:
+        """Return the decision in one sentence."""
+        return (
+            f"The residual network was {'kept' if self.kept else 'dropped'}: on held-out images "
+            f"{self.network_mm:.2f} mm RMS with it, {self.core_mm:.2f} mm without "
+            f"(p = {self.p_value:.3g})."
+        )
+
+
+class Shift(NamedTuple):
+    """How far something moves the hand-eye transform that the fit does not estimate.
+
+    It is the noise of the distances, an error that the model lacks, or an error of what the fit
+    takes as given.
+
+    Attributes:
+        cause: What moves it, for programs, such as `focal_length`.
+        words: What it is: of an error of the recording "focal length 0.1 % longer"; of one that
+            the model lacks, what the residuals do.
+        twist: How far the transform moves, in camera axes, translation first, shape (6,), metres
+            and radians.
+        p_value: Probability of such residuals by chance, with all patterns that were tried.
+        removed: Whether the estimate was moved back.
+    """
+
+    cause: str
+    words: str
+    twist: Tensor
+    p_value: float | None = None
+    removed: bool = False
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """How far the camera moves, metres, and turns, radians."""
+        return float(self.twist[:3].norm()), float(self.twist[3:].norm())
+
+    @property
+    def left(self) -> Tensor:
+        """Standard error that it leaves in the hand-eye transform, as a twist (6,)."""
+        # Of what noise moves, a fifth. Measured: in 12 designs of the simulator and of
+        # `benchmarks/hand_eye_bias.py` the error along the view is 0.7 to 1.2 times the shift.
+        return self.twist / 5 if self.removed else self.twist
+
+    def lacking(self) -> str:
+        """Return one sentence for the user about an error that the model lacks."""
+        moved, turned = self.size
+        return (
+            f"The residuals {self.words}: the model lacks a term. With one, the hand-eye transform "
+            f"would lie {1e3 * moved:.1f} mm and {1e3 * turned:.1f} mrad from this one. "
+            "Its standard errors are widened by that; `tofcorr diagnose` looks for the cause."
+        )
+
+    def to_mapping(self, rotation: Tensor) -> dict[str, Any]:
+        """Return shift (mm) and turn (degrees) along the tool's axes, for JSON.
+
+        Args:
+            rotation: Of tool_from_camera, shape (3, 3).
+        """
+        return {
+            "translation_mm": (1e3 * rotation @ self.twist[:3]).tolist(),
+            "rotation_deg": torch.rad2deg(rotation @ self.twist[3:]).tolist(),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Core:
+    """The parametric part of a fit: hand-eye and coefficients, without residual network.
+
+    Attributes:
+        options: The terms, with the values found in the data in place of `auto`.
+        moments: The moments of the images fitted, with the columns of the condition terms.
+        start: Where the solver started.
+        solution: The parameters found, and why the solver stopped.
+        smoothness: The smoothing penalties as a prior; None if no term is penalised.
+        observability: How well the images determine each direction, without the prior; None as
+            long as nobody asked.
+        prior: On the directions that they do not determine; None if there is none.
+    """
+
+    options: ErrorModelOptions
+    moments: ImageMoments
+    start: Parameters
+    solution: Solution
+    smoothness: Prior | None
+    observability: Observability | None = None
+    prior: Prior | None = None
+
+    @property
+    def total_prior(self) -> Prior | None:
+        """Every prior of the fit: that on undetermined directions, and the smoothness."""
+        if self.prior is None or self.smoothness is None:
+            return self.prior or self.smoothness
+        return self.prior.joined(self.smoothness)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Core):
+    """One fitted model.
+
+    The loss of its `solution` is that of `optimum`.
+
+    Attributes:
+        observability: How well the images determine each direction, without the prior.
+        model: The error model and hand-eye, with the fitted parameters.
+        domain: The ranges it was calibrated on.
+        optimum: The parameters of the least loss; the estimate is where the least loss were
+            without the noise of the distances, unless `noise_shift` says otherwise.
+        hand_eye_only: The best hand-eye transform without any depth correction.
+        covariance: Uncertainty of the parameters, by leaving out one pose at a time.
+        poses: The pose of each image fitted, shape (N,), counted from zero.
+        residual: How the residual network was decided on; None if none was asked for.
+        weights: The weight of each pixel; None if all have the same.
+        walls: The estimated walls; None if the recorded ones were used.
+        noise: Of a measured distance; None if unknown.
+        noise_shift: How far that noise moves the hand-eye transform, and whether the estimate was
+            moved back; None if the noise is unknown or the transform is not estimated.
+        misfit: An error that the model lacks and that would move the hand-eye transform out of its
+            interval; None if there is none, or none was looked for.
+        assumptions: What errors of the intrinsics and of measured planes would do to the hand-eye
+            transform; empty if that was not asked for.
+    """
+
+    observability: Observability  # pyright: ignore[reportGeneralTypeIssues] - known by then
+    model: CalibrationModel
+    domain: Domain
+    optimum: Parameters
+    hand_eye_only: Parameters
+    covariance: Covariance
+    poses: Tensor
+    residual: ResidualOutcome | None
+    weights: PixelWeights | None
+    walls: FoundWalls | None
+    noise: DistanceNoise | None
+    noise_shift: Shift | None
+    misfit: Shift | None = None
+    assumptions: tuple[Shift, ...] = ()
+
+    @property
+    def gain(self) -> float:
+        """How much the corrected depth of the fitted pixels changes with the measured one.
+
+        The slope of a line through both, along the optical axis, at the least loss; 1 where the
+        correction is a constant, and near 0 where it takes every point to the camera. NaN where all
+        pixels measured one depth.
+        """
+        coefficients = self.optimum.coefficients
+        corrected = torch.cat([coefficients.new_ones(1), -coefficients])
+        gram = self.moments.gram.sum(dim=0)
+        mean, total = gram[2:-1:3, -1], gram[-1, -1]
+        with_measured = gram[2, 2:-1:3] - mean[0] * mean / total
+        return float(with_measured @ corrected / with_measured[0])
+
+    @property
+    def hand_eye_covariance(self) -> Tensor:
+        """Mean square error of the hand-eye transform, shape (6, 6).
+
+        The scatter between poses, what is left of the noise's shift, and the shift by an error
+        that the model lacks.
+        """
+        matrix = self.covariance.matrix[:6, :6]
+        for one in (self.noise_shift, self.misfit):
+            matrix = matrix if one is None else matrix + torch.outer(one.left, one.left)
+        return matrix

@@ -9,7 +9,8 @@ no calibrated view is near, nothing has shown them.
 
 import json
 import math
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -34,26 +35,29 @@ from tofcorr.estimation.linear import (
     reduced,
     unknowns_given,
 )
+from tofcorr.estimation.moments import LEAST_RESIDUAL
 from tofcorr.estimation.noise import DistanceNoise
+from tofcorr.estimation.robust import student_quantile
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.linear_image import (
     BOWS,
     CLASSES,
     SHAPES,
-    Correlation,
-    FormFunctions,
-    LinearImage,
-    Linearisation,
+    LinearPixels,
+    block_squares,
+    design_effect,
+    form_classes,
+    linearised,
     wall_moves,
 )
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import off_the_wall, some_pixels
+from tofcorr.pixels.sample import pixels_of_image
 
-# Noise of a pixel where nothing is known, metres: only a scale, since the noise of each image is
-# measured; and the least noise, so that no pixel counts for all. Chosen.
-_TYPICAL_NOISE, _LEAST_NOISE = 5e-3, 1e-4
-# How much a robot's poses vary where nothing is known, metres and radians: only a scale as well.
-_TYPICAL_POSE = 1e-3
+# What is believed before any residual was seen, and weighs as much as one of them: form errors of
+# 1 mm, poses off by 0.3 mm and 0.3 mrad, as of an industrial robot, and walls flat to 0.05 mm.
+_FORM, _POSE, _BOW = 1e-3, 3e-4, 5e-5
 
 
 @dataclass(frozen=True)
@@ -62,12 +66,12 @@ class Reference:
 
     Attributes:
         mean: What is left in the residuals along the twist of the hand-eye (if it was estimated),
-            the coefficients and the functions of `FormFunctions`, shape (P,); metres, radians. The
-            unknowns are those of `LinearImage.unknowns`.
+            the coefficients and the `form_functions`, shape (P,); metres, radians. The
+            unknowns are those of `LinearPixels`.
         covariance: Of these, shape (P, P).
         random_variance: Of what differs from image to image, shape (3 + S,), square radians and
             metres: two turns and a shift of the wall, by the robot and all else, and the smooth
-            errors of `form_functions.shapes`.
+            errors of `linear_image.shapes`.
         bow_variance: Of a bow of the wall that all images share, square metres.
         persistence: Correlation of the shifts of one pose and the next; 0: poses are independent.
         poses: From how many poses of the robot this is known.
@@ -113,7 +117,7 @@ def repeated(persistence: float, count: int) -> float:
 
 def num_unknowns(state: CalibrationState) -> int:
     """Return how many unknowns a reference of a calibration has: twist, coefficients, form."""
-    functions = len(FormFunctions(state.domain).classes())
+    functions = len(form_classes(state.domain))
     return (6 if state.hand_eye_estimated else 0) + len(state.coefficients) + functions
 
 
@@ -131,31 +135,36 @@ def unknown_reference(state: CalibrationState, *, wall_is_known: bool) -> Refere
     return Reference(
         mean=torch.zeros(size, dtype=torch.float64),
         covariance=covariance,
-        random_variance=torch.tensor([_TYPICAL_POSE**2] * 3 + [_LEAST_NOISE**2] * SHAPES).double(),
-        bow_variance=_LEAST_NOISE**2,
+        random_variance=torch.tensor([_POSE**2] * 3 + [_BOW**2] * SHAPES).double(),
+        bow_variance=_BOW**2,
         persistence=0.0,
         poses=0,
         noise=state.noise,
     )
 
 
-def pixel_weights(noise: tuple[float, float, float] | None, image: LinearImage) -> Tensor:
-    """Return one over the variance of each pixel's noise, shape (M,), 1 / m^2."""
-    if noise is None or image.amplitude is None:
-        return torch.full_like(image.residual, _TYPICAL_NOISE**-2)
-    variance = DistanceNoise(*noise, source="neighbours").variance(image.amplitude)
-    return 1 / variance.clamp(min=_LEAST_NOISE**2)
+def pixel_weights(noise: tuple[float, float, float] | None, image: LinearPixels) -> Tensor:
+    """Return one over the variance of each pixel's noise, shape (M,), 1 / m^2.
+
+    Args:
+        noise: a, b, c of the variance; None: the same for all pixels, which is only a scale, since
+            the noise of each image is measured.
+        image: One image, with amplitudes where there is a noise.
+    """
+    if noise is None:
+        return torch.full_like(image.residual, _FORM**-2)
+    variance = DistanceNoise(*noise, source="neighbours").variance(image.pixels.amplitude)
+    return 1 / variance.clamp(min=LEAST_RESIDUAL**2)
 
 
-VIEW = 7
-"""Numbers that describe a view: the wall's normal, direction to its middle, log of its distance."""
+def view_of(image: LinearPixels) -> Tensor:
+    """Return what describes the view of an image, shape (7,).
 
-
-def view_of(image: LinearImage) -> Tensor:
-    """Return what describes the view of an image, shape (7,)."""
+    It is the wall's normal, the direction to its middle, and the logarithm of its distance.
+    """
     middle = image.points.mean(dim=0)
     distance = middle.norm()
-    return torch.cat([image.normal, middle / distance, distance.log()[None]])
+    return torch.cat([image.normal[0], middle / distance, distance.log()[None]])
 
 
 def share_unlike(views: Tensor, calibrated: Tensor) -> float:
@@ -171,12 +180,8 @@ def share_unlike(views: Tensor, calibrated: Tensor) -> float:
     apart = torch.cdist(calibrated, calibrated)
     apart.fill_diagonal_(math.inf)
     # Of views drawn at random from those of a calibration, one in twenty is said to be unlike them.
-    usual = torch.quantile(apart.min(dim=1).values, 0.95)
+    usual = torch.quantile(apart.min(dim=1).values, 1 - 1 / 20)
     return float((torch.cdist(views, calibrated).min(dim=1).values > usual).double().mean())
-
-
-# Turns and shift of each image's own wall: the first of its effects.
-_OF_WALL = 3
 
 
 def own_noise(sums: GroupSums) -> Tensor:
@@ -185,7 +190,12 @@ def own_noise(sums: GroupSums) -> Tensor:
     Args:
         sums: Of each image; its first unknown is the offset.
     """
-    left = torch.stack([_squares_left(products, sums.random) for products in sums.products])
+    # What offset, wall and shapes leave of the squares of each image's residuals.
+    first = sums.products.shape[1] - sums.random - 1
+    own = sums.products[:, [0, *range(first, sums.products.shape[1])]]
+    own, right = own[:, :-1, [0, *range(first, sums.products.shape[1] - 1)]], own[:, :-1, -1]
+    explained = torch.einsum("gi,gij,gj->g", right, Curvature(own).inverse, right)
+    left = sums.products[:, -1, -1] - explained
     return left / (sums.size - sums.random - 1).clamp(min=1)
 
 
@@ -197,7 +207,7 @@ def scatter(sums: GroupSums, found: Estimate) -> float:
         found: What the images say together, without an offset.
     """
     precision = 1 / found.variances.random
-    precision[:_OF_WALL] = 0.0
+    precision[:3] = 0.0  # Turns and shift of each image's own wall.
     each, right = reduced(sums, own_noise(sums), precision)
     gain, cross = each[:, 0, 0], each[:, 0, 1:]
     score = right[:, 0] - cross @ found.mean
@@ -208,34 +218,8 @@ def scatter(sums: GroupSums, found: Estimate) -> float:
     return float(departure.sum() / free.sum()) if float(free.sum()) > 0 else 1.0
 
 
-def _squares_left(products: Tensor, random: int) -> Tensor:
-    """Return the sum of squares that offset, wall and shapes leave of one image's residuals."""
-    size = len(products)
-    kept = [0, *range(size - random - 1, size - 1)]
-    own, right = products[kept][:, kept], products[kept, -1]
-    return products[-1, -1] - right @ Curvature(own).inverse @ right
-
-
-# Most images and most pixels of each that are looked at: with more, what the form leaves out is
-# known no better, because it is the same in all. Chosen: a tenth of a second on a small recording.
-_MOST_IMAGES, _MOST_PIXELS = 200, 1200
-# Standard deviation of the prior on the twist and the coefficients, metres and radians: wider than
-# the error of any camera that was calibrated.
-_WIDE = 0.1
-# What is believed before any residual was seen, and weighs as much as one of them: form errors of
-# 1 mm, poses off by 0.3 mm and 0.3 mrad, as of an industrial robot, and walls flat to 0.05 mm.
-_FORM, _POSE, _BOW = 1e-3, 3e-4, 5e-5
 # Kinds of what differs from pose to pose: turns, shift, bows, finer shapes.
 _RANDOM = torch.tensor([0, 0, 1] + [2] * BOWS + [3] * (SHAPES - BOWS))
-# First of the kinds that bend an image: those before move its wall.
-_SMOOTH = 2
-# Place of the shift among these. From `LinearImage.moves`: two turns, then the shift.
-_SHIFT = 2
-# Standard deviations of a correlation of independent poses, below which it counts as none: by
-# chance it is above in one recording of a hundred.
-_PERSISTS = 2.33
-# Largest such correlation: one in nine poses then counts. Chosen.
-_LONGEST = 0.8
 
 
 def estimate_reference(
@@ -247,6 +231,7 @@ def estimate_reference(
     *,
     twist: bool,
     walls_are_known: bool,
+    most_frames: int = 200,
 ) -> Reference | None:
     """Return how far the camera may be from what a fitted model says, frame by frame.
 
@@ -258,83 +243,80 @@ def estimate_reference(
         noise: a, b, c of the variance of a measured distance; None: all pixels weigh the same.
         twist: Whether the hand-eye transform was estimated.
         walls_are_known: Whether the planes are right; otherwise each wall's place is unknown.
+        most_frames: Of more, evenly spread ones are looked at. With more, or with more pixels, what
+            the form leaves out is known no better, because it is the same in all.
 
     Returns:
         The reference; None with fewer than three poses, and where the equations have no solution:
         a fit that took every point to the camera leaves no noise.
     """
-    forms, rays = FormFunctions(domain), dataset.ray_directions()
+    rays = dataset.ray_directions()
     dataset = dataset.without(off_the_wall(rays))
-    linear = Linearisation(model.error, forms, rays, twist)
+    noise = noise if dataset.has_amplitude else None
+    hand_eye, poses = model.hand_eye().detach(), dataset.column("world_from_tool")
     groups, names = dataset.pose_groups(), dataset.targets
-    frames = frames[:: max(-(-len(frames) // _MOST_IMAGES), 1)]
+    frames = frames[:: max(-(-len(frames) // most_frames), 1)]
     walls = [] if walls_are_known else sorted(set(names[frames].tolist()))
-    products: dict[int, Tensor] = {}
-    count: dict[int, int] = {}
+    products: dict[int, Tensor] = defaultdict(lambda: torch.zeros(()))
+    count: dict[int, int] = defaultdict(int)
     views: dict[int, Tensor] = {}
-    correlation = Correlation()
-    for frame, image, wall in _images(dataset, frames, linear, model, domain):
-        weight = pixel_weights(noise, image)
-        correlation.add(image, weight)
-        places = [wall if name == names[frame] else torch.zeros_like(wall) for name in walls]
-        shared = [image.unknowns, image.shapes[:, :BOWS], *places]
-        own = [image.moves, image.shapes, image.residual[:, None]]
-        columns = torch.cat([image.gain[:, None], *shared, *own], dim=1)
-        group = int(groups[frame])
-        found = columns.T @ (weight[:, None] * columns)
-        products[group] = products[group] + found if group in products else found
-        count[group] = count.get(group, 0) + len(weight)
-        views.setdefault(group, view_of(image))
+    squares = torch.zeros(())
+    for batch in dataset.batches(frames):
+        inside = batch.valid & domain.holds(batch.radial_distance, batch.amplitude)
+        for k, frame in enumerate(batch.indices.tolist()):
+            used = some_pixels(inside[k].flatten().nonzero()[:, 0], 1200, frame)
+            if not len(used):
+                continue
+            plane = plane_in_frame(batch.normal_tool[k], batch.offset_tool[k], hand_eye)
+            pixels, ray = pixels_of_image(batch, k, used), rays.flatten(0, 1)[used]
+            image = linearised(model.error, pixels, ray, plane, twist=twist, domain=domain)
+            weight = pixel_weights(noise, image)
+            squares = squares + block_squares(image, weight)
+            wall = wall_moves(image.points, plane[0], poses[frame] @ hand_eye)
+            shared = [wall * (name == names[frame]) for name in walls]
+            shared = [image.unknowns, image.shapes[:, :BOWS], *shared]
+            own = [image.moves, image.shapes, image.residual[:, None]]
+            columns = torch.cat([image.gain[:, None], *shared, *own], dim=1)
+            group = int(groups[frame])
+            products[group] = products[group] + columns.T @ (weight[:, None] * columns)
+            count[group] += len(weight)
+            views.setdefault(group, view_of(image))
     if len(products) < 3:
         return None
-    effect = correlation.design_effect()
+    effect = design_effect(squares)
     sums = GroupSums(
         torch.stack(list(products.values())) / effect,
         torch.tensor(list(count.values())).double() / effect,
         len(_RANDOM),
     )
     try:
-        found = _solved(sums, forms, noise, 3 * len(walls))
+        found = _solved(sums, form_classes(domain), noise, 3 * len(walls))
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
         return None
     return replace(found, views=torch.stack(list(views.values())))
 
 
-def _images(
-    dataset: Dataset,
-    frames: np.ndarray,
-    linear: Linearisation,
-    model: CalibrationModel,
-    domain: Domain,
-) -> Iterator[tuple[int, LinearImage, Tensor]]:
-    """Yield each frame's number, its linear form, and its change by the place of the wall."""
-    hand_eye = model.hand_eye().detach()
-    poses = torch.cat([torch.from_numpy(one.frames.world_from_tool) for one in dataset.recordings])
-    for batch in dataset.batches(frames):
-        inside = batch.valid & domain.holds(batch.radial_distance, batch.amplitude)
-        for k, frame in enumerate(batch.indices.tolist()):
-            used = inside[k].flatten().nonzero()[:, 0]
-            used = some_pixels(used, _MOST_PIXELS, frame)
-            if len(used):
-                plane = plane_in_frame(batch.normal_tool[k], batch.offset_tool[k], hand_eye)
-                image = linear(batch, k, used, plane)
-                yield frame, image, wall_moves(image.points, plane[0], poses[frame] @ hand_eye)
-
-
 def _solved(
     with_offset: GroupSums,
-    forms: FormFunctions,
+    classes: Tensor,
     noise: tuple[float, float, float] | None,
     of_walls: int,
 ) -> Reference:
+    """Return the reference, without views, from the sums of each pose.
+
+    Args:
+        with_offset: Their first unknown is an offset, which is not estimated here.
+        classes: The kind of each function of the form.
+        noise: Of a pixel.
+        of_walls: How many of the unknowns place walls.
+    """
     sums = with_offset._replace(products=with_offset.products[:, 1:, 1:])
-    classes = forms.classes()
     kept = sums.unknowns - of_walls - BOWS
     of_unknown = torch.full((sums.unknowns,), -1)
     of_unknown[kept - len(classes) : kept] = classes
-    of_unknown[kept : kept + BOWS] = len(CLASSES)
+    of_unknown[kept : kept + BOWS] = CLASSES
     kinds = int(_RANDOM.max()) + 1
-    believed = torch.tensor([_FORM**2] * len(CLASSES) + [_BOW**2]).double()
+    believed = torch.tensor([_FORM**2] * CLASSES + [_BOW**2]).double()
     of = Classes(
         of_random=_RANDOM,
         of_unknown=of_unknown,
@@ -342,7 +324,8 @@ def _solved(
         believed_unknown=believed,
         largest_random=torch.full((kinds,), torch.inf).double(),
     )
-    wide = torch.where(of_unknown < 0, _WIDE**-2, 0.0).double().diag()
+    # On the twist and the coefficients: wider than the error of any camera that was calibrated.
+    wide = torch.where(of_unknown < 0, PRIOR_SIGMA**-2, 0.0).double().diag()
     start = Variances(
         noise=1.0,
         random=torch.full((sums.random,), _POSE**2).double(),
@@ -350,18 +333,16 @@ def _solved(
     )
     of = of._replace(largest_random=_without_unknowns(sums, start, of))
     found = estimate(sums, wide, start, of)
-    persistence = _persistence(random_effects(sums, found)[0][:, _SHIFT])
-    departs = scatter(with_offset, found)
+    persistence = _persistence(random_effects(sums, found)[0][:, 2])
+    departs, variances = scatter(with_offset, found), found.variances
     # Of poses that are alike fewer count, as if each were as much worse.
-    variances = found.variances
-    fewer = variances._replace(
-        random=variances.random * repeated(persistence, len(sums.size)),
-    )
-    known = unknowns_given(sums, wide, fewer)
-    # Noise and smooth errors that images have alike leave them as far apart as they are seen to be.
-    apart = torch.where(_RANDOM < _SMOOTH, 1.0, departs).double()
-    seen = fewer._replace(noise=fewer.noise * departs, random=fewer.random * apart)
-    within = unknowns_given(sums, wide, seen)
+    random = variances.random * repeated(persistence, len(sums.size))
+    known = unknowns_given(sums, wide, variances._replace(random=random))
+    # Noise and smooth errors, not walls, that images have alike leave them as far apart as they are
+    # seen to be.
+    apart = torch.where(_RANDOM < 2, 1.0, departs).double()
+    seen = variances._replace(noise=variances.noise * departs, random=random * apart)
+    inside = unknowns_given(sums, wide, seen)
     return Reference(
         mean=known.mean[:kept],
         covariance=known.covariance[:kept, :kept],
@@ -371,14 +352,19 @@ def _solved(
         poses=len(sums.size),
         noise=noise,
         scatter=departs,
-        covariance_within=within.covariance[:kept, :kept],
+        covariance_within=inside.covariance[:kept, :kept],
     )
 
 
 def _persistence(shift: Tensor) -> float:
-    """Return the correlation of one pose's shift and the next one's; 0 where chance explains it."""
-    found = float((shift[1:] * shift[:-1]).sum() / shift.square().sum().clamp(min=1e-300))
-    return min(found, _LONGEST) if found > _PERSISTS / math.sqrt(len(shift)) else 0.0
+    """Return the correlation of one pose's shift and the next one's; 0 where chance explains it.
+
+    Of independent poses it is above in one recording of a hundred.
+    """
+    tiny = torch.finfo(shift.dtype).tiny
+    found = float((shift[1:] * shift[:-1]).sum() / shift.square().sum().clamp(min=tiny))
+    by_chance = student_quantile(1 - 1 / 100, math.inf) / math.sqrt(len(shift))
+    return found if found > by_chance else 0.0
 
 
 def _without_unknowns(sums: GroupSums, start: Variances, of: Classes) -> Tensor:
@@ -398,28 +384,30 @@ def _without_unknowns(sums: GroupSums, start: Variances, of: Classes) -> Tensor:
 REFERENCE_FILE = "reference.json"
 """Its name in a run folder."""
 
-_FORMAT, _VERSION = "tofcorr-reference", 2
-# Largest file that is read, bytes: a hundred times that of the largest shipped model.
-_LARGEST = 200_000_000
+_FORMAT = {"format": "tofcorr-reference", "version": 2}
+_POSITIVE: tuple[str, Callable[[Tensor], Tensor]] = ("positive numbers", lambda one: one > 0)
+_COVARIANCE: tuple[str, Callable[[Tensor], Tensor]] = (
+    "a covariance",
+    lambda one: torch.isclose(one, one.T) & (one.diagonal() >= 0),
+)
+# What is expected of the entries of a file besides their shape.
+_EXPECTED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
+    "covariance": _COVARIANCE,
+    "random_variance": _POSITIVE,
+    "bow_variance": _POSITIVE,
+    "persistence": ("a number from 0 to below 1", lambda one: (one >= 0) & (one < 1)),
+    "poses": ("a positive whole number", lambda one: (one > 0) & (one == one.round())),
+    "noise": ("no negative number", lambda one: one >= 0),
+    "scatter": _POSITIVE,
+    "covariance_within": _COVARIANCE,
+}
 
 
 def save_reference(path: Path, reference: Reference, state: CalibrationState) -> None:
     """Write a reference as JSON, with the coefficients that it belongs to."""
-    values = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "coefficients": state.coefficients.tolist(),
-        "mean": reference.mean.tolist(),
-        "covariance": reference.covariance.tolist(),
-        "random_variance": reference.random_variance.tolist(),
-        "bow_variance": reference.bow_variance,
-        "persistence": reference.persistence,
-        "poses": reference.poses,
-        "noise": None if reference.noise is None else list(reference.noise),
-        "scatter": reference.scatter,
-        "covariance_within": _listed(reference.covariance_within),
-        "views": _listed(reference.views),
-    }
+    entries = {"coefficients": state.coefficients, **vars(reference)}
+    plain = {k: one.tolist() if isinstance(one, Tensor) else one for k, one in entries.items()}
+    values = _FORMAT | plain
     values |= {"sha256": _digest(values)}
     path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -437,7 +425,7 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
     if not path.is_file():
         return None
     try:
-        return _reference(json.loads(_text(path)), state)
+        return _reference(json.loads(path.read_text(encoding="utf-8")), state)
     except (OSError, ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
         raise CalibrationDataError(
             f"{path}: is damaged, or not of this run ({error}); train again, or remove the file "
@@ -445,80 +433,49 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
         ) from None
 
 
-def _text(path: Path) -> str:
-    if path.stat().st_size > _LARGEST:
-        raise ValueError("it is far too large")
-    return path.read_text(encoding="utf-8")
-
-
-def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN401 - any JSON
-    if not isinstance(values, dict) or values["format"] != _FORMAT:
-        raise ValueError(f"its format is not {_FORMAT}")
-    if values["version"] != _VERSION:
-        raise ValueError(f"its version is {values['version']}, this package reads {_VERSION}")
+def _reference(values: dict[str, Any], state: CalibrationState) -> Reference:
+    for key, expected in _FORMAT.items():
+        if values[key] != expected:
+            raise ValueError(f"its {key} is {values[key]}, this package reads {expected}")
     if values["sha256"] != _digest({k: one for k, one in values.items() if k != "sha256"}):
         raise ValueError("it was changed after it was written")
-    size = num_unknowns(state)
-    of_state = _numbers(values, "coefficients", len(state.coefficients))
-    if not torch.equal(of_state, state.coefficients.cpu()):
+    size, views = num_unknowns(state), values.get("views")
+    shapes = {
+        "coefficients": (len(state.coefficients),),
+        "mean": (size,),
+        "covariance": (size, size),
+        "random_variance": (3 + SHAPES,),
+        "bow_variance": (),
+        "persistence": (),
+        "poses": (),
+        "noise": (3,),
+        "scatter": (),
+        "covariance_within": (size, size),
+        "views": (0 if views is None else len(views), 7),
+    }
+    # Files of older versions have no scatter, nor what came with it.
+    values = {"scatter": 1.0, "covariance_within": None, "views": None} | values
+    unknown = {k for k in ("noise", "covariance_within", "views") if values[k] is None}
+    found = {k: _entry(values, k, one) for k, one in shapes.items() if k not in unknown}
+    if not torch.equal(found.pop("coefficients"), state.coefficients.cpu()):
         raise ValueError("its coefficients are those of another calibration")
-    covariance = _covariance(values, "covariance", size)
-    persistence = float(_numbers(values, "persistence"))
-    if not 0 <= persistence < 1:
-        raise ValueError("persistence: expected a number from 0 to below 1")
-    poses, noise = values["poses"], values["noise"]
-    if type(poses) is not int or not 0 < poses < 10**9:
-        raise ValueError("poses: expected a positive whole number")
-    if noise is not None:
-        a, b, c = _numbers(values, "noise", 3).tolist()
-        if min(a, b, c) < 0:
-            raise ValueError("noise: expected no negative number")
-        noise = (a, b, c)
-    # Files of older versions have neither of these.
-    views, within = values.get("views"), values.get("covariance_within")
-    return Reference(
-        mean=_numbers(values, "mean", size),
-        covariance=covariance,
-        random_variance=_positive(values, "random_variance", 3 + SHAPES),
-        bow_variance=float(_positive(values, "bow_variance")),
-        persistence=persistence,
-        poses=poses,
-        noise=noise,
-        scatter=float(_positive({"scatter": 1.0} | values, "scatter")),
-        covariance_within=None
-        if within is None
-        else _covariance(values, "covariance_within", size),
-        views=None if views is None else _numbers(values, "views", len(views), VIEW),
-    )
+    numbers = {k: one.item() for k, one in found.items() if not one.ndim}
+    noise = None if "noise" in unknown else tuple(found["noise"].tolist())
+    poses = int(numbers["poses"])
+    return Reference(**dict.fromkeys(unknown) | found | numbers | {"noise": noise, "poses": poses})
 
 
-def _covariance(values: dict[str, Any], key: str, size: int) -> Tensor:
-    found = _numbers(values, key, size, size)
-    if not torch.allclose(found, found.T) or bool((found.diagonal() < 0).any()):
-        raise ValueError(f"{key}: is not one")
-    return found
-
-
-def _listed(values: Tensor | None) -> list[list[float]] | None:
-    return None if values is None else values.tolist()
-
-
-def _digest(values: dict[str, Any]) -> str:
-    """Return the digest of all entries; numbers come back from JSON as they were written."""
-    return sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-def _positive(values: dict[str, Any], key: str, *shape: int) -> Tensor:
-    found = _numbers(values, key, *shape)
-    if not bool((found > 0).all()):
-        raise ValueError(f"{key}: expected positive numbers")
-    return found
-
-
-def _numbers(values: dict[str, Any], key: str, *shape: int) -> Tensor:
+def _entry(values: dict[str, Any], key: str, shape: tuple[int, ...]) -> Tensor:
     found = torch.tensor(values[key], dtype=torch.float64)
     if found.shape != shape:
         raise ValueError(f"{key}: has shape {tuple(found.shape)}, expected {shape}")
     if not bool(found.isfinite().all()):
         raise ValueError(f"{key}: holds a value that is not finite")
+    if key in _EXPECTED and not bool(_EXPECTED[key][1](found).all()):
+        raise ValueError(f"{key}: expected {_EXPECTED[key][0]}")
     return found
+
+
+def _digest(values: dict[str, Any]) -> str:
+    """Return the digest of all entries; numbers come back from JSON as they were written."""
+    return sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

@@ -36,7 +36,7 @@ from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
 from tofcorr.module.fitting import FitReport, fit_to
 from tofcorr.options import Options, PositiveNumber, load_options, one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, covered_domain, opened
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 FORMAT = "tofcorr-module"
 

@@ -13,11 +13,10 @@ from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.training import report as reporting
-from tofcorr.training.calibration import calibrate
+from tofcorr.training.calibration import TrainingOptions, calibrate
 from tofcorr.training.judgement import against_garbage, frames_left_out, warnings
-from tofcorr.training.options import TrainingOptions
 from tofcorr.training.report import hand_eye_summary
-from tofcorr.training.result import calibration_state
+from tofcorr.training.run import calibration_state
 from tofcorr.training.support import recording_support
 
 _HEADINGS = ("before", "hand-eye only", "after")

@@ -5,10 +5,10 @@ one: each the one that most shrinks the variances that remain.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,12 +23,12 @@ from tofcorr.estimation.accumulator import CHUNK_PIXELS, Design, MomentAccumulat
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, concatenate
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.support import ENOUGH_REFLECTIVITY, sample_reflectivity
+from tofcorr.training.support import ENOUGH_REFLECTIVITY, sample_reflectivity, worst_sigma
 
 # Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
 # Set by hand for printed boards in the near infrared.
@@ -37,19 +37,47 @@ _DARK = 1 / 8
 # falls to a third there.
 _STEEPEST_INCIDENCE_DEG = 70.0
 
-_Drawn = list[tuple[Tensor, int, list[float]]]
+
+@dataclass(frozen=True)
+class PosePool:
+    """Poses that the robot could take, around those it took.
+
+    Attributes:
+        world_from_tool: Shape (M, 4, 4); of the camera, without a robot.
+        normal_world: The wall each would look at, shape (M, 3).
+        offset: Its offset, shape (M,).
+        target: What each would look at, M names.
+        brightness: Log normalised amplitude of its dark and bright parts, shape (M, 2).
+        described: Distance (m), tilt (degrees) and roll from the pose it was drawn from
+            (degrees), shape (M, 3).
+    """
+
+    world_from_tool: Tensor
+    normal_world: Tensor
+    offset: Tensor
+    target: list[str]
+    brightness: Tensor
+    described: Tensor
+
+    def moments(
+        self, design: Design, tool_from_camera: Tensor, pixel_share: float, enough: int = 4000
+    ) -> ImageMoments:
+        """Return the moments to expect of a camera without error; see `predicted_moments`."""
+        planes = plane_in_frame(self.normal_world, self.offset, self.world_from_tool)
+        brightness = self.brightness
+        return predicted_moments(design, tool_from_camera, *planes, brightness, pixel_share, enough)
 
 
 def draw_views(
     cameras: Tensor,
-    normal: Tensor,
-    distance: Tensor,
+    plane: tuple[Tensor, Tensor],
+    tool_from_camera: Tensor,
     limits: tuple[float, float, float, float],
+    brightness: Mapping[str, Tensor],
     usable: Callable[[Tensor, int], bool],
     generator: np.random.Generator,
     size: int = 300,
-    trials: int = 20,
-) -> _Drawn:
+) -> PosePool | None:
     """Draw cameras that look at the same points of a wall as given ones, turned, rolled and moved.
 
     With 150 to 1200 planned poses the expected rotation after 20 of them changes by a quarter,
@@ -57,20 +85,23 @@ def draw_views(
 
     Args:
         cameras: world_from_camera, shape (N, 4, 4).
-        normal: Of the wall that each looks at, towards the camera, shape (N, 3).
-        distance: From each to its wall along its axis, shape (N,), metres.
+        plane: Of the wall that each looks at: normals towards the camera, shape (N, 3), and
+            offsets, shape (N,).
+        tool_from_camera: The hand-eye transform, shape (4, 4).
         limits: Largest tilt and roll, degrees; smallest and largest distance.
+        brightness: Of the targets, which are taken in turn.
         usable: Whether a camera may be used, from its pose and the number of its source.
         generator: Source of randomness.
-        size: How many are wanted.
-        trials: How many are drawn at most for each one wanted.
+        size: How many are wanted; twenty times as many are drawn at most.
 
     Returns:
-        Each camera, the number of its source, and its distance, tilt and roll.
+        The poses; None if none can be used.
     """
     steepest, roll_deg, nearest, farthest = limits
-    drawn: _Drawn = []
-    for _ in range(trials * size):
+    normal, offset = plane
+    distance = along_axis(cameras, plane)
+    poses, chosen, described = [], [], []
+    for _ in range(20 * size):
         k = int(generator.integers(len(distance)))
         tilt = steepest * generator.uniform()
         roll = roll_deg * generator.uniform(-1, 1)
@@ -78,10 +109,29 @@ def draw_views(
         azimuth = generator.uniform(0, 2 * math.pi)
         pose = _moved_camera(cameras[k], normal[k], distance[k], (tilt, azimuth, roll, away))
         if usable(pose, k):
-            drawn.append((pose, k, [away, tilt, roll]))
-        if len(drawn) == size:
+            poses.append(pose)
+            chosen.append(k)
+            described.append([away, tilt, roll])
+        if len(poses) == size:
             break
-    return drawn
+    if not poses:
+        return None
+    target = [list(brightness)[k % len(brightness)] for k in range(len(poses))]
+    return PosePool(
+        world_from_tool=torch.stack(poses) @ se3.inverse(tool_from_camera),
+        normal_world=normal[chosen],
+        offset=offset[chosen],
+        target=target,
+        brightness=torch.stack([brightness[name] for name in target]),
+        described=torch.tensor(described, dtype=torch.float64),
+    )
+
+
+def along_axis(cameras: Tensor, plane: tuple[Tensor, Tensor]) -> Tensor:
+    """Return the distances of cameras (N, 4, 4) to planes along their axes, shape (N,), metres."""
+    normal, offset = plane
+    height = (normal * cameras[:, :3, 3]).sum(-1) + offset
+    return -height / (normal * cameras[:, :3, 2]).sum(-1)
 
 
 def _moved_camera(
@@ -130,43 +180,18 @@ def _sees_wall(
     return bool(seen.all())
 
 
-@dataclass(frozen=True)
-class PosePool:
-    """Poses that the robot could take, around those it took.
-
-    Attributes:
-        world_from_tool: Shape (M, 4, 4); of the camera, without a robot.
-        normal_world: The wall each would look at, shape (M, 3).
-        offset: Its offset, shape (M,).
-        target: What each would look at, M names.
-        brightness: Log normalised amplitude of its dark and bright parts, shape (M, 2).
-        described: Distance (m), tilt (degrees) and roll from the pose it was drawn from
-            (degrees), shape (M, 3).
-    """
-
-    world_from_tool: Tensor
-    normal_world: Tensor
-    offset: Tensor
-    target: list[str]
-    brightness: Tensor
-    described: Tensor
-
-
 def draw_pool(
     dataset: Dataset,
     frames: np.ndarray,
     fit: Fit,
     generator: np.random.Generator,
     size: int = 300,
-    *,
-    tilt_deg: tuple[float, float] = (30.0, 40.0),
-    roll_deg: float = 90.0,
-    farthest: float = 1.05,
 ) -> PosePool | None:
     """Draw poses that look at the same wall, tilted, rolled and at other distances.
 
     Each is a recorded pose whose camera is turned about the point it looks at, rolled, and moved
-    along its axis. The wall fills the image, nowhere too grazing or too far.
+    along its axis. The wall fills the image, nowhere too grazing, and nowhere a twentieth farther
+    than any calibrated distance.
 
     Args:
         dataset: The recordings.
@@ -174,10 +199,6 @@ def draw_pool(
         fit: The calibration so far.
         generator: Source of randomness.
         size: How many.
-        tilt_deg: Tilts are drawn up to the largest recorded, but up to a limit between these two:
-            what a robot arm reaches in front of a wall.
-        roll_deg: Rolls are drawn between plus and minus this.
-        farthest: Largest distance of a corner, in times the longest calibrated distance.
 
     Returns:
         The poses; None if none was found where the wall fills the image, and for a fit that takes
@@ -185,68 +206,49 @@ def draw_pool(
     """
     hand_eye, ranges = fit.solution.parameters.tool_from_camera, fit.domain.radial_distance
     names = "world_from_tool", "normal_world", "offset"
-    world_from_tool, normal, offset = (dataset.column(name)[frames] for name in names)
+    world_from_tool, *plane = (dataset.column(name)[frames] for name in names)
     camera = world_from_tool @ hand_eye
-    facing = (normal * camera[:, :3, 2]).sum(-1)
-    distance = -((normal * camera[:, :3, 3]).sum(-1) + offset) / facing
+    distance = along_axis(camera, (plane[0], plane[1]))
     # A fit that took the camera to the wall says nothing of where poses should be.
-    kept = torch.isfinite(distance) & (distance > 0.5 * ranges.low)
+    kept = torch.isfinite(distance) & (distance > ranges.low / 2)
     if not bool(kept.any()):
         return None
-    camera, normal, offset, distance = (part[kept] for part in (camera, normal, offset, distance))
-    recorded = float(torch.rad2deg(torch.arccos((-facing[kept]).clamp(-1, 1))).max())
-    steepest = min(max(recorded, tilt_deg[0]), tilt_deg[1])
-    rays = dataset.ray_directions()
-    drawn = draw_views(
+    camera, normal, offset, distance = (part[kept] for part in (camera, *plane, distance))
+    facing = -(normal * camera[:, :3, 2]).sum(-1)
+    recorded = float(torch.rad2deg(torch.arccos(facing.clamp(-1, 1))).max())
+    # Up to the largest tilt recorded, within what a robot arm reaches in front of a wall.
+    steepest, rays = min(max(recorded, 30), 40), dataset.ray_directions()
+    farthest = ranges.high * (1 + 1 / 20)
+    return draw_views(
         camera,
-        normal,
-        distance,
-        (steepest, roll_deg, float(distance.min()), float(distance.max())),
-        lambda pose, k: _sees_wall(pose, normal[k], offset[k], rays, farthest * ranges.high),
+        (normal, offset),
+        hand_eye,
+        (steepest, 90, float(distance.min()), float(distance.max())),
+        target_brightness(dataset, frames, hand_eye),
+        lambda pose, k: _sees_wall(pose, normal[k], offset[k], rays, farthest),
         generator,
         size,
     )
-    if not drawn:
-        return None
-    poses, chosen, described = map(list, zip(*drawn, strict=True))
-    brightness = target_brightness(dataset, frames, hand_eye)
-    target = [list(brightness)[k % len(brightness)] for k in range(len(drawn))]
-    return PosePool(
-        world_from_tool=torch.stack(poses) @ se3.inverse(hand_eye),
-        normal_world=normal[chosen],
-        offset=offset[chosen],
-        target=target,
-        brightness=torch.stack([brightness[name] for name in target]),
-        described=torch.tensor(described, dtype=torch.float64),
-    )
 
 
-def target_brightness(
-    dataset: Dataset,
-    frames: np.ndarray,
-    hand_eye: Tensor,
-    dark_and_bright: tuple[float, float] = (0.1, 0.9),
-    pixels: int = 500,
-) -> dict[str, Tensor]:
+def target_brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[str, Tensor]:
     """Return dark and bright log normalised amplitude of each target, with a checkerboard.
 
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames.
         hand_eye: tool_from_camera, shape (4, 4).
-        dark_and_bright: Quantiles of the log amplitude that stand for both.
-        pixels: About how many of a frame these are measured on.
     """
     names = dataset.targets[frames]
     nothing = {str(name): torch.zeros(2, dtype=torch.float64) for name in np.unique(names)}
     if not dataset.has_amplitude:
         return nothing
-    rays = dataset.ray_directions()
-    quantiles = torch.tensor(dark_and_bright, dtype=torch.float64)
-    found = {}
+    rays, found = dataset.ray_directions(), {}
+    # A tenth of the pixels is darker than what stands for dark, a tenth brighter than bright.
+    quantiles = torch.tensor([1 / 10, 9 / 10], dtype=torch.float64)
     for name in np.unique(names):
         batches = dataset.batches(frames[names == name])
-        logs = torch.cat([sample_reflectivity(one, rays, hand_eye, pixels)[1] for one in batches])
+        logs = torch.cat([sample_reflectivity(one, rays, hand_eye, 500)[1] for one in batches])
         if logs.numel():  # A target may have no pixel with light that is not too grazing.
             found[str(name)] = logs.quantile(quantiles)
     if not found:
@@ -277,9 +279,7 @@ def advise(
     design = Design(fit.model.error, fit.domain, dataset.ray_directions())
     camera = dataset.first.camera
     share = float(fit.moments.count.mean()) / (camera.height * camera.width)
-    planes = plane_in_frame(pool.normal_world, pool.offset, pool.world_from_tool)
-    hand_eye = best.tool_from_camera
-    moments = predicted_moments(design, hand_eye, *planes, pool.brightness, share, enough)
+    moments = pool.moments(design, best.tool_from_camera, share, enough)
     # Poses carry no information about condition terms.
     beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
     if beyond:
@@ -288,16 +288,15 @@ def advise(
     order, covariances = choose_views(fit.observability.precision, added, number)
     spreads = covariances.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
     worst = [1e3 * worst_sigma(covariance) for covariance in covariances]
+    names = "distance_m", "tilt_deg", "roll_by_deg"
     poses = [
         {
             "target": pool.target[k],
-            "distance_m": float(pool.described[k, 0]),
-            "tilt_deg": float(pool.described[k, 1]),
-            "roll_by_deg": float(pool.described[k, 2]),
+            **dict(zip(names, pool.described[k].tolist(), strict=True)),
             "world_from_tool": pool.world_from_tool[k].tolist() if dataset.moves else None,
-            "worst_sigma_mm_or_mrad": worst[1 + place],
+            "worst_sigma_mm_or_mrad": sigma,
         }
-        for place, k in enumerate(order)
+        for k, sigma in zip(order, worst[1:], strict=True)
     ]
     advice: dict[str, Any] = {"worst_sigma_mm_or_mrad": worst[0], "poses": poses}
     if best.hand_eye_is_free:
@@ -353,17 +352,16 @@ def predicted_moments(
     return concatenate(parts)
 
 
-def choose_views(
-    precision: Tensor, candidates: Tensor, number: int, power: int = 4
-) -> tuple[list[int], Tensor]:
+def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[list[int], Tensor]:
     """Choose views greedily, each the one that most shrinks the weak directions' variances.
+
+    It has the smallest mean of the fourth powers of the directions' variances: between
+    A-optimality (their sum) and E-optimality (the largest alone), which ignores all but one.
 
     Args:
         precision: Of the unknowns, from the recording, shape (P, P).
         candidates: The precision that each view would add, shape (M, P, P).
         number: How many to choose; each view can be chosen once.
-        power: Exponent of the mean over the directions' variances. 1 would be A-optimality (their
-            sum), infinity E-optimality (the largest alone), which ignores all directions but one.
 
     Returns:
         Their indices, and the covariances of the unknowns before, and after each view, shape
@@ -374,18 +372,13 @@ def choose_views(
     for _ in range(min(number, len(candidates))):
         after = posterior_covariance(precision + candidates)
         # The trace of a power is the sum of that power of the directions' variances.
-        badness = torch.linalg.matrix_power(after, power).diagonal(dim1=-2, dim2=-1).sum(-1)
+        badness = torch.linalg.matrix_power(after, 4).diagonal(dim1=-2, dim2=-1).sum(-1)
         badness[order] = torch.inf
         best = int(badness.argmin())
         order.append(best)
         precision = precision + candidates[best]
         covariances.append(after[best])
     return order, torch.stack(covariances)
-
-
-def worst_sigma(covariance: Tensor) -> float:
-    """Return the largest standard deviation of any direction, metres or radians."""
-    return float(torch.linalg.eigvalsh(covariance)[-1].clamp(min=0).sqrt())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -432,18 +425,6 @@ class Workspace:
         return math.log(_DARK) if self.checkerboard else 0.0
 
 
-class HandEyeErrors(NamedTuple):
-    """Expected standard errors of the hand-eye transform; infinite while it is not determined.
-
-    Attributes:
-        translation_mm: Of the worst axis of the translation.
-        rotation_deg: About the worst axis.
-    """
-
-    translation_mm: float
-    rotation_deg: float
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosePlan:
     """Poses to record, the most informative first.
@@ -451,19 +432,21 @@ class PosePlan:
     Attributes:
         start_from_tool: Poses of the tool relative to where it starts, shape (N, 4, 4), metres.
         described: Distance (m), tilt and roll (degrees) of each, shape (N, 3).
-        expected: What is to be expected after the first k poses, N entries.
+        expected: Standard errors of the hand-eye transform to be expected after the first k poses:
+            of the worst axis of the translation, mm, and of the rotation, degrees, shape (N, 2);
+            infinite while it is not determined.
     """
 
     start_from_tool: Tensor
     described: Tensor
-    expected: tuple[HandEyeErrors, ...]
+    expected: Tensor
 
     def __repr__(self) -> str:
         """Return the expected standard errors after every few poses, as a table."""
         lines = ["poses   hand-eye: worst axis of translation    rotation"]
         count = len(self.expected)
         for k in sorted({*range(5, count, 5), count}):
-            shift, turn = self.expected[k - 1]
+            shift, turn = self.expected[k - 1].tolist()
             known = f"{shift:24.2f} mm {turn:16.3f} deg"
             lines.append(f"{k:5d}   {'not determined' if math.isinf(shift + turn) else known}")
         return "\n".join(lines)
@@ -507,39 +490,34 @@ def plan_poses(
     normal = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
     offset = torch.tensor([start_distance or middle], dtype=torch.float64)
     rays = ray_directions(camera)
-    drawn = draw_views(
+    pool = draw_views(
         torch.eye(4, dtype=torch.float64)[None],
-        normal,
-        offset,
+        (normal, offset),
+        hand_eye,
         (workspace.tilt_deg, workspace.roll_deg, workspace.nearest, workspace.farthest),
+        {"wall": torch.tensor([workspace.log_dark, 0.0]).double()},
         lambda pose, _: _sees_wall(pose, normal[0], offset[0], rays, size=workspace.wall_size),
         np.random.default_rng(seed),
     )
-    if not drawn:
+    if pool is None:
         raise ConfigError(
             "No view between the given distances lies on the wall: allow shorter distances, less "
             "tilt, or give the wall's size."
         )
-    world_from_tool = torch.stack([pose for pose, _, _ in drawn]) @ se3.inverse(hand_eye)
-    planes = plane_in_frame(
-        normal.expand(len(drawn), 3), offset.expand(len(drawn)), world_from_tool
-    )
-    brightness = torch.tensor([[workspace.log_dark, 0.0]]).double().expand(len(drawn), 2)
     domain = _domain(camera, workspace)
     design = Design(ErrorModel(model, domain), domain, rays)
     # An image counts for so many independent pixels: they share the errors of pose and target. Set
     # on the configurations demo, set2 and set3, where it counts for 140 to 330.
     share = min(1.0, 100 / (camera.height * camera.width))
-    moments = predicted_moments(design, hand_eye, *planes, brightness, share)
+    moments = pool.moments(design, hand_eye, share)
     here = Parameters(hand_eye, torch.zeros(len(moments.symbols)).double(), True)
-    walls = Walls(normal, offset, torch.zeros(len(drawn), dtype=torch.long), world_from_tool)
+    walls = Walls(normal, offset, torch.zeros(len(pool.target)).long(), pool.world_from_tool)
     information = joint_image_equations(moments, here, walls).hessian / residual**2
     order, covariances = choose_views(torch.zeros_like(information[0]), information, number)
-    described = torch.tensor([text for _, _, text in drawn], dtype=torch.float64)
     return PosePlan(
-        start_from_tool=hand_eye @ world_from_tool[order],
-        described=described[order],
-        expected=tuple(_expected(covariance) for covariance in covariances[1:]),
+        start_from_tool=hand_eye @ pool.world_from_tool[order],
+        described=pool.described[order],
+        expected=torch.tensor([_expected(covariance) for covariance in covariances[1:]]),
     )
 
 
@@ -558,12 +536,11 @@ def _domain(camera: CameraIntrinsics, workspace: Workspace) -> Domain:
     )
 
 
-def _expected(covariance: Tensor) -> HandEyeErrors:
-    """Return the standard errors of the worst axes, from the covariance of all unknowns."""
-
-    def worst(part: Tensor) -> float:
-        sigma = worst_sigma(part)
-        # As in `observability`: half of the wide prior's variance.
-        return sigma if sigma**2 < 0.5 * PRIOR_SIGMA**2 else math.inf
-
-    return HandEyeErrors(1e3 * worst(covariance[:3, :3]), math.degrees(worst(covariance[3:6, 3:6])))
+def _expected(covariance: Tensor) -> tuple[float, float]:
+    """Return the standard errors of the worst axes, mm and degrees, from that of all unknowns."""
+    # As in `observability`: half of the wide prior's variance.
+    shift, turn = (
+        sigma if sigma**2 < PRIOR_SIGMA**2 / 2 else math.inf
+        for sigma in (worst_sigma(covariance[axes, axes]) for axes in (slice(3), slice(3, 6)))
+    )
+    return 1e3 * shift, math.degrees(turn)

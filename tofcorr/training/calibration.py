@@ -1,28 +1,50 @@
-"""The computation of a training: split the frames, fit the model, measure its errors."""
+"""The options of a training, and its computation: split the frames, fit, measure the errors."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
+from pydantic import NonNegativeInt
 from torch import Tensor
 
-from tofcorr.correction.model import CalibrationModel, HandEye
+from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Watcher
-from tofcorr.fit.fitting import fit
+from tofcorr.fit.fitting import calibrated, fit
 from tofcorr.fit.misfit import assumptions, find_misfit, misfit_pixels
-from tofcorr.fit.result import Fit
+from tofcorr.fit.problem import Fit, FitOptions
+from tofcorr.fit.walls import with_every_wall
 from tofcorr.pixels.dataset import (
     Dataset,
+    SplitOptions,
     covered_domain,
     recorded_hand_eye,
     split_frames,
     thread_number,
 )
 from tofcorr.pixels.metrics import FrameErrors, frame_errors
-from tofcorr.training.options import TrainingOptions
+from tofcorr.pixels.sample import MaskOptions
+
+
+class TrainingOptions(FitOptions, MaskOptions):
+    """All options of `tofcorr.train` and `tofcorr train`: the fit, the pixels used, and the split.
+
+    Attributes:
+        name: The model's name in reports.
+        split: The frames held out.
+        advice: For how many further poses the report gives advice; 0: for none.
+        figures: Whether TensorBoard is given figures; the numbers of the fit it gets anyway.
+    """
+
+    config_folder: ClassVar[str] = "train"
+
+    name: str
+    split: SplitOptions = SplitOptions()
+    advice: NonNegativeInt = 5
+    figures: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,6 +67,11 @@ class Calibration:
     test: np.ndarray
     stages: Mapping[str, CalibrationModel]
     errors: Mapping[str, FrameErrors]
+
+    @property
+    def frames(self) -> np.ndarray:
+        """Global numbers of all frames used, fitted or held out, increasing."""
+        return np.sort(np.concatenate([self.train, self.test]))
 
 
 def calibrate(
@@ -71,28 +98,28 @@ def calibrate(
     )
     domain = covered_domain(data, train)
     fitted = fit(data, train, options, domain, watcher, resumed)
-    data = fitted.on_its_walls(data)
-    stages = _stages(data, fitted)
-    errors = frame_errors(data, stages, device=options.device)
-    if fitted.solution.parameters.hand_eye_is_free:
-        with thread_number(1):
-            seen = misfit_pixels(data, fitted, np.sort(np.concatenate([train, test])))
-            if seen is not None:
-                assumed = assumptions(seen, fitted, data.first.camera)
-                fitted = replace(fitted, misfit=find_misfit(seen, fitted), assumptions=assumed)
-    return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
-
-
-def _stages(data: Dataset, fitted: Fit) -> dict[str, CalibrationModel]:
-    """Return the models whose errors the report compares: before, hand-eye only, after."""
-    return {
-        "before": _without_correction(fitted.domain, recorded_hand_eye(data)),
-        "hand_eye_only": _without_correction(fitted.domain, fitted.hand_eye_only.tool_from_camera),
+    data = with_every_wall(data, fitted.walls, fitted.model)
+    stages = {
+        "before": without_correction(domain, recorded_hand_eye(data)),
+        "hand_eye_only": without_correction(domain, fitted.hand_eye_only.tool_from_camera),
         "after": fitted.model,
     }
+    errors = frame_errors(data, stages, device=options.device)
+    found = Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
+    if not fitted.solution.parameters.hand_eye_is_free:
+        return found
+    with thread_number(1):
+        seen = misfit_pixels(data, fitted, found.frames)
+        if seen is None:
+            return found
+        assumed = assumptions(seen, fitted, data.first.camera)
+        misfit = find_misfit(seen, fitted)
+    return replace(found, fit=replace(fitted, misfit=misfit, assumptions=assumed))
 
 
-def _without_correction(domain: Domain, tool_from_camera: Tensor) -> CalibrationModel:
-    hand_eye = HandEye(fixed=True)
-    hand_eye.rebase(tool_from_camera)
-    return CalibrationModel(ErrorModel(ErrorModelOptions(), domain), hand_eye)
+def without_correction(domain: Domain, tool_from_camera: Tensor) -> CalibrationModel:
+    """Return a hand-eye transform without any depth correction."""
+    nothing = ErrorModel(ErrorModelOptions(), domain)
+    return calibrated(
+        nothing, Parameters(tool_from_camera, nothing.coefficient_vector(), hand_eye_is_free=False)
+    )

@@ -1,6 +1,7 @@
 """Writes the course of a calibration for TensorBoard, with curves and error images."""
 
 import math
+import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -17,7 +18,8 @@ from tofcorr.estimation.solvers import Solution
 from tofcorr.geometry import se3
 from tofcorr.pixels.sample import sample_pixels
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.shown import ends_of, error_images, error_picture, frames_to_show, profile
+from tofcorr.training.figures import ends_of, error_images, error_picture, frames_to_show, profile
+from tofcorr.training.judgement import error_cells
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -87,21 +89,21 @@ class RunMonitor:
 
         def state(now: Parameters) -> dict[str, float]:
             after = now.tool_from_camera
-            x, y, z = (1e3 * (after - before)[:3, 3]).tolist()
+            shift = (1e3 * (after - before)[:3, 3]).tolist()
             turned = torch.rad2deg(se3.rotation_angle(before[:3, :3].T @ after[:3, :3]))
-            moved = {"t_x_mm": x, "t_y_mm": y, "t_z_mm": z, "rotation_deg": float(turned)}
+            names = ("t_x_mm", "t_y_mm", "t_z_mm", "rotation_deg")
+            moved = zip(names, [*shift, float(turned)], strict=True)
             parts = loss_parts(moments, now, targets)
             return {
-                **{f"hand_eye_since_start/{name}": value for name, value in moved.items()},
+                **{f"hand_eye_since_start/{name}": value for name, value in moved},
                 **dict(zip(tags, (1e3 * now.coefficients).tolist(), strict=True)),
                 **{f"rms_mm/{name}": value for name, value in parts.items()},
             }
 
         for iteration, when in zip(self.iterations, self._times, strict=True):
-            step_left = math.log10(max(iteration.step_left, 1e-300))
-            yield "convergence/loss_m2", iteration.loss, iteration.iterations, when
-            yield "convergence/log10_step_left_se", step_left, iteration.iterations, when
-            for tag, value in state(iteration.parameters).items():
+            left = math.log10(max(iteration.step_left, sys.float_info.min))
+            own = {"convergence/loss_m2": iteration.loss, "convergence/log10_step_left_se": left}
+            for tag, value in (own | state(iteration.parameters)).items():
                 yield tag, value, iteration.iterations, when
         for tag, value in state(calibration.fit.solution.parameters).items():
             yield tag, value, last + 1, self._times[-1]
@@ -147,12 +149,11 @@ def _write_figures(
         least_steps: TensorBoard counts steps in whole numbers, so a covariate is multiplied by the
             power of ten that the tag names, until its range has so many: bins stay apart.
     """
-    frames = np.sort(np.concatenate([calibration.train, calibration.test]))
-    sample = sample_pixels(calibration.data, calibration.stages, frames)
+    sample = sample_pixels(calibration.data, calibration.stages, calibration.frames)
     tested = np.isin(sample.frame, calibration.test)
     for covariate, x in sample.covariates.items():
         low, high = ends = ends_of(x)
-        power = max(math.ceil(math.log10(least_steps / max(high - low, 1e-9))), 0)
+        power = max(math.ceil(math.log10(least_steps / max(high - low, sys.float_info.epsilon))), 0)
         name = covariate.split(" [")[0].replace(" ", "_")
         name += f"_x{10**power}" if power else ""
         shown = {stage: (x, error) for stage, error in sample.errors_mm.items()}
@@ -196,7 +197,7 @@ def loss_parts(
     squares = (by_pixel * p).sum(dim=1).clamp(min=0)
     weight = moments.gram[:, -1, -1]
     # The last column is the constant 1, so its row of G p is the sum of the residuals.
-    between = by_pixel[:, -1].square() / weight.clamp(min=1e-300)
+    between = by_pixel[:, -1].square() / weight.clamp(min=sys.float_info.min)
 
     def rms_mm(of_images: Tensor, among: Tensor) -> float:
         return 1e3 * float((of_images[among].sum() / weight[among].sum()).sqrt())
@@ -218,9 +219,7 @@ def _in_markdown(report: Mapping[str, Any]) -> Iterator[str]:
     yield f"**{report['model']}**: {report.get('message', report['stopped'])}"
     lines = ["| error [mm] | train mean abs. | train RMS | test mean abs. | test RMS |"]
     lines.append("| :-- | --: | --: | --: | --: |")
-    for stage, halves in report["error_mm"].items():
-        values = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
-        cells = ["–" if value is None else f"{value:.2f}" for value in values]
+    for stage, cells in error_cells(report, unknown="–").items():
         lines.append(f"| {stage.replace('_', ' ')} | {' | '.join(cells)} |")
     yield "\n".join(lines)
     if report.get("warnings"):

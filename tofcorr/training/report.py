@@ -8,65 +8,65 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.state import HandEyeAccuracy
-from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import HAND_EYE_SYMBOLS
 from tofcorr.estimation.robust import outlying_images, student_quantile
 from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
-from tofcorr.fit.result import Fit
-from tofcorr.fit.walls import wall_summary
+from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.advice import advise, draw_pool
-from tofcorr.training.calibration import Calibration
+from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.judgement import judge, left_out_mapping, warnings
-from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import Support, recording_support
 from tofcorr.version import __version__
 
 
-def hand_eye_errors(fit: Fit) -> tuple[Tensor, Tensor]:
-    """Return the standard errors of translation (3,) and rotation (3,), metres and radians.
+def hand_eye_errors(fit: Fit) -> Tensor:
+    """Return the standard errors of translation and rotation, shape (2, 3), metres and radians.
 
     They are along the tool's axes: by leaving out one pose at a time, with what is left of the
     noise's shift, and the shift by an error that the model lacks.
     """
-    rotation, matrix = fit.solution.parameters.tool_from_camera[:3, :3], fit.hand_eye_covariance
-    blocks = matrix[:3, :3], matrix[3:6, 3:6]
-    first, second = (
-        (rotation @ block @ rotation.T).diagonal().clamp(min=0).sqrt() for block in blocks
-    )
-    return first, second
+    turn = torch.block_diag(*[fit.solution.parameters.tool_from_camera[:3, :3]] * 2)
+    matrix = turn @ fit.hand_eye_covariance @ turn.T
+    return matrix.diagonal().clamp(min=0).sqrt().view(2, 3)
 
 
-def hand_eye_intervals(fit: Fit, level: float = 0.95) -> tuple[Tensor, Tensor]:
-    """Return the half-widths of the intervals of translation and rotation, each (3,).
+def hand_eye_intervals(fit: Fit, level: float = 0.95) -> Tensor:
+    """Return the half-widths of the intervals of translation and rotation, shape (2, 3).
 
     The standard errors of `hand_eye_errors` times the t distribution's quantile. Its degrees of
     freedom are the poses less one.
     """
     quantile = student_quantile((1 + level) / 2, fit.covariance.degrees_of_freedom)
-    translation, rotation = hand_eye_errors(fit)
-    return quantile * translation, quantile * rotation
+    return quantile * hand_eye_errors(fit)
+
+
+def _in_units(values: Tensor, kind: str) -> dict[str, list[float]]:
+    """Return values of translation and rotation (2, 3) in millimetres and degrees, by name."""
+    return {
+        f"translation_{kind}_mm": (1e3 * values[0]).tolist(),
+        f"rotation_{kind}_deg": torch.rad2deg(values[1]).tolist(),
+    }
 
 
 def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
     """Return how well a fit knows the hand-eye transform; None if it was not estimated."""
     if not fit.solution.parameters.hand_eye_is_free:
         return None
-    translation, rotation = hand_eye_errors(fit)
-    return HandEyeAccuracy(
-        translation_se_mm=tuple((1e3 * translation).tolist()),
-        rotation_se_deg=tuple(rotation.rad2deg().tolist()),
-        undetermined=tuple(
-            direction.in_words()
-            for direction in fit.observability.undetermined
-            if set(direction.shares) & set(HAND_EYE_SYMBOLS)
-        ),
-    )
+    undetermined = [
+        direction.in_words()
+        for direction in fit.observability.undetermined
+        if set(direction.shares) & set(HAND_EYE_SYMBOLS)
+    ]
+    known = _in_units(hand_eye_errors(fit), "se") | {"undetermined": undetermined}
+    return HandEyeAccuracy(**{name: tuple(values) for name, values in known.items()})
 
 
 def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
@@ -78,26 +78,18 @@ def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
     """
     transform, shift, known = fit.solution.parameters.tool_from_camera, None, hand_eye_accuracy(fit)
     if fit.noise_shift is not None:
-        rotation, twist = transform[:3, :3], fit.noise_shift.twist
-        shift = {
-            "translation_mm": (1e3 * rotation @ twist[:3]).tolist(),
-            "rotation_deg": torch.rad2deg(rotation @ twist[3:]).tolist(),
-            "removed": fit.noise_shift.removed,
-        }
-    summary = {
+        shift = fit.noise_shift.to_mapping(transform[:3, :3]) | {"removed": fit.noise_shift.removed}
+    errors = _in_units(torch.zeros(2, 3), "se") | {"undetermined": []}
+    if known is not None:
+        errors = known.model_dump(mode="json")
+    return {
         "tool_from_camera": transform.tolist(),
         "estimated": known is not None,
-        "translation_se_mm": [0.0, 0.0, 0.0] if known is None else list(known.translation_se_mm),
-        "rotation_se_deg": [0.0, 0.0, 0.0] if known is None else list(known.rotation_se_deg),
-        "undetermined": [] if known is None else list(known.undetermined),
+        **errors,
         "noise_shift": shift,
         "frames": frames.to_mapping(),
+        **({} if known is None else _in_units(hand_eye_intervals(fit), "ci95")),
     }
-    if known is not None:
-        translation, turn = hand_eye_intervals(fit)
-        summary["translation_ci95_mm"] = (1e3 * translation).tolist()
-        summary["rotation_ci95_deg"] = torch.rad2deg(turn).tolist()
-    return summary
 
 
 def bootstrap_summary(
@@ -116,18 +108,15 @@ def bootstrap_summary(
         weights = draw_block_weights(fit.poses, resamples, generator)
     except CalibrationDataError:
         return None
-    optimum = fit.optimum
-    drawn = bootstrap(fit.moments, optimum, weights, fit.total_prior)
-    if not bool(drawn.isfinite().all()):
+    steps = bootstrap(fit.moments, fit.optimum, weights, fit.total_prior)
+    if not bool(steps.isfinite().all()):
         return None
     summary: dict[str, Any] = {"resamples": resamples, "poses": int(fit.poses.max()) + 1}
-    if optimum.hand_eye_is_free:
-        rotation = optimum.tool_from_camera[:3, :3]
-        translation = 1e3 * (drawn[:, :3] @ rotation.T)
-        turn = torch.rad2deg(drawn[:, 3:6] @ rotation.T)
-        summary["translation_se_mm"] = translation.std(dim=0).tolist()
-        summary["rotation_se_deg"] = turn.std(dim=0).tolist()
-    return summary
+    if not fit.optimum.hand_eye_is_free:
+        return summary
+    rotation = fit.optimum.tool_from_camera[:3, :3]
+    moved = torch.stack([steps[:, :3] @ rotation.T, steps[:, 3:6] @ rotation.T])
+    return summary | _in_units(moved.std(dim=1), "se")
 
 
 def correction_curves(fit: Fit, points: int = 21) -> dict[str, list[dict[str, float]]]:
@@ -151,27 +140,19 @@ def correction_curves(fit: Fit, points: int = 21) -> dict[str, list[dict[str, fl
 
 
 def _curve(fit: Fit, distance: Tensor, amplitude: Tensor) -> list[dict[str, float]]:
-    first = fit.solution.parameters.twist_size
-    covariance = fit.covariance.matrix[first:, first:]
-    coefficients = fit.solution.parameters.coefficients
-    basis = central_basis(fit.model.error, distance, amplitude)
+    parameters, error = fit.solution.parameters, fit.model.error
+    centre = [torch.full_like(distance, (size - 1) / 2) for size in (error.height, error.width)]
+    conditions = torch.zeros(len(distance), len(CONDITIONS)).to(distance)
     # Condition terms come last; they are zero at the mean conditions.
-    known = basis.shape[1]
-    error = basis @ coefficients[:known]
-    variance = ((basis @ covariance[:known, :known]) * basis).sum(dim=1)
-    quantities = (distance, amplitude, 1e3 * error, 1e3 * variance.clamp(min=0).sqrt())
+    known = len(error.image_symbols())
+    with torch.no_grad():
+        basis = error.columns_at(Pixels(distance, amplitude, *centre, conditions))[:known].T
+    own = slice(parameters.twist_size, parameters.twist_size + known)
+    predicted = basis @ parameters.coefficients[:known]
+    variance = ((basis @ fit.covariance.matrix[own, own]) * basis).sum(dim=1)
+    quantities = (distance, amplitude, 1e3 * predicted, 1e3 * variance.clamp(min=0).sqrt())
     names = ("radial_distance_m", "amplitude", "error_mm", "standard_error_mm")
     return [dict(zip(names, row, strict=True)) for row in torch.stack(quantities, dim=1).tolist()]
-
-
-def central_basis(model: ErrorModel, distance: Tensor, amplitude: Tensor) -> Tensor:
-    """Return the functions that the coefficients multiply, in the image's centre, shape (S, K)."""
-    row = torch.full_like(distance, (model.height - 1) / 2)
-    column = torch.full_like(distance, (model.width - 1) / 2)
-    with torch.no_grad():
-        signal = [term.basis(distance, amplitude) for term in model.signal_terms]  # type: ignore[operator]
-        pixel = [term.basis(row, column) for term in model.pixel_terms]  # type: ignore[operator]
-    return torch.cat([torch.ones_like(distance)[None], *signal, *pixel]).T
 
 
 def training_report(
@@ -184,18 +165,20 @@ def training_report(
         options: Those of the training; the seed of the split also seeds bootstrap and advice.
         inspection: What was odd about the recordings.
     """
-    fit, data = calibration.fit, calibration.data
-    solution = fit.solution
-    support = recording_support(data, calibration.train, solution.parameters.tool_from_camera)
+    fit, data, seed = calibration.fit, calibration.data, options.split.seed
+    solution, after = fit.solution, calibration.errors["after"]
+    hand_eye = solution.parameters.tool_from_camera
+    support = recording_support(data, calibration.train, hand_eye)
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
-    generator = torch.Generator().manual_seed(options.split.seed)
     verdict, reason = judge(fit, errors, support, inspection)
     noise_mm = 1e3 * inspection.look.noise_rms
     found = warnings(fit, errors, support, noise_mm, robot_moves=data.moves)
-    rotation = solution.parameters.tool_from_camera[:3, :3]
-    used = {*calibration.train.tolist(), *calibration.test.tolist()}
-    after = calibration.errors["after"]
     rms = np.sqrt(after.squared / np.maximum(after.count, 1))
+    advice, pool = None, None
+    if options.advice:
+        pool = draw_pool(data, calibration.train, fit, np.random.default_rng(seed))
+    if pool is not None:
+        _, advice = advise(data, pool, fit, options.advice)
     return {
         "format": "tofcorr-report",
         "version": 1,
@@ -210,15 +193,25 @@ def training_report(
         "hand_eye": hand_eye_summary(fit, data.first.frame_names),
         "error_mm": errors,
         "frames": {"train": calibration.train.tolist(), "test": calibration.test.tolist()},
-        "assumptions": [one.to_mapping(rotation) for one in fit.assumptions],
-        "misfit": None if fit.misfit is None else fit.misfit.to_mapping(rotation),
-        "left_out": left_out_mapping(set(inspection.outlying) - used, inspection),
-        "weights": weight_summary(fit),
-        "walls": None if fit.walls is None else wall_summary(fit.walls.names, fit.walls.walls),
+        "assumptions": [
+            {"name": one.cause, "error": one.words, **one.to_mapping(hand_eye[:3, :3])}
+            for one in fit.assumptions
+        ],
+        "misfit": None
+        if (lacking := fit.misfit) is None
+        else {
+            "probe": lacking.cause,
+            "residuals": lacking.words,
+            "p_value": lacking.p_value,
+            **lacking.to_mapping(hand_eye[:3, :3]),
+        },
+        "left_out": left_out_mapping({*inspection.outlying} - {*calibration.frames}, inspection),
+        "weights": None if fit.weights is None else fit.weights.to_mapping(),
+        "walls": None if fit.walls is None else fit.walls.summary(),
         "outlying_images": [one._asdict() for one in outlying_images(after.frames, rms)],
-        "bootstrap": bootstrap_summary(fit, generator),
+        "bootstrap": bootstrap_summary(fit, torch.Generator().manual_seed(seed)),
         "observability": observability_summary(fit, support),
-        "advice": _advice(calibration, options),
+        "advice": advice,
         "plausibility": [one.to_mapping() for one in inspection.findings],
         "warnings": [*found, *inspection.notes],
     }
@@ -263,32 +256,9 @@ def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
     }
 
 
-def weight_summary(fit: Fit) -> dict[str, Any] | None:
-    """Return how pixels were weighted; None if all had the same weight."""
-    if fit.weights is None:
-        return None
-    noise = fit.weights.noise
-    return {
-        "noise": None if noise is None else noise.to_mapping(),
-        "robust": fit.weights.loss,
-        "scale_mm": None if fit.weights.model is None else 1e3 * fit.weights.scale,
-    }
-
-
 def number_or_none(value: float) -> float | None:
-    """Return the number, or None where it is not finite: JSON has no NaN."""
+    """Return the number, or None where it is not finite: JSON has neither NaN nor infinity."""
     return value if math.isfinite(value) else None
-
-
-def _advice(calibration: Calibration, options: TrainingOptions) -> dict[str, Any] | None:
-    """Return which poses to add; None if the options ask for none, or if none was found."""
-    if not options.advice:
-        return None
-    generator = np.random.default_rng(options.split.seed)
-    pool = draw_pool(calibration.data, calibration.train, calibration.fit, generator)
-    if pool is None:
-        return None
-    return advise(calibration.data, pool, calibration.fit, options.advice)[1]
 
 
 def calibration_mapping(
@@ -340,22 +310,20 @@ def coefficient_summary(fit: Fit) -> dict[str, Any]:
         error.set_coefficient_vector(best.moved(shift).coefficients)
         shifted.append(error.paper_coefficients())
     error.set_coefficient_vector(best.coefficients)
+
+    def standard_error(group: str, symbol: str) -> float | None:
+        """Return the jackknife's standard error; None if a value is unknown."""
+        known = np.array([one[group].get(symbol, np.nan) for one in shifted])
+        variance = (len(known) - 1) * np.mean(np.square(known - known.mean()))
+        return number_or_none(float(np.sqrt(variance)))
+
     return {
         group: {
             symbol: {
                 "value": number_or_none(value),
-                "standard_error": _jackknife_error([one[group].get(symbol) for one in shifted]),
+                "standard_error": standard_error(group, symbol),
             }
             for symbol, value in named.items()
         }
         for group, named in values.items()
     }
-
-
-def _jackknife_error(values: list[float | None]) -> float | None:
-    """Return the jackknife's standard error; None if a value is unknown."""
-    given = [math.nan if value is None else value for value in values]
-    known = torch.tensor(given, dtype=torch.float64)
-    count = len(known)
-    variance = (count - 1) / count * (known - known.mean()).square().sum()
-    return number_or_none(float(variance.sqrt()))

@@ -1,55 +1,232 @@
-"""`tofcorr.train`: calibrate recordings of one camera."""
+"""`tofcorr.train`: calibrate recordings of one camera; and its run folder, for later commands."""
 
+import json
 import logging
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from tofcorr.errors import ExportError
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.torchscript import export_torchscript
+from tofcorr.correction.state import (
+    STATE_FILE,
+    CalibrationState,
+    ResidualState,
+    load_calibration,
+    save_calibration,
+)
+from tofcorr.errors import CalibrationDataError, ConfigError, ExportError
+from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Solution
-from tofcorr.files import StagedFolder, refuse_existing
-from tofcorr.options import resolve_options
+from tofcorr.files import StagedFolder, refuse_existing, staged_file
+from tofcorr.fit.problem import Fit
+from tofcorr.fit.reference import REFERENCE_FILE, Reference, estimate_reference, save_reference
+from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
 from tofcorr.pixels.distributed import alone, is_first, process_group
-from tofcorr.pixels.sample import usable_pixels
+from tofcorr.pixels.sample import PixelSample, sample_pixels, usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
-from tofcorr.training.calibration import calibrate
-from tofcorr.training.judgement import against_garbage, frames_left_out
+from tofcorr.training.calibration import Calibration, TrainingOptions, calibrate
+from tofcorr.training.figures import (
+    error_images,
+    frames_to_show,
+    points_figure,
+    profile_figure,
+    residual_figure,
+)
+from tofcorr.training.judgement import DO_NOT_USE, against_garbage, frames_left_out, report_text
 from tofcorr.training.monitor import RunMonitor
-from tofcorr.training.options import TrainingOptions
-from tofcorr.training.report import training_report
-from tofcorr.training.result import TrainingResult, resumed_parameters, write_report
+from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_LOG = logging.getLogger(__name__)
 
 
-class Stopwatch:
-    """Adds up the seconds of named stages.
+def run_reference(calibration: Calibration, state: CalibrationState) -> Reference | None:
+    """Return what a later check must know of the frames, fitted and held out; None: unknown."""
+    fit = calibration.fit
+    return estimate_reference(
+        calibration.data,
+        calibration.frames,
+        fit.model,
+        fit.domain,
+        state.noise,
+        twist=state.hand_eye_estimated,
+        walls_are_known=fit.walls is None,
+    )
 
-    Args:
-        announce: Called with the name of each stage as it begins.
+
+def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> CalibrationState:
+    """Return the calibration as the numbers that a corrector is built from."""
+    recording, error, parameters = data.first, fit.model.error, fit.solution.parameters
+    network = None
+    if error.residual is not None and options.residual is not None:
+        weights = error.residual.weight_vector()
+        network = ResidualState(options=options.residual.network, weights=weights)
+    return CalibrationState(
+        name=options.name,
+        error_model=fit.options,
+        domain=fit.domain,
+        coefficients=parameters.coefficients,
+        tool_from_camera=parameters.tool_from_camera,
+        hand_eye_estimated=parameters.hand_eye_is_free,
+        camera=recording.camera,
+        depth_kind=recording.depth_kind,
+        saturation_amplitude=recording.saturation_amplitude,
+        fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
+        residual=network,
+        covariance=fit.covariance.matrix[parameters.twist_size :, parameters.twist_size :],
+        noise=None if fit.noise is None else fit.noise.coefficients,
+        frames=recording.frame_names,
+        hand_eye_accuracy=hand_eye_accuracy(fit),
+    )
+
+
+def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
+    """Return where the run in a folder stood.
+
+    Raises:
+        CalibrationDataError: The folder holds no run.
+        ConfigError: The run was of another model.
+    """
+    path = Path(run) / STATE_FILE
+    if not path.is_file():
+        raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
+    state = load_calibration(path)
+    if not state.error_model.same_coefficients(options.model):
+        raise ConfigError(
+            f"{run}: its model has other terms than the configuration asks for; resume with the "
+            "configuration of that run, its config.yaml."
+        )
+    return Parameters(state.tool_from_camera, state.coefficients, state.hand_eye_estimated)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class TrainingResult:
+    """A training: what was fitted, how large its errors are, and what to know before using it.
 
     Attributes:
-        seconds: By stage, in the order of the first start, to the millisecond.
+        report: The content of report.json; errors in millimetres.
+        calibration: The fitted model and its errors in full.
+        options: The options of the training.
+        monitor: Every iteration of the solver, and when it ended.
+        force: Whether a corrector is written whatever the verdict.
     """
 
-    def __init__(self, announce: Callable[[str], object] = lambda name: None) -> None:
-        self._announce = announce
-        self.seconds: dict[str, float] = {}
+    report: Mapping[str, Any]
+    calibration: Calibration
+    options: TrainingOptions
+    monitor: RunMonitor
+    force: bool = False
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the time of the block to a stage, whatever ends it."""
-        self._announce(name)
-        start = perf_counter()
-        try:
-            yield
-        finally:
-            spent = self.seconds.get(name, 0.0) + perf_counter() - start
-            self.seconds[name] = round(spent, 3)
+    @property
+    def iterations(self) -> tuple[Solution, ...]:
+        """Every iteration of the solver."""
+        return tuple(self.monitor.iterations)
+
+    @property
+    def fit(self) -> Fit:
+        """The fitted model with its uncertainty."""
+        return self.calibration.fit
+
+    @property
+    def data(self) -> Dataset:
+        """The recordings; estimated walls stand in place of the recorded ones."""
+        return self.calibration.data
+
+    def corrector(self) -> DepthCorrector:
+        """Return the corrector of this calibration, as `corrector.ts` holds it."""
+        return DepthCorrector.from_state(calibration_state(self.data, self.options, self.fit))
+
+    def save(self, folder: Path | str) -> None:
+        """Write the run folder, whole or not at all.
+
+        Raises:
+            CalibrationDataError: Something is there already, or it cannot be written.
+        """
+        with StagedFolder(folder) as stage:
+            self.write_into(stage.folder)
+        self.show_in(stage.path)
+
+    def write_into(self, folder: Path) -> None:
+        """Write all files but TensorBoard's into an existing folder."""
+        fit, options = self.fit, self.options
+        state = calibration_state(self.data, options, fit)
+        save_calibration(folder / STATE_FILE, state)
+        reference = run_reference(self.calibration, state)
+        if reference is not None:
+            save_reference(folder / REFERENCE_FILE, reference, state)
+        if self.force or self.report["verdict"] != DO_NOT_USE:
+            export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
+        self.write_report(folder)
+        for name, text in (
+            ("config.yaml", dump_yaml(options.to_mapping(), last="model")),
+            (
+                "calibration.yaml",
+                dump_yaml(calibration_mapping(self.data, options, fit, self.report)),
+            ),
+        ):
+            (folder / name).write_text(text, encoding="utf-8")
+
+    def write_report(self, folder: Path) -> None:
+        """Write report.json, whole or not at all; an older one is replaced."""
+        text = json.dumps(dict(self.report), indent=1, allow_nan=False) + "\n"
+        with staged_file(folder / "report.json") as part:
+            part.write_text(text, encoding="utf-8")
+
+    def show_in(self, folder: Path) -> None:
+        """Write TensorBoard's files of a run folder."""
+        figures = self.options.figures
+        self.monitor.write(folder / "tb", self.calibration, self.report, figures=figures)
+
+    def plot_profile(self, covariate: str = "distance") -> "Figure":
+        """Draw mean and standard deviation of the error against a covariate.
+
+        Args:
+            covariate: `distance`, `amplitude`, `row`, `column` or `angle of incidence`.
+
+        Raises:
+            CalibrationDataError: The recording has no such covariate.
+        """
+        name = self._sample.covariate_named(covariate)
+        return profile_figure(self._sample, name, self.calibration.test)
+
+    def plot_residuals(self) -> "Figure":
+        """Draw the error images of some frames before and after correction.
+
+        The frames range from the best corrected to the worst.
+        """
+        chosen = frames_to_show(self.calibration)
+        return residual_figure(*error_images(self.calibration, chosen))
+
+    def plot_points(self, frame: int) -> "Figure":
+        """Draw the points of one frame on its plane at each stage, their distance stretched.
+
+        Args:
+            frame: Global number of the frame, over all recordings.
+        """
+        return points_figure(self.calibration, frame)
+
+    def __repr__(self) -> str:
+        """Return errors, hand-eye translation, advice and warnings, as the command prints them."""
+        return report_text(self.report)
+
+    @cached_property
+    def _sample(self) -> PixelSample:
+        return sample_pixels(self.data, self.calibration.stages, self.calibration.frames)
+
+
+Config = str | Path | Mapping[str, Any] | TrainingOptions
+"""A shipped configuration by name, a YAML file, its keys and values, or the options."""
 
 
 @contextmanager
@@ -75,15 +252,6 @@ def interruptible() -> Iterator[list[int]]:
         yield received
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-_LOG = logging.getLogger(__name__)
-
-# Stages that the progress bar counts: read, inspect, read, fit, report; then write and figures.
-_STAGES, _STAGES_WRITTEN = 5, 7
-
-Config = str | Path | Mapping[str, Any] | TrainingOptions
-"""A shipped configuration by name, a YAML file, its keys and values, or the options."""
 
 
 def train(
@@ -119,64 +287,62 @@ def train(
     options = resolve_options(TrainingOptions, config)
     if out is not None:
         refuse_existing(Path(out))
-    with stages("training", _STAGES if out is None else _STAGES_WRITTEN) as begin:
-        return _train(recordings, options, out, resume, Stopwatch(begin), force=force)
+    seconds: dict[str, float] = {}
+    # The bar counts read, inspect, read, fit and report; then write and figures.
+    with stages("training", 5 if out is None else 7) as begin:
 
+        @contextmanager
+        def stage(name: str) -> Iterator[None]:
+            """Announce a stage, and add up the seconds of the block, whatever ends it."""
+            begin(name)
+            start = perf_counter()
+            try:
+                yield
+            finally:
+                seconds[name] = round(seconds.get(name, 0.0) + perf_counter() - start, 3)
 
-def _train(
-    recordings: Recordings,
-    options: TrainingOptions,
-    out: Path | str | None,
-    resume: Path | str | None,
-    clock: Stopwatch,
-    *,
-    force: bool,
-) -> TrainingResult:
-    with clock.stage("read"):
-        data = Dataset(opened(recordings))
-        start = None if resume is None else resumed_parameters(resume, options)
-    with clock.stage("inspect"):
-        inspection = vet(data, resolved_planes(options.planes, data.recordings), force=force)
-        options = against_garbage(options, inspection)
-        left_out = frames_left_out(inspection, [split_frames(data, options.split)[0]])
-    with clock.stage("read"):
-        data = usable_pixels(
-            data,
-            options,
-            robust=options.weights.robust != "none",
-            frames=split_frames(data, options.split)[0],
-        )
-    with process_group(options.device) as device, interruptible() as interrupted:
-        # Every process fits, so that none waits; only the first one watches and writes.
-        stage = StagedFolder(out) if out is not None and is_first() else None
-        with stage or nullcontext():
-            monitor = RunMonitor()
+        with stage("read"):
+            data = Dataset(opened(recordings))
+            start = None if resume is None else resumed_parameters(resume, options)
+        with stage("inspect"):
+            inspection = vet(data, resolved_planes(options.planes, data.recordings), force=force)
+            options = against_garbage(options, inspection)
+            train_frames, _ = split_frames(data, options.split)
+            left_out = frames_left_out(inspection, [train_frames])
+        with stage("read"):
+            robust = options.weights.robust != "none"
+            data = usable_pixels(data, options, robust=robust, frames=train_frames)
+        with process_group(options.device) as device, interruptible() as interrupted:
+            # Every process fits, so that none waits; only the first one watches and writes.
+            folder = StagedFolder(out) if out is not None and is_first() else None
+            with folder or nullcontext():
+                monitor = RunMonitor()
 
-            def watch(iteration: Solution) -> bool:
-                monitor.iteration(iteration)
-                return not interrupted
+                def watch(iteration: Solution) -> bool:
+                    monitor.iteration(iteration)
+                    return not interrupted
 
-            local = options.model_copy(update={"device": device})
-            with clock.stage("fit"):
-                calibration = calibrate(data, local, watch, start, left_out)
-            with clock.stage("report"):
-                report = training_report(calibration, options, inspection)
-            result = TrainingResult(
-                report=report | {"seconds": clock.seconds},
-                calibration=calibration,
-                options=options,
-                iterations=tuple(monitor.iterations),
-                force=force,
-            )
-            if stage:
-                with alone(), clock.stage("write"):
-                    result.write_into(stage.folder)
-    # The run is on disk; what only helps to look at it follows.
-    if stage:
-        try:
-            with clock.stage("figures"):
-                result.show_in(stage.path, monitor)
-            write_report(stage.path, result.report)
-        except (OSError, ExportError) as error:
-            _LOG.warning("%s is whole; its files for TensorBoard are not: %s", out, error)
-    return result
+                local = options.model_copy(update={"device": device})
+                with stage("fit"):
+                    calibration = calibrate(data, local, watch, start, left_out)
+                with stage("report"):
+                    report = training_report(calibration, options, inspection)
+                result = TrainingResult(
+                    report=report | {"seconds": seconds},
+                    calibration=calibration,
+                    options=options,
+                    monitor=monitor,
+                    force=force,
+                )
+                if folder:
+                    with alone(), stage("write"):
+                        result.write_into(folder.folder)
+        # The run is on disk; what only helps to look at it follows.
+        if folder:
+            try:
+                with stage("figures"):
+                    result.show_in(folder.path)
+                result.write_report(folder.path)
+            except (OSError, ExportError) as error:
+                _LOG.warning("%s is whole; its files for TensorBoard are not: %s", out, error)
+        return result

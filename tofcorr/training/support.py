@@ -14,7 +14,7 @@ from tofcorr.pixels.dataset import Dataset
 
 # Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a
 # function of distance and place. Set by hand.
-ENOUGH_REFLECTIVITY = 2.0
+ENOUGH_REFLECTIVITY = 2
 
 
 class Support(NamedTuple):
@@ -66,60 +66,46 @@ def recording_support(
     )
 
 
-def hardly_tilted(support: Support, enough_deg: float = 5.0) -> str | None:
-    """Return one sentence if a moving camera saw all walls from the front; None: it did not.
+# Least standard deviation of the tilt, degrees. On simulated walls c0 and t_z correlate by 0.99 for
+# tilts within 2 degrees, by 0.73 within 10 and by 0.42 within 30; tilts uniform within 10 degrees
+# have a standard deviation of 5.8.
+_ENOUGH_TILT = 5
 
-    Args:
-        support: What a recording covers.
-        enough_deg: Least standard deviation of the tilt, degrees. On simulated walls c0 and t_z
-            correlate by 0.99 for tilts within 2 degrees, by 0.73 within 10 and by 0.42 within 30;
-            tilts uniform within 10 degrees have a standard deviation of 5.8.
-    """
+
+def hardly_tilted(support: Support) -> str | None:
+    """Return one sentence if a moving camera saw all walls from the front; None: it did not."""
     strong, _ = support.tilt_deg
-    if strong >= enough_deg:
+    if strong >= _ENOUGH_TILT:
         return None
     return (
         f"The camera is hardly tilted against the wall (standard deviation {strong:.1f} degrees, "
-        f"{enough_deg:g} needed on two axes): the model's form decides translation along the "
+        f"{_ENOUGH_TILT} needed on two axes): the model's form decides translation along the "
         "wall, rotation about its normal, and how much of a constant is c0 and how much t_z."
     )
 
 
-def shortcomings(
-    support: Support,
-    *,
-    moves: bool,
-    with_intensity: bool,
-    enough_tilt_deg: float = 5.0,
-    enough_roll_deg: float = 10.0,
-    enough_distance: float = 0.5,
-) -> list[str]:
+def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list[str]:
     """Return what a calibration would need and the recording does not cover, one sentence each.
 
     Args:
         support: What it covers.
         moves: Whether a hand-eye transform is estimated.
         with_intensity: Whether the model has an intensity term.
-        enough_tilt_deg: As in `hardly_tilted`.
-        enough_roll_deg: Standard deviation of the roll that makes up for tilt about one axis only.
-        enough_distance: Least range of distances relative to its centre; below it the distance
-            term can hardly be separated from the constant.
     """
-    found: list[str] = []
-    strong, weak = support.tilt_deg
-    frontal = hardly_tilted(support, enough_tilt_deg) if moves else None
-    if frontal is not None:
-        found.append(frontal)
-    elif moves and weak < enough_tilt_deg:
+    (strong, weak), frontal = support.tilt_deg, hardly_tilted(support) if moves else None
+    found = [] if frontal is None else [frontal]
+    if moves and frontal is None and weak < _ENOUGH_TILT:
         roll = support.roll_deg or 0.0
-        hint = "" if roll > enough_roll_deg else f" and hardly rolled ({roll:.1f} degrees)"
+        # More makes up for tilt about one axis only.
+        hint = "" if roll > 10 else f" and hardly rolled ({roll:.1f} degrees)"
         found.append(
             f"The camera is tilted about one axis only (standard deviation {strong:.1f} and "
-            f"{weak:.1f} degrees, {enough_tilt_deg:g} needed on both){hint}: translation along "
+            f"{weak:.1f} degrees, {_ENOUGH_TILT} needed on both){hint}: translation along "
             "that axis is unknown; tilt about the other one, or roll the camera."
         )
     low, high = support.distance_m
-    if (high - low) < enough_distance * (high + low) / 2:
+    # Below half of its centre the distance term can hardly be separated from the constant.
+    if high - low < (high + low) / 4:
         found.append(
             f"The range of distances is narrow ({low:.2f} to {high:.2f} m): the distance "
             "polynomial's coefficients hold in that range only, and its constant cannot be "
@@ -129,11 +115,16 @@ def shortcomings(
     if with_intensity and ratio is not None and ratio < ENOUGH_REFLECTIVITY:
         found.append(
             f"The target has one reflectivity (bright to dark {ratio:.1f} to 1, "
-            f"{ENOUGH_REFLECTIVITY:g} to 1 needed): the amplitude is nearly a function of "
+            f"{ENOUGH_REFLECTIVITY} to 1 needed): the amplitude is nearly a function of "
             "distance and place, so the intensity term cannot be separated from the distance term; "
             "add a checkerboard or a grey wall."
         )
     return found
+
+
+def worst_sigma(covariance: Tensor) -> float:
+    """Return the largest standard deviation of any direction, metres or radians."""
+    return float(torch.linalg.eigvalsh(covariance)[-1].clamp(min=0).sqrt())
 
 
 def _roll(world_from_camera: Tensor, normal_world: Tensor) -> Tensor:
@@ -156,7 +147,8 @@ def _tilt(normals: Tensor) -> tuple[float, float]:
 
 
 def _circular_spread_deg(angles: Tensor) -> float:
-    resultant = torch.polar(torch.ones_like(angles), angles).mean().abs().clamp(1e-12, 1.0)
+    least = torch.finfo(angles.dtype).eps
+    resultant = torch.polar(torch.ones_like(angles), angles).mean().abs().clamp(least, 1.0)
     return math.degrees(math.sqrt(abs(2 * math.log(float(resultant)))))
 
 
@@ -176,7 +168,7 @@ def _reflectivity_ratio(
     if len(logarithm) < 100:
         return None
     smooth = torch.linalg.lstsq(place, logarithm[:, None], driver="gelsd").solution
-    low, high = np.quantile((logarithm - (place @ smooth)[:, 0]).numpy(), (0.05, 0.95))
+    low, high = np.quantile((logarithm - (place @ smooth)[:, 0]).numpy(), (1 / 20, 19 / 20))
     return float(np.exp(high - low))
 
 
@@ -185,7 +177,6 @@ def sample_reflectivity(
     rays: Tensor,
     tool_from_camera: Tensor,
     per_frame: int,
-    least_cosine: float = 0.1,
 ) -> tuple[Tensor, Tensor]:
     """Return the reflectivity of some pixels up to a factor: A D^2 over the cosine of incidence.
 
@@ -196,7 +187,6 @@ def sample_reflectivity(
         rays: Unit rays, shape (H, W, 3).
         tool_from_camera: The hand-eye transform, shape (4, 4).
         per_frame: About how many pixels of each frame are looked at.
-        least_cosine: Of their incidence; 84 degrees.
 
     Returns:
         The six terms of a quadratic of the pixel's place, which can describe the vignetting,
@@ -207,11 +197,11 @@ def sample_reflectivity(
     while step > 1 and math.gcd(step, rays.shape[1]) > 1:
         step -= 1
     cosine = -torch.einsum("hwa,ba->bhw", rays, batch.normal_tool @ tool_from_camera[:3, :3])
-    usable = batch.valid & (batch.amplitude > 0) & (cosine > least_cosine)
+    usable = batch.valid & (batch.amplitude > 0) & (cosine > 1 / 10)  # Up to 84 degrees.
     chosen = usable.flatten(1)[:, ::step]
     place = rays.flatten(0, 1)[::step]
-    x, y = (place[:, 0] / place[:, 2]), (place[:, 1] / place[:, 2])
-    quadratic = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=-1)
+    x, y, one = *(place[:, :2] / place[:, 2:]).unbind(1), torch.ones(len(place)).to(place)
+    quadratic = torch.stack([one, x, y, x * x, x * y, y * y], dim=-1)
     amplitude, distance, frontal = (
         values.flatten(1)[:, ::step][chosen]
         for values in (batch.amplitude, batch.radial_distance, cosine)

@@ -20,10 +20,10 @@ from importing.walls.wall_trials import MOUNTS, ONE_PIXEL, WALLS, read_trial
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
-from tofcorr.fit.result import Fit
-from tofcorr.fit.walls import name_walls, walls_alone
+from tofcorr.fit.problem import Fit
+from tofcorr.fit.walls import walls_alone
 from tofcorr.pixels.dataset import Dataset, covered_domain
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions
 
 TrialsOf = Callable[[str, tuple[str, ...]], Recording]
 """Gives the recording of a mount before some walls."""
@@ -167,7 +167,7 @@ def test_three_real_walls_predict_the_distances_to_the_fourth(
 
 def _rms_alone(dataset: Dataset, frames: np.ndarray, model: CalibrationModel) -> float:
     """Return the RMS distance to a wall whose plane alone is estimated in these frames, mm."""
-    found = walls_alone(dataset, name_walls(dataset), frames, model)
+    found = walls_alone(dataset, frames, model)
     return _rms_mm(found.put_into(dataset), frames, model)
 
 

@@ -27,7 +27,7 @@ from tofcorr.digits import decimals, known, known_interval
 from tofcorr.observables.pairs import LEAST_P
 from tofcorr.options import dump_yaml
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
-from tofcorr.simulation.effects import CATALOGUE
+from tofcorr.simulation.effects.registry import CATALOGUE
 from tofcorr.training.monitor import event_writer
 from tofcorr.version import __version__
 

@@ -79,10 +79,10 @@ def with_numbered_walls(observations: Observations, *, fewest_poses: int = 3) ->
             "and no robot moves: nothing but the depth itself says where they are. Measure them, "
             "or import a checkerboard."
         )
-    named = name_walls(Dataset((recording,)))
-    wall = torch.from_numpy(named.of_frame)
+    of_frame, names = name_walls(Dataset((recording,)))
+    wall = torch.from_numpy(of_frame)
     seen = observations.frame.unique()
-    for number, name in enumerate(named.names):
+    for number, name in enumerate(names):
         poses = len(observations.unit[seen][wall[seen] == number].unique())
         if poses < fewest_poses:
             raise CalibrationDataError(
@@ -91,7 +91,7 @@ def with_numbered_walls(observations: Observations, *, fewest_poses: int = 3) ->
                 f"{fewest_poses} are needed to "
                 "estimate it anew. Record more, or leave its frames out."
             )
-    return replace(observations, wall=wall, num_walls=len(named.names))
+    return replace(observations, wall=wall, num_walls=len(names))
 
 
 def wall_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor:

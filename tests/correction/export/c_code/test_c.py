@@ -13,7 +13,8 @@ import torch
 from correction.export.c_code.models import STATES, exported, hard_frames, state_of
 from correction.export.states import TRANSFORMS, calibration, write
 
-from tofcorr.correction.export.c import Correct, load_c
+from tofcorr.correction.export.c import load_c
+from tofcorr.correction.export.parity import Correct
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics
