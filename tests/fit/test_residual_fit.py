@@ -8,12 +8,7 @@ import torch
 from simulated_walls import SENSOR, simulated_wall
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.state import (
-    CalibrationState,
-    ResidualState,
-    load_calibration,
-    save_calibration,
-)
+from tofcorr.correction.state import load_calibration, save_calibration
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import Fit
@@ -21,6 +16,7 @@ from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.simulation.signal import PixelDelayOptions, pixel_delay
 from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.run import calibration_state
 
 CORE = [
     {"kind": "distance_polynomial", "degree": 3},
@@ -92,24 +88,9 @@ def test_trained_network_travels_with_the_calibration(
     wavy: Dataset, wavy_fit: Fit, tmp_path: Path
 ) -> None:
     error = wavy_fit.model.error
-    assert error.residual is not None
-    options = TrainingOptions.from_mapping(
-        {"name": "test", "model": {"terms": CORE}, "residual": NETWORK}, "test"
-    )
-    assert options.residual is not None
-    state = CalibrationState(
-        name="test",
-        error_model=wavy_fit.options,
-        domain=wavy_fit.domain,
-        coefficients=error.coefficient_vector(),
-        tool_from_camera=wavy_fit.model.hand_eye().detach(),
-        hand_eye_estimated=True,
-        camera=wavy.first.camera,
-        depth_kind="radial",
-        residual=ResidualState(
-            options=options.residual.network, weights=error.residual.weight_vector()
-        ),
-    )
+    values = {"name": "test", "model": {"terms": CORE}, "residual": NETWORK}
+    state = calibration_state(wavy, TrainingOptions.from_mapping(values, "test"), wavy_fit)
+    assert state.residual is not None
     save_calibration(tmp_path / "state.pt", state)
     again = load_calibration(tmp_path / "state.pt")
     assert again.domain == state.domain
@@ -140,22 +121,14 @@ def test_fixed_pattern_is_that_of_the_simulated_chip(tmp_path: Path) -> None:
     assert held_out(dataset, found) < held_out(dataset, fitted(dataset, CORE))
 
 
-def test_missing_column_or_frequency_is_refused_by_name(wavy: Dataset, tmp_path: Path) -> None:
-    conditions = {"recorded": ["pose_id"]}
-    dataset = simulated_wall(tmp_path / "recording", shots=(("white", 4),), conditions=conditions)
+def test_missing_column_or_frequency_is_refused_by_name(tmp_path: Path) -> None:
+    dataset = simulated_wall(tmp_path / "recording", conditions={"recorded": ["pose_id"]})
     for kind, name in (
         ("integration_time", "integration_time_us"),
         ("room_temperature", "room_temperature_c"),
     ):
         with pytest.raises(CalibrationDataError, match=rf"'{name}' is missing; the term {kind}"):
-            fit(
-                dataset,
-                np.arange(4),
-                TrainingOptions.from_mapping(
-                    {"name": "x", "model": {"terms": [{"kind": kind}]}}, "x"
-                ),
-                covered_domain(dataset, np.arange(4)),
-            )
+            fitted(dataset, [{"kind": kind}])
 
 
 def test_drift_over_temperature_and_time_is_found(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from tofcorr.estimation.accumulator import Design
 from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.advice import advise, choose_views, draw_pool, predicted_moments
+from tofcorr.training.advice import PosePool, advise, choose_views, draw_pool, predicted_moments
 from tofcorr.training.support import worst_sigma
 
 
@@ -21,6 +21,16 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Fit]:
     folder = tmp_path_factory.mktemp("wall") / "wall"
     dataset = simulated_wall(folder, shots=(("white", 8), ("checkerboard", 7)))
     return dataset, fitted(dataset)
+
+
+@pytest.fixture(scope="module")
+def pool(wall: tuple[Dataset, Fit]) -> PosePool:
+    dataset, fit = wall
+    found = draw_pool(
+        dataset, np.arange(dataset.num_frames), fit, np.random.default_rng(0), size=50
+    )
+    assert found is not None
+    return found
 
 
 def test_predicted_moments_of_the_recorded_poses_are_those_measured(
@@ -52,11 +62,8 @@ def test_the_first_view_chosen_is_the_best_of_all() -> None:
     assert len(set(order)) == 3
 
 
-def test_the_worst_sigma_never_grows_with_a_view(wall: tuple[Dataset, Fit]) -> None:
+def test_the_worst_sigma_never_grows_with_a_view(wall: tuple[Dataset, Fit], pool: PosePool) -> None:
     dataset, fit = wall
-    frames = np.arange(dataset.num_frames)
-    pool = draw_pool(dataset, frames, fit, np.random.default_rng(0), size=50)
-    assert pool is not None
     _, advice = advise(dataset, pool, fit)
     worst = [advice["worst_sigma_mm_or_mrad"]]
     worst += [pose["worst_sigma_mm_or_mrad"] for pose in advice["poses"]]
@@ -65,12 +72,9 @@ def test_the_worst_sigma_never_grows_with_a_view(wall: tuple[Dataset, Fit]) -> N
 
 
 def test_poses_of_the_pool_see_the_wall_at_the_distance_they_state(
-    wall: tuple[Dataset, Fit],
+    wall: tuple[Dataset, Fit], pool: PosePool
 ) -> None:
-    dataset, fit = wall
-    pool = draw_pool(dataset, np.arange(dataset.num_frames), fit, np.random.default_rng(0), size=50)
-    assert pool is not None
-    camera = pool.world_from_tool @ fit.solution.parameters.tool_from_camera
+    camera = pool.world_from_tool @ wall[1].solution.parameters.tool_from_camera
     cosine = -(camera[:, :3, 2] * pool.normal_world).sum(-1)
     height = (camera[:, :3, 3] * pool.normal_world).sum(-1) + pool.offset
     torch.testing.assert_close(height / cosine, pool.described[:, 0])
@@ -131,11 +135,9 @@ def test_worst_sigma_is_the_largest_over_all_unit_directions() -> None:
 
 
 def test_thinning_a_large_image_changes_its_prediction_little(
-    wall: tuple[Dataset, Fit],
+    wall: tuple[Dataset, Fit], pool: PosePool
 ) -> None:
     dataset, fit = wall
-    pool = draw_pool(dataset, np.arange(dataset.num_frames), fit, np.random.default_rng(0), size=20)
-    assert pool is not None
     _, whole = advise(dataset, pool, fit)
     _, thin = advise(dataset, pool, fit, enough=200)
     last = [advice["poses"][-1]["worst_sigma_mm_or_mrad"] for advice in (whole, thin)]
