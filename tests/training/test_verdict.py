@@ -60,7 +60,7 @@ def test_a_fit_that_was_rolled_back_from_nan_is_not_to_be_used(
     train = trained.result.calibration.train
     support = recording_support(data, train, fit.solution.parameters.tool_from_camera)
     inspection = tofcorr.inspect(trained.recording)
-    ended = replace(fit, solution=replace(fit.solution, stopped=stopped, message="Not converged."))
+    ended = replace(fit, solution=replace(fit.solution, stopped=stopped))
     assert judge(ended, trained.report()["error_mm"], support, inspection)[0] == expected
 
 

@@ -514,5 +514,5 @@ def _slopes(error: ErrorModel, pixels: Pixels) -> Tensor:
 
     one = torch.ones_like(pixels.radial_distance)
     with torch.no_grad():
-        _, slopes = torch.func.jvp(columns, (pixels.radial_distance,), (one,))
+        slopes = torch.func.jvp(columns, (pixels.radial_distance,), (one,))[1]
     return torch.cat([one[None], slopes])

@@ -459,10 +459,10 @@ def _reference(values: dict[str, Any], state: CalibrationState) -> Reference:
     found = {k: _entry(values, k, one) for k, one in shapes.items() if k not in unknown}
     if not torch.equal(found.pop("coefficients"), state.coefficients.cpu()):
         raise ValueError("its coefficients are those of another calibration")
-    numbers = {k: one.item() for k, one in found.items() if not one.ndim}
+    entries: dict[str, Any] = dict.fromkeys(unknown) | found
+    entries |= {k: one.item() for k, one in found.items() if not one.ndim}
     noise = None if "noise" in unknown else tuple(found["noise"].tolist())
-    poses = int(numbers["poses"])
-    return Reference(**dict.fromkeys(unknown) | found | numbers | {"noise": noise, "poses": poses})
+    return Reference(**entries | {"noise": noise, "poses": int(entries["poses"])})
 
 
 def _entry(values: dict[str, Any], key: str, shape: tuple[int, ...]) -> Tensor:

@@ -56,8 +56,9 @@ def fit_residual(
     network, best = None, core.solution.parameters
     if options.keep == "always" or p_value < level:
         network, best = _train(core, error, sample, domain, options)
-    rms = 1e3 * np.sqrt([np.nanmean(row) for row in square])
-    return ResidualOutcome(network is not None, *rms.tolist(), p_value), network, best
+    without, with_network = (1e3 * float(np.nanmean(row)) ** 0.5 for row in square)
+    outcome = ResidualOutcome(network is not None, without, with_network, p_value)
+    return outcome, network, best
 
 
 def _p_value(gain: np.ndarray) -> float:

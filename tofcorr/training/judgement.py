@@ -158,10 +158,10 @@ def judge(
         (free and frontal is not None, frontal or ""),
         (beyond is not None, beyond or ""),
     ]
-    for verdict, reasons in ((DO_NOT_USE, against), ("usable", reservations)):
-        for counts, reason in reasons:
-            if counts:
-                return verdict, reason
+    for reason in (sentence for counts, sentence in against if counts):
+        return DO_NOT_USE, reason
+    for reason in (sentence for counts, sentence in reservations if counts):
+        return "usable", reason
     if all(one.sigma <= _WEAK for one in fit.observability.directions):
         return "good", f"{measured}, and every direction is determined."
     known = f"the hand-eye transform is determined to {1e3 * _WEAK:g} mm and mrad"

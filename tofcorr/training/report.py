@@ -48,7 +48,7 @@ def hand_eye_intervals(fit: Fit, level: float = 0.95) -> Tensor:
     return quantile * hand_eye_errors(fit)
 
 
-def _in_units(values: Tensor, kind: str) -> dict[str, list[float]]:
+def _in_units(values: Tensor, kind: str) -> dict[str, Any]:
     """Return values of translation and rotation (2, 3) in millimetres and degrees, by name."""
     return {
         f"translation_{kind}_mm": (1e3 * values[0]).tolist(),
@@ -66,7 +66,7 @@ def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
         if set(direction.shares) & set(HAND_EYE_SYMBOLS)
     ]
     known = _in_units(hand_eye_errors(fit), "se") | {"undetermined": undetermined}
-    return HandEyeAccuracy(**{name: tuple(values) for name, values in known.items()})
+    return HandEyeAccuracy.model_validate(known)
 
 
 def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
@@ -141,12 +141,14 @@ def correction_curves(fit: Fit, points: int = 21) -> dict[str, list[dict[str, fl
 
 def _curve(fit: Fit, distance: Tensor, amplitude: Tensor) -> list[dict[str, float]]:
     parameters, error = fit.solution.parameters, fit.model.error
-    centre = [torch.full_like(distance, (size - 1) / 2) for size in (error.height, error.width)]
+    row, column = (
+        torch.full_like(distance, (size - 1) / 2) for size in (error.height, error.width)
+    )
     conditions = torch.zeros(len(distance), len(CONDITIONS)).to(distance)
     # Condition terms come last; they are zero at the mean conditions.
     known = len(error.image_symbols())
     with torch.no_grad():
-        basis = error.columns_at(Pixels(distance, amplitude, *centre, conditions))[:known].T
+        basis = error.columns_at(Pixels(distance, amplitude, row, column, conditions))[:known].T
     own = slice(parameters.twist_size, parameters.twist_size + known)
     predicted = basis @ parameters.coefficients[:known]
     variance = ((basis @ fit.covariance.matrix[own, own]) * basis).sum(dim=1)
