@@ -14,7 +14,6 @@ from typing import Any
 
 import click
 import torch
-from benchmarks.timing import timed
 from torch import Tensor
 
 from benchmarks.timing import timed

@@ -24,8 +24,7 @@ from tofcorr.sensor.sensor_file import (
     write_sensor,
 )
 from tofcorr.simulation.options import CameraOptions
-from tofcorr.training.run import calibration_state
-from tofcorr.training.run import train
+from tofcorr.training.run import calibration_state, train
 
 ROOT = Path(__file__).resolve().parents[1]
 # Every view is fitted: the held-out error of these terms stands in docs/results/models.md.
