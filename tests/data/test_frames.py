@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from broken_recordings import value as damaged
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_recordings import CAMERA, NUM_FRAMES, frame_rows, write_small_recording
@@ -102,9 +103,7 @@ def test_a_frame_that_is_not_there_is_named(radial: Recording) -> None:
 def test_what_opening_did_not_look_at_is_refused_while_streaming(
     folder: Path, name: str, value: float
 ) -> None:
-    array = np.load(folder / f"{name}.npy")
-    array[5, 1, 2] = value
-    np.save(folder / f"{name}.npy", array)
+    damaged(name, (5, 1, 2), value)(folder)
     recording = Recording.open(folder, check_contents=False)
     assert len(list(iterate_frames(recording, range(5)))) == 1
     with pytest.raises(CalibrationDataError, match=f"{name}.npy: frame 5, row 1, column 2"):

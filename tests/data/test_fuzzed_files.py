@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from broken_recordings import put
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_recordings import write_small_recording
@@ -120,11 +121,7 @@ def test_any_value_of_any_key_is_taken_or_refused_in_words(
     shared_folder: Path, key: str, value: Any
 ) -> None:
     values = yaml.safe_load((shared_folder / "recording.yaml").read_text())
-    *parents, last = [int(part) if part.isdigit() else part for part in key.split(".")]
-    holder = values
-    for part in parents:
-        holder = holder[part]
-    holder[last] = value
+    put(values, key, value)
     content = yaml.safe_dump(values, allow_unicode=True).encode("utf-8", "surrogatepass")
     opens_or_is_refused(shared_folder, "recording.yaml", content)
 

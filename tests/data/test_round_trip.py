@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from broken_recordings import header
 from small_recordings import CAMERA, frame_rows, rigid, small_images, write_small_recording
 
 from tofcorr.data.recording import Recording
@@ -66,16 +67,13 @@ def test_a_header_without_the_optional_keys_means_recorded_planes(folder: Path) 
 
 @pytest.mark.parametrize("name", ["", " tool0", "two\nlines"])
 def test_a_name_that_is_no_line_of_text_is_refused(name: str, folder: Path) -> None:
-    header = yaml.safe_load((folder / "recording.yaml").read_text())
-    (folder / "recording.yaml").write_text(yaml.safe_dump(header | {"frames": {"tool": name}}))
+    header(("frames", {"tool": name}))(folder)
     with pytest.raises(CalibrationDataError, match=r"frames\.tool|tool"):
         Recording.open(folder)
 
 
 def test_a_frame_without_a_name_keeps_the_usual_one(folder: Path) -> None:
-    header = yaml.safe_load((folder / "recording.yaml").read_text())
-    text = yaml.safe_dump(header | {"frames": {"world": "base_link"}})
-    (folder / "recording.yaml").write_text(text)
+    header(("frames", {"world": "base_link"}))(folder)
     names = Recording.open(folder).frame_names
     assert (names.world, names.tool, names.camera) == ("base_link", "tool", "camera")
 
@@ -135,20 +133,20 @@ def test_a_recording_like_another_has_its_very_rows(tmp_path: Path, folder: Path
 
 def test_a_frequency_without_a_sign_in_its_exponent_is_a_number(folder: Path) -> None:
     # YAML 1.1 reads 20.0e6 as text; the format's own example writes it so.
-    header = yaml.safe_load((folder / "recording.yaml").read_text())
-    text = yaml.safe_dump(header | {"modulation_frequency_hz": 0})
-    text = text.replace("modulation_frequency_hz: 0", "modulation_frequency_hz: 20.0e6")
+    header(("modulation_frequency_hz", 0))(folder)
+    text = (
+        (folder / "recording.yaml").read_text().replace("frequency_hz: 0", "frequency_hz: 20.0e6")
+    )
     (folder / "recording.yaml").write_text(text)
     assert Recording.open(folder).modulation_frequency == 20e6
 
 
 def test_a_rounded_hand_eye_becomes_an_exact_rotation(folder: Path) -> None:
-    header = yaml.safe_load((folder / "recording.yaml").read_text())
-    header["tool_from_camera"] = np.round(header["tool_from_camera"], 4).tolist()
-    (folder / "recording.yaml").write_text(yaml.safe_dump(header))
+    rounded = np.round(Recording.open(folder).tool_from_camera, 4)
+    header(("tool_from_camera", rounded.tolist()))(folder)
     rotation = Recording.open(folder).tool_from_camera[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(rotation, np.array(header["tool_from_camera"])[:3, :3], atol=2e-4)
+    np.testing.assert_allclose(rotation, rounded[:3, :3], atol=2e-4)
 
 
 def test_require_names_the_missing_part_and_what_needs_it(tmp_path: Path, folder: Path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from broken_recordings import cells
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -66,8 +67,8 @@ def test_a_table_from_windows_with_other_columns_in_another_order_is_read_alike(
 
 def test_a_quaternion_has_its_scalar_last(folder: Path) -> None:
     # A quarter turn about z: x goes to y.
-    half = np.sqrt(0.5)
-    _set_cells(folder, 2, {"qx": 0.0, "qy": 0.0, "qz": half, "qw": half})
+    half = 0.5**0.5
+    cells(2, qx="0", qy="0", qz=repr(half), qw=repr(half))(folder)
     rotation = Recording.open(folder).frames.world_from_tool[2, :3, :3]
     np.testing.assert_allclose(rotation @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-15)
 
@@ -75,7 +76,7 @@ def test_a_quaternion_has_its_scalar_last(folder: Path) -> None:
 def test_a_normal_of_almost_unit_length_describes_the_same_plane_when_normalised(
     folder: Path,
 ) -> None:
-    _set_cells(folder, 3, {"nx": 0.0, "ny": 0.0, "nz": -1.0005, "d": 2.001})
+    cells(3, nx="0", ny="0", nz="-1.0005", d="2.001")(folder)
     table = Recording.open(folder).frames
     np.testing.assert_array_equal(table.normal_world[3], [0.0, 0.0, -1.0])
     assert table.offset[3] == pytest.approx(2.0, rel=1e-15)  # -z + 2 = 0: the plane z = 2.
@@ -114,14 +115,3 @@ def test_any_pose_and_time_survive_the_table(
     np.testing.assert_allclose(table.integration_time, [seconds], rtol=1e-14)
     assert (table.offset[0], table.timestamp[0]) == (pytest.approx(metres, rel=1e-14), metres)
     assert table.target[0] == 'a, "b"'
-
-
-def _set_cells(folder: Path, frame: int, values: dict[str, float]) -> None:
-    path = folder / "frames.csv"
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    rows[frame] |= {name: repr(float(value)) for name, value in values.items()}
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)

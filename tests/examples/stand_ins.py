@@ -26,66 +26,48 @@ class Header:
 class _Message:
     """A message of rosidl: its fields are fixed, have types, and are given by keyword."""
 
-    fields_of: ClassVar[dict[str, tuple[type, Any]]] = {}
+    fields_of: ClassVar[dict[str, type]] = {}
 
     def __init__(self, **values: Any) -> None:
-        for name, (_, default) in self.fields_of.items():
-            object.__setattr__(self, name, default() if callable(default) else default)
+        for name, kind in self.fields_of.items():
+            object.__setattr__(self, name, array("B") if kind is array else kind())
         for name, value in values.items():
             setattr(self, name, value)
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self.fields_of:
             raise AttributeError(f"{type(self).__name__} has no field {name}")
-        kind, _ = self.fields_of[name]
+        kind = self.fields_of[name]
         assert isinstance(value, kind), f"{name} must be {kind.__name__}, got {type(value)}"
         if kind is array:
             assert value.typecode == "B"
         object.__setattr__(self, name, value)
 
 
-def _bytes() -> array:
-    return array("B")
+_SIZE = {"header": Header, "height": int, "width": int}
 
 
 class Image(_Message):
-    fields_of: ClassVar = {
-        "header": (Header, Header),
-        "height": (int, 0),
-        "width": (int, 0),
-        "encoding": (str, ""),
-        "is_bigendian": (int, 0),
-        "step": (int, 0),
-        "data": (array, _bytes),
-    }
+    fields_of: ClassVar = _SIZE | {"encoding": str, "is_bigendian": int, "step": int, "data": array}
 
 
 class PointField(_Message):
     FLOAT32 = 7
-    fields_of: ClassVar = {
-        "name": (str, ""),
-        "offset": (int, 0),
-        "datatype": (int, 0),
-        "count": (int, 0),
-    }
+    fields_of: ClassVar = {"name": str, "offset": int, "datatype": int, "count": int}
 
 
 class PointCloud2(_Message):
     fields_of: ClassVar = {
-        "header": (Header, Header),
-        "height": (int, 0),
-        "width": (int, 0),
-        "fields": (list, list),
-        "is_bigendian": (bool, False),
-        "point_step": (int, 0),
-        "row_step": (int, 0),
-        "data": (array, _bytes),
-        "is_dense": (bool, False),
+        **(_SIZE | {"fields": list, "data": array}),
+        "is_bigendian": bool,
+        "is_dense": bool,
+        "point_step": int,
+        "row_step": int,
     }
 
 
 class CameraInfo(_Message):
-    fields_of: ClassVar = {"header": (Header, Header), "k": (list, list)}
+    fields_of: ClassVar = {"header": Header, "k": list}
 
 
 @dataclass

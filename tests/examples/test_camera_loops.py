@@ -15,11 +15,10 @@ from examples.stand_ins import load_example
 DEPTH_SCALE = 0.00025
 
 
-class _Frame:
+class _Frame(SimpleNamespace):
     """A frame of pyrealsense2; one without data is false."""
 
-    def __init__(self, data: np.ndarray | None) -> None:
-        self.data = data
+    data: np.ndarray | None
 
     def __bool__(self) -> bool:
         return self.data is not None
@@ -37,10 +36,8 @@ class _Pipeline:
         self.count = -1
 
     def start(self, config: Any) -> Any:
-        assert config.streams == [
-            ("depth", WIDTH, HEIGHT, "z16"),
-            ("infrared", WIDTH, HEIGHT, "y8"),
-        ]
+        kinds = (("depth", "z16"), ("infrared", "y8"))
+        assert config.streams == [(name, WIDTH, HEIGHT, kind) for name, kind in kinds]
         sensor = SimpleNamespace(get_depth_scale=lambda: DEPTH_SCALE)
         device = SimpleNamespace(first_depth_sensor=lambda: sensor)
         return SimpleNamespace(get_device=lambda: device)
@@ -50,8 +47,8 @@ class _Pipeline:
         depth, infrared = frame(self.count)
         infrared8 = None if self.count == 1 else (infrared // 4).astype(np.uint8)
         return SimpleNamespace(
-            get_depth_frame=lambda: _Frame((depth * 4).astype(np.uint16)),
-            get_infrared_frame=lambda: _Frame(infrared8),
+            get_depth_frame=lambda: _Frame(data=(depth * 4).astype(np.uint16)),
+            get_infrared_frame=lambda: _Frame(data=infrared8),
         )
 
     def stop(self) -> None:
@@ -67,15 +64,19 @@ class _Config:
         self.streams.append((stream, width, height, kind))
 
 
-def assert_corrected(found: Any, model: Path, depth: np.ndarray, amplitude: np.ndarray) -> None:
-    given = torch.from_numpy(depth.astype(np.float32)), torch.from_numpy(amplitude)
+def assert_corrected(loop: Any, model: Path, scale: float, dimmed: int) -> None:
+    """The loop corrects the first and third frame, for the second lacks infrared, and ends."""
     corrector = torch.jit.load(str(model))
-    corrected, valid = corrector(*given)
-    torch.testing.assert_close(found[0], corrected, rtol=0, atol=1e-6, equal_nan=True)
-    assert torch.equal(found[1], valid)
-    torch.testing.assert_close(
-        found[2], corrector.points(*given), rtol=0, atol=1e-6, equal_nan=True
-    )
+    for found, k in zip(islice(loop, 2), (0, 2), strict=True):
+        depth, infrared = frame(k)
+        metres = depth.astype(np.float32) * np.float32(scale)
+        given = tuple(map(torch.from_numpy, (metres, np.float32(infrared // dimmed))))
+        corrected, valid = corrector(*given)
+        near = {"rtol": 0, "atol": 1e-6, "equal_nan": True}
+        torch.testing.assert_close(found[0], corrected, **near)
+        assert torch.equal(found[1], valid)
+        torch.testing.assert_close(found[2], corrector.points(*given), **near)
+    loop.close()
 
 
 def test_realsense_loop_gives_corrected_frames(
@@ -88,11 +89,7 @@ def test_realsense_loop_gives_corrected_frames(
     monkeypatch.setitem(sys.modules, "pyrealsense2", driver)
     model = save_corrector(tmp_path / "corrector.ts")
     loop = load_example("realsense").corrected_frames(str(model))
-    for found, k in zip(islice(loop, 2), (0, 2), strict=True):
-        depth, infrared = frame(k)
-        metres = (depth * 4).astype(np.float32) * np.float32(DEPTH_SCALE)
-        assert_corrected(found, model, metres, (infrared // 4).astype(np.float32))
-    loop.close()
+    assert_corrected(loop, model, 4 * DEPTH_SCALE, 4)
     assert _Pipeline.stopped
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -136,11 +133,7 @@ def test_azure_kinect_loop_gives_corrected_frames(
 ) -> None:
     model = save_corrector(tmp_path / "corrector.ts")
     loop = azure_kinect.corrected_frames(str(model))
-    for found, k in zip(islice(loop, 2), (0, 2), strict=True):
-        depth, infrared = frame(k)
-        metres = depth.astype(np.float32) * np.float32(1e-3)
-        assert_corrected(found, model, metres, infrared.astype(np.float32))
-    loop.close()
+    assert_corrected(loop, model, 1e-3, 1)
     assert not _PyK4A.running
     assert capsys.readouterr().err.count("\n") == 1
 

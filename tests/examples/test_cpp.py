@@ -8,17 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from examples.correctors import HEIGHT, WIDTH, save_corrector
 from filelock import FileLock
 
-from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.torchscript import export_torchscript
-from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.base import Domain, Interval
-from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.geometry.camera import CameraIntrinsics
-
 SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp"
-HEIGHT, WIDTH = 6, 8
 
 pytestmark = pytest.mark.skipif(
     not (shutil.which("cmake") and shutil.which("g++")), reason="needs cmake and g++"
@@ -47,41 +40,11 @@ def program(pytestconfig: pytest.Config) -> Path:
 
 @pytest.fixture(scope="module")
 def corrector(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = ErrorModelOptions.from_mapping(
-        {
-            "terms": [
-                {"kind": "distance_polynomial", "degree": 3},
-                {"kind": "pixel_polynomial", "degree": 2},
-                {"kind": "amplitude_polynomial", "degree": 2},
-            ]
-        },
-        "test",
-    )
-    domain = Domain(
-        height=HEIGHT,
-        width=WIDTH,
-        radial_distance=Interval(0.5, 2.0),
-        amplitude=Interval(10.0, 500.0),
-        normalised_amplitude=Interval(10.0, 900.0),
-    )
-    camera = CameraIntrinsics(
-        width=WIDTH,
-        height=HEIGHT,
-        matrix=((9.0, 0.0, 3.5), (0.0, 9.0, 2.5), (0.0, 0.0, 1.0)),
-    )
-    state = CalibrationState(
-        name="EA",
-        error_model=options,
-        domain=domain,
-        coefficients=torch.linspace(-0.02, 0.03, 10, dtype=torch.float64),
-        tool_from_camera=torch.eye(4, dtype=torch.float64),
-        hand_eye_estimated=True,
-        camera=camera,
-        depth_kind="radial",
-    )
-    path = tmp_path_factory.mktemp("corrector") / "corrector.ts"
-    export_torchscript(DepthCorrector.from_state(state), path, state)
-    return path
+    return save_corrector(tmp_path_factory.mktemp("corrector") / "corrector.ts")
+
+
+def run(program: Path, *arguments: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
 
 
 @pytest.mark.slow
@@ -96,8 +59,7 @@ def test_cpp_program_gives_the_very_bits_that_python_gives(
     frames["depth"][0, :2] = (np.nan, 0.0)
     for name, frame in frames.items():
         frame.tofile(tmp_path / f"{name}.raw")
-    arguments = [corrector, *(tmp_path / f"{n}.raw" for n in ("depth", "amplitude", "out"))]
-    done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
+    done = run(program, corrector, *(tmp_path / f"{n}.raw" for n in (*frames, "out")))
     assert done.returncode == 0, done.stderr
 
     expected, valid = torch.jit.load(str(corrector))(*map(torch.from_numpy, frames.values()))
@@ -111,8 +73,8 @@ def test_cpp_program_refuses_a_frame_of_another_size_in_one_line(
     program: Path, corrector: Path, tmp_path: Path
 ) -> None:
     np.zeros((HEIGHT, WIDTH - 1), np.float32).tofile(tmp_path / "small.raw")
-    arguments = [corrector, tmp_path / "small.raw", tmp_path / "small.raw", tmp_path / "out.raw"]
-    done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
+    small = tmp_path / "small.raw"
+    done = run(program, corrector, small, small, tmp_path / "out.raw")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert f"expected {HEIGHT} x {WIDTH} float32 values" in done.stderr

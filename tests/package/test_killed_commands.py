@@ -18,7 +18,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree import ElementTree
 
 import pytest
@@ -62,14 +61,6 @@ try:
 finally:
     print("operations", number, flush=True)
 """
-
-
-class Command(NamedTuple):
-    """A command in the workspace: its words, what it writes, and what reads that whole."""
-
-    words: str
-    out: str
-    check: Callable[[Path], object]
 
 
 def _yaml(path: Path) -> None:
@@ -119,54 +110,37 @@ def _poses(path: Path) -> None:
     assert len(rows) >= 3
 
 
-COMMANDS = {
-    "simulate": Command("simulate --config simulator.yaml --out new", "new", Recording.open),
-    "inspect": Command("inspect recording --out new.html", "new.html", _page),
-    "train": Command("train --recording recording --out new --no-figures", "new", _run),
-    "evaluate": Command(
-        "evaluate --recording recording --config few.yaml --out new", "new", _tables
-    ),
-    "select": Command("select --recording recording --config few.yaml --out new", "new", _tables),
-    "check": Command("check --run run --recording recording --out old.json", "old.json", _yaml),
-    **{
-        f"export {kind}": Command(f"export --run run --format {kind} --out {out}", out, check)
-        for kind, out, check in (
-            ("torchscript", "new.ts", load_corrector),
-            ("lut", "new.npz", read_lut),
-            ("urdf", "new.urdf", ElementTree.parse),
-            ("tf", "new.yaml", _yaml),
-            ("easy_handeye", "new.yaml", _yaml),
-            ("opencv", "new.yaml", _ends),
-            ("c", "new.c", _ends),
-        )
-    },
-    "correct": Command(
-        "correct --model run/corrector.ts --recording recording --out new", "new", Recording.open
-    ),
-    "correct --ply": Command(
-        "correct --model run/corrector.ts --recording recording --ply new", "new", _clouds
-    ),
-    "degrade": Command(
-        "degrade --sensor sensor.yaml --recording recording --out new", "new", Recording.open
-    ),
-    "poses": Command(
-        "poses --intrinsics camera.yaml --size 12 10 --distance 0.5 2 --number 4 --out new.csv",
-        "new.csv",
-        _poses,
-    ),
-    "diagnose": Command(
-        "diagnose --recording recording --set bootstraps=20 --out new", "new", _diagnosis
-    ),
+RUN, RECORDING = "--run run", "--recording recording"
+COMMANDS: dict[str, Callable[[Path], object]] = {
+    "simulate --config simulator.yaml --out new": Recording.open,
+    "inspect recording --out new.html": _page,
+    f"train {RECORDING} --out new --no-figures": _run,
+    f"evaluate {RECORDING} --config few.yaml --out new": _tables,
+    f"select {RECORDING} --config few.yaml --out new": _tables,
+    f"check {RUN} {RECORDING} --out old.json": _yaml,
+    f"export {RUN} --format torchscript --out new.ts": load_corrector,
+    f"export {RUN} --format lut --out new.npz": read_lut,
+    f"export {RUN} --format urdf --out new.urdf": ElementTree.parse,
+    f"export {RUN} --format tf --out new.yaml": _yaml,
+    f"export {RUN} --format easy_handeye --out new.yaml": _yaml,
+    f"export {RUN} --format opencv --out new.yaml": _ends,
+    f"export {RUN} --format c --out new.c": _ends,
+    f"correct --model run/corrector.ts {RECORDING} --out new": Recording.open,
+    f"correct --model run/corrector.ts {RECORDING} --ply new": _clouds,
+    f"degrade --sensor sensor.yaml {RECORDING} --out new": Recording.open,
+    "poses --intrinsics camera.yaml --size 12 10 --distance 0.5 2 --number 4 --out new.csv": _poses,
+    f"diagnose {RECORDING} --set bootstraps=20 --out new": _diagnosis,
 }
+"""Commands in the workspace, and what reads whole what each writes."""
 
 
 @pytest.fixture(scope="module")
 def ready(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The workspace that every command starts from."""
     folder = tmp_path_factory.mktemp("ready")
-    made = tiny.make(folder, 1)
-    header = yaml.safe_load((made.recording / "recording.yaml").read_text(encoding="utf-8"))
-    sensor = yaml.safe_load(made.sensor.read_text(encoding="utf-8"))
+    tiny.make(folder, 1)
+    header = yaml.safe_load((folder / "recording" / "recording.yaml").read_text(encoding="utf-8"))
+    sensor = yaml.safe_load((folder / "sensor.yaml").read_text(encoding="utf-8"))
     sensor |= {"camera": header["camera"], "depth_kind": header["depth_kind"]}
     texts = {
         "sensor.yaml": sensor,
@@ -180,14 +154,14 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(command: Command, ready: Path, place: Path, what: str, moment: int) -> tuple[int, str]:
+def run(words: str, ready: Path, place: Path, what: str, moment: int) -> tuple[int, str]:
     """Run a command in a copy of the workspace; return exit code and what it printed."""
     folder, scratch = place / "work", place / "scratch"
     if not folder.exists():
         shutil.copytree(ready, folder)
     scratch.mkdir(exist_ok=True)
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, what, str(moment), *command.words.split()],
+        [sys.executable, "-c", PROGRAM, what, str(moment), *words.split()],
         cwd=folder,
         env=os.environ | {"TMPDIR": str(scratch), "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -214,34 +188,35 @@ def hidden(place: Path) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("words", COMMANDS)
 def test_a_command_that_is_killed_leaves_nothing_or_all(
-    name: str, ready: Path, tmp_path: Path
+    words: str, ready: Path, tmp_path: Path
 ) -> None:
-    command, draw = COMMANDS[name], random.Random(name)
-    code, told = run(command, ready, tmp_path / "whole", "", 10**9)
+    check, draw = COMMANDS[words], random.Random(words)
+    written = words.split(" --ply " if "--ply" in words else " --out ")[1].split(maxsplit=1)[0]
+    code, told = run(words, ready, tmp_path / "whole", "", 10**9)
     assert code == 0, told
-    command.check(tmp_path / "whole" / "work" / command.out)
+    check(tmp_path / "whole" / "work" / written)
     operations = int(told.split("operations ")[1].split()[0])
     before = digests(ready)
     for number in range(KILLS):
         what, place = draw.choice(list(SIGNALS)), tmp_path / str(number)
-        code, told = run(command, ready, place, what, draw.randint(1, operations))
+        code, told = run(words, ready, place, what, draw.randint(1, operations))
         assert code in {0, *SIGNALS[what]}, told
         assert "Traceback" not in told
-        after, out = digests(place / "work"), place / "work" / command.out
-        assert {path: after.get(path) for path in before if path != command.out} == {
-            path: digest for path, digest in before.items() if path != command.out
+        after, out = digests(place / "work"), place / "work" / written
+        assert {path: after.get(path) for path in before if path != written} == {
+            path: digest for path, digest in before.items() if path != written
         }
         if os.path.lexists(out):
-            command.check(out)
+            check(out)
         else:
-            assert command.out not in before
+            assert written not in before
         left = hidden(place)
         assert not left or what == "KILL" or code < 0
         shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
-        code, told = run(command, ready, place, "", 10**9)
+        code, told = run(words, ready, place, "", 10**9)
         assert code == 0, told
         assert not hidden(place)
         assert not left or "Removed" in told
-        command.check(out)
+        check(out)

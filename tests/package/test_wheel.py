@@ -31,6 +31,24 @@ for words in (
 """
 
 
+def run(python: Path | str, folder: Path, *arguments: str) -> str:
+    """Return what `python ARGUMENTS` prints, run in `folder` as a user without the repository.
+
+    With the repository in PYTHONPATH, its `tofcorr.egg-info` passed for an installed tofcorr, and
+    pip installed nothing.
+    """
+    done = subprocess.run(
+        [python, *arguments],
+        cwd=folder,
+        env={key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build a source distribution from a copy of the repository, and the wheel from that."""
@@ -41,19 +59,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copytree(ROOT / name, source / name, ignore=ignored)
         else:
             shutil.copy(ROOT / name, source)
-    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", "dist"]
-    done = subprocess.run(build, cwd=source, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    run(sys.executable, source, "-m", "build", "--no-isolation", "--outdir", "dist")
     return next((source / "dist").glob("*.whl"))
-
-
-def of_a_user() -> dict[str, str]:
-    """Return the environment of somebody without the repository.
-
-    With the repository in PYTHONPATH, its `tofcorr.egg-info` passed for an installed tofcorr, and
-    pip installed nothing.
-    """
-    return {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
 
 
 @pytest.fixture(scope="module")
@@ -67,29 +74,11 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False, symlinks=os.name != "nt")
     new = next(path for path in folder.rglob("python*") if path.stem == "python")
-    pip = [sys.executable, "-m", "pip", "--python", str(new), "install", "--no-deps", "--no-index"]
-    install = [*pip, "--no-compile", str(wheel)]
-    done = subprocess.run(
-        install, env=of_a_user(), cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    pip = ("-m", "pip", "--python", str(new), "install", "--no-deps", "--no-index", "--no-compile")
+    run(sys.executable, folder, *pip, str(wheel))
     packages = next(folder.rglob("site-packages"))
     (packages / "packages_of_the_tests.pth").write_text("\n".join(site.getsitepackages()))
     return new
-
-
-def run(python: Path, folder: Path, *arguments: str) -> str:
-    """Return what `python ARGUMENTS` prints, run in `folder` as a user without the repository."""
-    done = subprocess.run(
-        [python, *arguments],
-        cwd=folder,
-        env=of_a_user(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def test_the_wheel_holds_every_configuration_and_text_as_in_the_repository(wheel: Path) -> None:
@@ -115,10 +104,8 @@ def test_simulate_and_train_run_by_name_in_an_empty_folder(python: Path, tmp_pat
     assert Path(package).is_relative_to(python.parents[1])
     assert str(ROOT) not in search_path
 
-    tofcorr = ("-m", "tofcorr")
-    assert run(python, tmp_path, *tofcorr, "configs", "ea") == (
-        ROOT / "configs" / "train" / "ea.yaml"
-    ).read_text("utf-8")
+    shipped = (ROOT / "configs" / "train" / "ea.yaml").read_text("utf-8")
+    assert run(python, tmp_path, "-m", "tofcorr", "configs", "ea") == shipped
     printed = run(python, tmp_path, "-c", SIMULATE_AND_TRAIN)
     assert "Run filed in run" in printed
     report = json.loads((tmp_path / "run" / "report.json").read_text("utf-8"))
@@ -131,18 +118,16 @@ def test_simulate_and_train_run_by_name_in_an_empty_folder(python: Path, tmp_pat
 @pytest.mark.slow
 def test_a_bag_becomes_a_joint_of_the_robot_in_four_commands(python: Path, tmp_path: Path) -> None:
     recorded = Drive().record()
-    bag = str(bags.write_drive(recorded, tmp_path / "bag", "mcap"))
-    tofcorr = ("-m", "tofcorr")
-    topics = ("--depth", bags.DEPTH, "--amplitude", bags.INFRARED)
-    frames = ("--base-frame", bags.BASE, "--tool-frame", bags.TOOL)
-    run(python, tmp_path, *tofcorr, "import", "rosbag", bag, *topics, *frames, "--out", "wall")
-    run(
-        python, tmp_path, *tofcorr, "train", "--recording", "wall", "--config", "ea", "--out", "run"
+    bag = bags.write_drive(recorded, tmp_path / "bag", "mcap")
+    commands = (
+        f"import rosbag {bag} --depth {bags.DEPTH} --amplitude {bags.INFRARED}"
+        f" --base-frame {bags.BASE} --tool-frame {bags.TOOL} --out wall",
+        "train --recording wall --config ea --out run",
+        "export --run run --format urdf --out camera.urdf.xacro",
+        "correct --model run/corrector.ts --recording wall --out corrected",
     )
-    urdf = ("--format", "urdf", "--out", "camera.urdf.xacro")
-    run(python, tmp_path, *tofcorr, "export", "--run", "run", *urdf)
-    corrected = ("--model", "run/corrector.ts", "--recording", "wall", "--out", "corrected")
-    run(python, tmp_path, *tofcorr, "correct", *corrected)
+    for command in commands:
+        run(python, tmp_path, "-m", "tofcorr", *command.split())
     origin = ElementTree.parse(tmp_path / "camera.urdf.xacro").find(".//joint/origin")
     assert origin is not None
     place = [float(number) for number in origin.attrib["xyz"].split()]
