@@ -16,6 +16,17 @@ Graph = Mapping[str, frozenset[str]]
 """The modules that each module imports, by dotted name."""
 
 
+def imported(source: str) -> set[str]:
+    """Return the dotted names that a source imports anywhere, and what it takes from each."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
 def import_graph(package: Path = ROOT / "tofcorr") -> dict[str, frozenset[str]]:
     """Return the graph of all files of a package."""
     files = {_dotted(path, package.parent): path for path in sorted(package.rglob("*.py"))}

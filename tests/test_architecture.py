@@ -1,13 +1,12 @@
 """Rules that no linter knows."""
 
-import ast
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
-from import_graph import Graph, circles, import_graph, reached_from
+from import_graph import Graph, circles, import_graph, imported, reached_from
 
 from tofcorr.cli.main import COMMANDS
 from tofcorr.importing.registry import IMPORTERS
@@ -15,29 +14,16 @@ from tofcorr.importing.registry import IMPORTERS
 ROOT = Path(__file__).resolve().parents[1]
 CONFINED = {
     "cv2": {"tofcorr/importing", "tofcorr/correction/export/opencv.py"},
-    "torch.utils.tensorboard": {
-        "tofcorr/training/monitor.py",
-    },
+    "torch.utils.tensorboard": {"tofcorr/training/monitor.py"},
     "yaml": {"tofcorr/options.py", "tofcorr/data", "tofcorr/importing"},
 }
-
-
-def _imports(path: Path) -> set[str]:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    names: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        if isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
 
 
 @pytest.fixture(scope="module")
 def imports() -> dict[str, set[str]]:
     """What each file of the package imports, by the file's path."""
     files = (ROOT / "tofcorr").rglob("*.py")
-    return {path.relative_to(ROOT).as_posix(): _imports(path) for path in files}
+    return {path.relative_to(ROOT).as_posix(): imported(path.read_text("utf-8")) for path in files}
 
 
 @pytest.mark.parametrize("library", CONFINED)
@@ -90,11 +76,6 @@ def graph() -> Graph:
     return import_graph()
 
 
-def _layer(module: str) -> str:
-    """Return the room of a module: the first name below the package."""
-    return module.split(".")[1]
-
-
 def test_no_files_import_each_other_in_a_circle(graph: Graph) -> None:
     assert circles(graph) == []
 
@@ -104,15 +85,16 @@ def test_no_import_runs_to_a_higher_layer(graph: Graph) -> None:
     rank = {name: number for number, names in enumerate(layers) for name in names}
     upward = [
         f"{module} imports {other}"
-        for module, imported in graph.items()
-        for other in imported
+        for module, others in graph.items()
+        for other in others
         if "." in module and (other == "tofcorr" or not _may_import(module, other, rank))
     ]
     assert upward == []
 
 
 def _may_import(module: str, other: str, rank: dict[str, int]) -> bool:
-    own, its = _layer(module), _layer(other)
+    """Return whether a room, the first name below the package, stands above the other."""
+    own, its = module.split(".")[1], other.split(".")[1]
     return own == its or rank[own] < rank[its]
 
 

@@ -6,7 +6,9 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
+from broken_recordings import value
 from running import Program
 from small_recordings import CAMERA, NUM_FRAMES, write_small_recording
 from torch import Tensor, nn
@@ -52,8 +54,14 @@ def save_module(path: Path, module: nn.Module) -> Path:
     return path
 
 
-def test_depth_and_mask_are_corrected_and_all_else_stays(tmp_path: Path, program: Program) -> None:
-    source = write_small_recording(tmp_path / "recording")
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    return write_small_recording(tmp_path / "recording")
+
+
+def test_depth_and_mask_are_corrected_and_all_else_stays(
+    tmp_path: Path, program: Program, source: Path
+) -> None:
     model = save_corrector(tmp_path / "corrector.ts")
 
     told = program(*CORRECT, model, "--recording", source, "--out", tmp_path / "out")
@@ -75,9 +83,8 @@ def test_depth_and_mask_are_corrected_and_all_else_stays(tmp_path: Path, program
 
 
 def test_point_clouds_may_be_written_instead_of_a_recording(
-    tmp_path: Path, program: Program
+    tmp_path: Path, program: Program, source: Path
 ) -> None:
-    source = write_small_recording(tmp_path / "recording")
     model = save_corrector(tmp_path / "corrector.ts")
     given = (*CORRECT, model, "--recording", source)
     assert program(*given, "--ply", tmp_path / "clouds").code == 0
@@ -89,14 +96,13 @@ def test_point_clouds_may_be_written_instead_of_a_recording(
     assert "give --out, --ply, or both" in told
 
 
-def test_the_batch_size_does_not_change_the_result(tmp_path: Path) -> None:
-    recording = Recording.open(write_small_recording(tmp_path / "recording"))
+def test_the_batch_size_does_not_change_the_result(tmp_path: Path, source: Path) -> None:
+    recording = Recording.open(source)
     corrector = ConstantCorrector("{}")
     steps: list[int] = []
-    for name, chunk_pixels in {"one": 1, "three": 3 * 35, "all": 10**6}.items():
-        write_corrected(
-            corrector, recording, tmp_path / name, chunk_pixels=chunk_pixels, progress=steps.append
-        )
+    for name, pixels in {"one": 1, "three": 3 * 35, "all": 10**6}.items():
+        how = {"chunk_pixels": pixels, "progress": steps.append}
+        write_corrected(corrector, recording, tmp_path / name, **how)
     assert steps == [1, 1, 1, 1, 1, 1, 3, 3, 6]
     for other in ("three", "all"):
         for name in ("depth.npy", "mask.npy", "amplitude.npy", "frames.csv", "recording.yaml"):
@@ -112,8 +118,7 @@ def test_a_model_without_intensity_term_corrects_a_recording_without_amplitude(
     assert Recording.open(tmp_path / "out").amplitude is None
 
 
-def test_another_lens_is_remarked_upon(tmp_path: Path, program: Program) -> None:
-    source = write_small_recording(tmp_path / "recording")
+def test_another_lens_is_remarked_upon(tmp_path: Path, program: Program, source: Path) -> None:
     lens = {"K": [list(row) for row in CAMERA.matrix], "distortion": list(CAMERA.distortion)}
     size = {"width": CAMERA.width, "height": CAMERA.height}
     for name, described, remarked in [
@@ -134,21 +139,16 @@ class Nameless(nn.Module):
 
 
 def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
-    tmp_path: Path, program: Program
+    tmp_path: Path, program: Program, source: Path
 ) -> None:
-    fitting = write_small_recording(tmp_path / "recording")
     without_amplitude = write_small_recording(tmp_path / "dark", amplitude=None)
     negative = write_small_recording(tmp_path / "negative")
-    amplitude = np.load(negative / "amplitude.npy")
-    amplitude[3, 0, 0] = -1.0
-    np.save(negative / "amplitude.npy", amplitude)
+    value("amplitude", (3, 0, 0), -1.0)(negative)
     turned = write_small_recording(
         tmp_path / "turned",
         camera=CameraIntrinsics(width=5, height=7, matrix=CAMERA.matrix),
-        depth=np.ones((6, 7, 5)),
-        amplitude=np.ones((6, 7, 5)),
-        mask=None,
-        raw=None,
+        **dict.fromkeys(("depth", "amplitude"), np.ones((6, 7, 5))),
+        **dict.fromkeys(("mask", "raw")),
     )
     corrector = save_corrector(tmp_path / "corrector.ts", needs_amplitude=False)
     needs_amplitude = save_corrector(tmp_path / "amplitude.ts")
@@ -160,18 +160,14 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
     pickled = tmp_path / "weights.pt"
     torch.save({"weight": torch.ones(2)}, pickled)
     cases = [
-        (tmp_path / "none.ts", fitting, "none.ts: there is no such file."),
-        (tmp_path, fitting, "is a folder; expected the corrector.ts of a run"),
+        (tmp_path / "none.ts", source, "none.ts: there is no such file."),
+        (tmp_path, source, "is a folder; expected the corrector.ts of a run"),
         (corrector, tmp_path / "nowhere", "nowhere: there is no such folder."),
         (corrector, garbage, "garbage.ts: is a file; a recording is a folder"),
-        (garbage, fitting, "garbage.ts: is not the corrector.ts of a run"),
-        (pickled, fitting, "weights.pt: not a TorchScript module"),
-        (
-            nameless,
-            fitting,
-            "nameless.ts: a TorchScript module, but without a corrector's metadata",
-        ),
-        (along_axis, fitting, "depth is of kind 'radial', but"),
+        (garbage, source, "garbage.ts: is not the corrector.ts of a run"),
+        (pickled, source, "weights.pt: not a TorchScript module"),
+        (nameless, source, "nameless.ts: a TorchScript module, but without a corrector's meta"),
+        (along_axis, source, "depth is of kind 'radial', but"),
         (corrector, turned, "frames are 5x7 pixels, but"),
         (needs_amplitude, without_amplitude, "amplitude.npy is missing; the corrector"),
         # Metadata that does not tell the size: the module itself refuses, and is quoted.
@@ -188,7 +184,7 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
         assert sorted(tmp_path.rglob("*")) == before
 
     (tmp_path / "out").mkdir()
-    told = program(*CORRECT, corrector, "--recording", fitting, "--out", tmp_path / "out")
+    told = program(*CORRECT, corrector, "--recording", source, "--out", tmp_path / "out")
     assert told.code == 2
     assert "exists already and is not overwritten" in told.err
     assert list((tmp_path / "out").iterdir()) == []

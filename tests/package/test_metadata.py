@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from import_graph import imported
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -42,13 +43,7 @@ def sources(folder: Path) -> Iterator[str]:
 
 def imported_packages(folder: Path) -> set[str]:
     """Return the top-level packages imported below `folder`, inside functions too."""
-    names: set[str] = set()
-    for source in sources(folder):
-        for node in ast.walk(ast.parse(source)):
-            if isinstance(node, ast.Import):
-                names |= {alias.name.partition(".")[0] for alias in node.names}
-            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names.add(node.module.partition(".")[0])
+    names = {name.partition(".")[0] for source in sources(folder) for name in imported(source)}
     return names - set(sys.stdlib_module_names)
 
 
