@@ -5,8 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tofcorr.error_terms.base import Domain, Interval, SignalTerm
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -120,26 +118,3 @@ def test_a_flat_direction_has_its_vertex_nowhere_and_still_survives() -> None:
     again = built(P2)
     again.set_paper_coefficients(paper)
     torch.testing.assert_close(again.coefficient_vector(), model.coefficient_vector())
-
-
-@given(
-    values=st.lists(st.floats(-0.1, 0.1), min_size=10, max_size=10),
-    factor=st.floats(-3, 3, allow_nan=False),
-)
-def test_the_error_is_linear_in_all_coefficients(values: list[float], factor: float) -> None:
-    model = built(D, P2, I1)
-    distance, amplitude = frame(torch.Generator().manual_seed(1))
-    vector = torch.tensor(values, dtype=torch.float64)
-    model.set_coefficient_vector(vector)
-    once = model(distance, amplitude)
-    model.set_coefficient_vector(factor * vector)
-    torch.testing.assert_close(model(distance, amplitude), factor * once, rtol=1e-9, atol=1e-12)
-
-
-def test_pixel_polynomial_is_its_coefficients_times_its_basis(generator: torch.Generator) -> None:
-    term = randomised(built(P2 | {"degree": 3}), generator).pixel_terms[0]
-    rows = 8 * torch.rand(50, generator=generator, dtype=torch.float64)
-    columns = 11 * torch.rand(50, generator=generator, dtype=torch.float64)
-    expected = term.coefficients @ term.basis(rows, columns)  # type: ignore[operator]
-    torch.testing.assert_close(term(rows, columns), expected)
-    torch.testing.assert_close(torch.jit.script(term)(rows, columns), expected)

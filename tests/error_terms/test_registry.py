@@ -72,8 +72,9 @@ def test_every_value_of_a_state_is_a_tensor(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", TERMS)
 def test_a_domain_without_what_a_term_needs_is_refused(kind: str) -> None:
+    said = {"amplitude": "amplitude.npy", "modulation_frequency": "modulation_frequency_hz"}
     for need in TERMS[kind].needs:
-        with pytest.raises(CalibrationDataError):
+        with pytest.raises(CalibrationDataError, match=said.get(need, need.replace("_", " "))):
             model_of(kind, WITHOUT[need])
 
 

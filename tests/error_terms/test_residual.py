@@ -66,12 +66,3 @@ def test_it_scripts_identically_and_needs_no_amplitude(generator: torch.Generato
         assert found.isfinite().all()
         scripted = torch.jit.script(network)
         torch.testing.assert_close(scripted(distance, amplitude, ROWS, COLUMNS), found)
-
-
-def test_weights_survive_as_one_vector(generator: torch.Generator) -> None:
-    first = trained(generator)
-    second = ResidualNetwork(ResidualNetworkOptions(bound_mm=15.0), DOMAIN)
-    second.set_weight_vector(first.weight_vector())
-    distance = 1 + 2 * torch.rand(5, 7, generator=generator, dtype=torch.float64)
-    arguments = (distance, 100 * distance, ROWS, COLUMNS)
-    torch.testing.assert_close(first(*arguments), second(*arguments))

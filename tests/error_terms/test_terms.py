@@ -12,14 +12,11 @@ from scipy.interpolate import BSpline
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import (
     ConditionTerm,
-    Domain,
-    Interval,
     SignalTerm,
     Term,
 )
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.splines import second_differences, spline_basis
-from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import unambiguous_range
 
 SIGNAL: list[dict[str, Any]] = [
@@ -186,19 +183,6 @@ def test_circular_error_returns_after_a_quarter_of_the_unambiguous_range(
     torch.testing.assert_close(term(distance, distance), term(distance + period, distance))
     third = term(distance + period / 3, distance)
     assert bool((term(distance, distance) != third).any())
-
-
-def test_a_domain_without_frequency_or_column_is_refused_by_name() -> None:
-    bare = Domain(height=5, width=7, radial_distance=Interval(0.5, 3.0))
-    for kind, name in (
-        ("periodic", "modulation_frequency_hz"),
-        ("incident_light", "amplitude.npy"),
-        ("tensor_spline", "amplitude.npy"),
-        ("room_temperature", "room temperature"),
-    ):
-        options = ErrorModelOptions.from_mapping({"terms": [{"kind": kind}]}, "test")
-        with pytest.raises(CalibrationDataError, match=name):
-            ErrorModel(options, bare)
 
 
 def test_the_whole_model_scripts_identically_with_conditions(generator: torch.Generator) -> None:
