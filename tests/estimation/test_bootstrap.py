@@ -5,7 +5,7 @@ import torch
 from simulated_walls import fitted, simulated_wall
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.moments import MomentObjective, WithPrior
+from tofcorr.estimation.moments import MomentObjective
 from tofcorr.estimation.solvers import minimise
 from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
 from tofcorr.fit.problem import Fit
@@ -48,7 +48,7 @@ def test_a_resample_keeps_the_prior(fit_with_prior: Fit) -> None:
     drawn = weights(fit, 2)
     steps = bootstrap(fit.moments, best, drawn, fit.total_prior)
     for row, step in zip(drawn, steps, strict=True):
-        objective = WithPrior(MomentObjective(fit.moments.weighted(row)), fit.total_prior)
+        objective = MomentObjective(fit.moments.weighted(row), fit.total_prior)
         solved = minimise(objective, best).parameters
         apart = best.moved(step).tool_from_camera - solved.tool_from_camera
         assert float(apart.abs().max()) < 1e-5

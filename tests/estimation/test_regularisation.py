@@ -12,7 +12,7 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.base import Domain, SignalTerm
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, WithPrior
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.regularisation import (
     STRENGTHS,
     penalties_of,
@@ -65,7 +65,7 @@ def test_penalised_fit_is_least_squares_with_the_roughness_as_further_rows(
     moments = moments_of(model, batch)
     prior = smoothness(penalties_of(model), total_weight(moments), zero(moments))
     assert prior is not None
-    objective = WithPrior(MomentObjective(moments), prior)
+    objective = MomentObjective(moments, prior)
     found = minimise(objective, zero(moments)).parameters.coefficients
 
     cosine = -ray_directions(CAMERA)[..., 2].expand_as(batch.radial_distance).reshape(-1)
@@ -103,7 +103,7 @@ def test_strength_means_the_same_for_any_number_of_pixels(generator: torch.Gener
         moments = moments_of(model, batch).weighted(torch.full((NUM_FRAMES,), times).double())
         prior = smoothness(penalties_of(model), total_weight(moments), zero(moments))
         assert prior is not None
-        objective = WithPrior(MomentObjective(moments), prior)
+        objective = MomentObjective(moments, prior)
         found.append(minimise(objective, zero(moments)).parameters)
     torch.testing.assert_close(found[0].coefficients, found[1].coefficients)
 

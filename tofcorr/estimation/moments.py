@@ -239,10 +239,11 @@ class MomentObjective:
 
     Args:
         moments: Moments of the images to fit.
+        prior: A prior that is added; None: there is none.
     """
 
-    def __init__(self, moments: ImageMoments) -> None:
-        self.moments = moments
+    def __init__(self, moments: ImageMoments, prior: "Prior | None" = None) -> None:
+        self.moments, self.prior = moments, prior
         self._slope: tuple[Parameters, Tensor] | None = None
 
     @property
@@ -269,7 +270,8 @@ class MomentObjective:
 
     def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
         """Return the loss, differentiable."""
-        return self.image_losses(parameters).sum()
+        images = self.image_losses(parameters).sum()
+        return images if self.prior is None else images + self.prior.penalty(parameters)
 
     def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
         """Return the change of the loss by a step.
@@ -281,7 +283,8 @@ class MomentObjective:
             with torch.no_grad():
                 self._slope = origin, self._joint @ origin.by_entries().flatten()
         change = _change_of_entries(origin, step).flatten()
-        return change @ (2 * self._slope[1] + self._joint @ change)
+        images = change @ (2 * self._slope[1] + self._joint @ change)
+        return images if self.prior is None else images + self.prior.change(origin, step)
 
     def image_equations(
         self, parameters: Parameters, further: Float[Tensor, "N S F"] | None = None
@@ -307,7 +310,9 @@ class MomentObjective:
         weighted = self._joint @ jacobian
         # Each image's loss by itself has lost fewer digits than a @ Q @ a.
         gradient = parameters.by_entries().flatten() @ weighted
-        return NormalEquations(self.loss(parameters), gradient, jacobian.mT @ weighted)
+        loss = self.image_losses(parameters).sum()
+        images = NormalEquations(loss, gradient, jacobian.mT @ weighted)
+        return images if self.prior is None else images.plus(self.prior.equations(parameters))
 
 
 def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S"]:
@@ -389,37 +394,11 @@ class Prior:
         parts = deviation.square().sum(), deviation @ jacobian, jacobian.T @ jacobian
         return NormalEquations(*(self.variance * part for part in parts))
 
-
-class WithPrior:
-    """An objective with a prior added.
-
-    Args:
-        objective: The images' part.
-        prior: The prior.
-    """
-
-    def __init__(self, objective: Objective, prior: Prior) -> None:
-        self.objective = objective
-        self.prior = prior
-
-    @property
-    def num_residuals(self) -> float:
-        """How many residuals the images' part sums."""
-        return self.objective.num_residuals
-
-    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
-        """Return the loss, differentiable."""
-        penalty = self.prior.deviation(parameters).square().sum()
-        return self.objective.loss(parameters) + self.prior.variance * penalty
+    def penalty(self, parameters: Parameters) -> Float[Tensor, ""]:
+        """Return the prior's part of the loss, differentiable."""
+        return self.variance * self.deviation(parameters).square().sum()
 
     def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Return the change of the loss by a step, differentiable."""
-        before = self.prior.deviation(origin)
-        after = self.prior.deviation(origin.moved(step))
-        penalty = ((after - before) * (after + before)).sum()
-        return self.objective.change(origin, step) + self.prior.variance * penalty
-
-    def normal_equations(self, parameters: Parameters) -> NormalEquations:
-        """Return loss, gradient and Gauss-Newton Hessian of both parts."""
-        images = self.objective.normal_equations(parameters)
-        return images.plus(self.prior.equations(parameters))
+        """Return the change of that part by a step, differentiable."""
+        before, after = (self.deviation(one) for one in (origin, origin.moved(step)))
+        return self.variance * ((after - before) * (after + before)).sum()

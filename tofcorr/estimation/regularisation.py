@@ -20,7 +20,7 @@ from torch import Tensor
 
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.linear import RESOLVED, NormalEquations, solved
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, Prior, WithPrior
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, Prior
 from tofcorr.estimation.solvers import SolverOptions, minimise
 
 STRENGTHS = tuple(10.0**exponent for exponent in range(-10, 1))
@@ -102,11 +102,9 @@ def with_strengths(
     # Linearised, and searched from, the middle of the strengths.
     middle = STRENGTHS[len(STRENGTHS) // 2]
     chosen = [replace(p, strength=middle) if p.strength == "auto" else p for p in penalties]
-    prior = smoothness(chosen, total_weight(moments), start)
-    images = MomentObjective(moments)
-    objective = images if prior is None else WithPrior(images, prior)
+    images = MomentObjective(moments, smoothness(chosen, total_weight(moments), start))
     roughly = SolverOptions(kind="levenberg_marquardt", max_iterations=20, tolerance=1e-3)
-    around = minimise(objective, start, roughly).parameters
+    around = minimise(images, start, roughly).parameters
     equations = images.image_equations(around)
     weights = moments.gram[:, -1, -1]
 

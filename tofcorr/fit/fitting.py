@@ -35,10 +35,8 @@ from tofcorr.estimation.linear import Curvature, solvable
 from tofcorr.estimation.moments import (
     ImageMoments,
     MomentObjective,
-    Objective,
     Parameters,
     Prior,
-    WithPrior,
 )
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.planes import estimate_walls, joint_image_equations
@@ -153,10 +151,7 @@ def _minimum(
     watcher: Watcher | None = None,
 ) -> Solution:
     """Minimise the point-to-plane loss of the moments with the solver that the options name."""
-    objective: Objective = MomentObjective(moments)
-    if prior is not None:
-        objective = WithPrior(objective, prior)
-    return minimise(objective, start, problem.options.solver, watcher)
+    return minimise(MomentObjective(moments, prior), start, problem.options.solver, watcher)
 
 
 def _solved(

@@ -10,7 +10,7 @@ from torch import Tensor
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
-from tofcorr.estimation.moments import MomentObjective, Objective, Parameters, WithPrior
+from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.regularisation import total_weight
 from tofcorr.estimation.robust import student_tail
 from tofcorr.estimation.solvers import SolverOptions, minimise, whitening
@@ -76,13 +76,11 @@ def _p_value(gain: np.ndarray) -> float:
 def _without(core: Core, images: Tensor) -> Core:
     """Fit the core anew without some images, given as a mask (N,)."""
     moments, smooth = core.moments.images(~images), core.smoothness
-    objective: Objective = MomentObjective(moments)
     if smooth is not None:
         share = total_weight(moments) / total_weight(core.moments)
         smooth = replace(smooth, variance=smooth.variance * share)
-        objective = WithPrior(objective, smooth)
     options = SolverOptions(kind="levenberg_marquardt")
-    solution = minimise(objective, core.solution.parameters, options)
+    solution = minimise(MomentObjective(moments, smooth), core.solution.parameters, options)
     return replace(core, moments=moments, solution=solution, smoothness=smooth)
 
 
