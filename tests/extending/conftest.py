@@ -21,7 +21,7 @@ from tofcorr.options import dump_yaml
 # The text in each registry in front of which the line goes.
 END_OF_LIST = {
     "error_terms": ")\n\n\ndef _class",
-    "simulation": ")\n\n\ndef _effect",
+    "simulation": ")\n\n\ndef _classes",
     "importing": '}\n"""The line of each',
     "correction": ")\n\nFORMATS",
     "plausibility": ')\n"""Checks that look at values',

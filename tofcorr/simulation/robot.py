@@ -12,7 +12,7 @@ from tofcorr.conditions import Conditions
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
-from tofcorr.simulation.effects.backlash import sides_of_approach
+from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import (
     CameraMountOptions,

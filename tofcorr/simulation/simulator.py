@@ -24,8 +24,8 @@ from tofcorr.geometry.rays import (
 )
 from tofcorr.options import resolve_options
 from tofcorr.progress import bar
-from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.registry import build_effects
+from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState
 from tofcorr.simulation.options import SensorOptions, SimulatorOptions
 from tofcorr.simulation.robot import draw_plan, draw_slip, hand_eye_guess, tool_twists
@@ -326,7 +326,7 @@ def twin_frames(
         recording.camera, options.sensor, options.scene, build_effects(options.effects)
     )
     table = recording.frames
-    poses = torch.from_numpy(table.world_from_tool)
+    poses, nominal = torch.from_numpy(table.world_from_tool), options.sensor.modulation_frequency_hz
     twists = tool_twists(torch.from_numpy(table.timestamp), poses)
     approach = sides_of_approach(poses)
     reached = _reached_poses(options, recording, generator)
@@ -338,7 +338,7 @@ def twin_frames(
         state = FrameState(
             index=index,
             camera=recording.camera,
-            modulation_frequency=modulation_frequency(options, recording),
+            modulation_frequency=recording.modulation_frequency or nominal,
             electrons_per_count=options.sensor.readout.electrons_per_count,
             conditions=Conditions(**row.by_name()),
             target=row.target,
@@ -365,11 +365,6 @@ def default_hand_eye(options: SimulatorOptions, recording: Recording) -> Tensor:
     if recording.moves:
         return options.hand_eye.tool_from_camera()
     return torch.eye(4, dtype=torch.float64)
-
-
-def modulation_frequency(options: SimulatorOptions, recording: Recording) -> float:
-    """Return the modulation frequency of the recording in Hz, or that of the options if unknown."""
-    return recording.modulation_frequency or options.sensor.modulation_frequency_hz
 
 
 def _reached_poses(

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import torch
 
-from tofcorr.simulation.effects.backlash import BacklashEffect, sides_of_approach
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.robot_kinematics import BacklashEffect, sides_of_approach
 
 
 def test_an_arm_that_comes_from_the_other_side_stops_farther_by_the_play(

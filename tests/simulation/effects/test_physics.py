@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from tofcorr.geometry.rays import distance_along_rays
 from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
 from tofcorr.simulation.effects.base import CatalogueEffect
-from tofcorr.simulation.effects.gloss import GlossEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.lens import true_rays
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
 from tofcorr.simulation.effects.motion import MotionEffect, radial_speed
 from tofcorr.simulation.effects.robot_kinematics import RobotKinematicsEffect
+from tofcorr.simulation.effects.surface import GlossEffect
 from tofcorr.simulation.effects.target_registration import TargetRegistrationEffect
 from tofcorr.simulation.effects.temperature import (
     RoomTemperatureEffect,

@@ -18,9 +18,9 @@ from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
-from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 from tofcorr.simulation.effects.numerics import by_frame
+from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
 from tofcorr.simulation.scene import planes_from_world
 
 
