@@ -5,8 +5,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.gains import flipped_gains
-from tofcorr.diagnosis.sums.linear_system import Layout, Sums
-from tofcorr.diagnosis.sums.resampling import draw_folds, draw_signs
+from tofcorr.diagnosis.sums.linear_system import Layout, Sums, draw_folds, draw_signs
 
 NUM_UNITS, NUM_VALUES = 12, 5
 SIGMA = 0.3

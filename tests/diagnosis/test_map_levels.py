@@ -10,8 +10,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     compare_effects,
     left_out_residual,
 )
-from tofcorr.diagnosis.sums.gains import HeldOutSquares
-from tofcorr.diagnosis.sums.map_gain import FittedMap
+from tofcorr.diagnosis.sums.gains import FittedMap, HeldOutSquares
 from tofcorr.diagnosis.sums.study import (
     Study,
     with_poses_reestimated,

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from tofcorr.diagnosis.sums.gains import HeldOutSquares
-from tofcorr.diagnosis.sums.linear_system import BASE, pose_sums
-from tofcorr.diagnosis.sums.resampling import draw_folds
+from tofcorr.diagnosis.sums.linear_system import BASE, draw_folds, pose_sums
 from tofcorr.diagnosis.sums.study import Study, with_residual
 from tofcorr.pixels.dataset import thread_number
 

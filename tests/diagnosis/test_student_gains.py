@@ -12,8 +12,14 @@ from tofcorr.diagnosis.sums.gains import (
     flipped_gains,
     student_gains,
 )
-from tofcorr.diagnosis.sums.linear_system import NUM_POSE, Layout, PoseSums, Sums
-from tofcorr.diagnosis.sums.resampling import draw_folds, draw_signs
+from tofcorr.diagnosis.sums.linear_system import (
+    NUM_POSE,
+    Layout,
+    PoseSums,
+    Sums,
+    draw_folds,
+    draw_signs,
+)
 
 POSES, VALUES, DRAWS = 10, 6, 99
 

@@ -14,9 +14,8 @@ from tofcorr.diagnosis.findings.effect_comparison import compare_effects
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.linear_system import tile_sums
+from tofcorr.diagnosis.sums.linear_system import cut_into_tiles, tile_sums
 from tofcorr.diagnosis.sums.observations import Observations, observe
-from tofcorr.diagnosis.sums.resampling import cut_into_tiles
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects.saturation import light_of
 

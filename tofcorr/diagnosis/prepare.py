@@ -12,7 +12,7 @@ from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import SimulatorError, filtered_inputs, fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, with_numbered_walls
-from tofcorr.diagnosis.sums.map_gain import FittedMap
+from tofcorr.diagnosis.sums.gains import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, observe
 from tofcorr.diagnosis.sums.study import Study, build_study, without_map
 from tofcorr.error_terms.pixel_terms import FixedPatternOptions

@@ -24,9 +24,14 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.gains import HeldOutSquares, NullScores, flipped_gains, student_gains
+from tofcorr.diagnosis.sums.gains import (
+    FittedMap,
+    HeldOutSquares,
+    NullScores,
+    flipped_gains,
+    student_gains,
+)
 from tofcorr.diagnosis.sums.linear_system import NUM_POSE, Sums, tile_sums
-from tofcorr.diagnosis.sums.map_gain import FittedMap
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study

@@ -20,8 +20,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     unexplained_squares,
     vary_alike,
 )
-from tofcorr.diagnosis.sums.gains import HeldOutSquares
-from tofcorr.diagnosis.sums.map_gain import FittedMap
+from tofcorr.diagnosis.sums.gains import FittedMap, HeldOutSquares
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import (
     Study,

@@ -14,7 +14,7 @@ from tofcorr.diagnosis.findings.absorption import fitted_coefficients
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.base_model import BaseModel
-from tofcorr.diagnosis.sums.map_gain import FittedMap
+from tofcorr.diagnosis.sums.gains import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.base import SignalTerm

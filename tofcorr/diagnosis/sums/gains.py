@@ -11,8 +11,7 @@ fold: for columns m of the model and e of the effect, and the equations N theta 
 
 .. math:: S = N_{ee} - N_{em} N_{mm}^{-1} N_{me}, \quad s = b_e - N_{em} N_{mm}^{-1} b_m .
 
-The
-others cannot predict a pose that alone determines a coefficient, such as the first one of a
+The others cannot predict a pose that alone determines a coefficient, such as the first one of a
 warm-up. Without the uncertainty, its error would outweigh the gain of all other poses. The
 log-determinant is omitted, because flips do not change it.
 
@@ -30,16 +29,30 @@ distribution of the quotient is drawn: scores of every pose are normal with the 
 the generalised sums imply (`NullScores`), and run through the same fits. Of that model only the
 shape matters, as in a t-test, because the quotient has no scale (Bell and McCaffrey 2002; Cameron
 and Miller 2015, "A practitioner's guide to cluster-robust inference", on few clusters).
+
+An effect that has one value for each cell of the image (`FittedMap`) is no column. With the
+residual r, less the offset and tilts of its pose, and the weights w of the pixels of a cell c, the
+value is
+
+.. math:: v_c = \frac{\sum w r}{\sum w + s^{-2}} ,
+
+with the prior standard deviation s, which is no less than what poses agree in. The weights are
+those of the pixels' own noise. The dispersion says how much more sums over many pixels vary than
+independent noise would make them, where neighbours share noise or show a smooth pattern; a cell is
+no such sum.
 """
 
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import product
 
 import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.linear_system import LEFT_OUT, NUM_POSE, PoseSums, Sums
 from tofcorr.diagnosis.sums.observations import TINY
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.simulation.effects import MapEffect
 
 # Added to a matrix before it is factored, as a share of its diagonal: rounding of sums of products
 # leaves less. And to the covariance of a pose's scores, which columns that one pose cannot
@@ -270,3 +283,128 @@ def _factor(covariance: Tensor) -> Tensor:
         values, vectors = torch.linalg.eigh(correlation)
         factor = vectors * values.clamp(min=0).sqrt()[:, None, :]
     return factor.float() * size.float()[:, :, None]
+
+
+class FittedMap:
+    """A map fitted to what a model leaves.
+
+    Args:
+        study: The recording.
+        effect: Which map.
+        residual: Of the model so far, shape (M,), metres.
+        prior_sd: Prior standard deviation of the values, metres; None: what poses agree in.
+        least_sd: What is taken at least then, metres: the size of fixed patterns.
+
+    Attributes:
+        prior_sd: The one that was taken, metres.
+    """
+
+    def __init__(
+        self,
+        study: Study,
+        effect: MapEffect,
+        residual: Tensor,
+        prior_sd: float | None = None,
+        least_sd: float = 0.003,
+    ) -> None:
+        self._study, self._effect = study, effect
+        # Of large images few cells hold a chosen pixel.
+        self._used, self._cells = effect.cells_of(study.inputs).unique(return_inverse=True)
+        self._observed = _without_pose(study, residual)
+        self._sums = self._per_pose(self._cells, study.fit.weight * self._observed)
+        self.prior_sd = max(self._agreed(), least_sd) if prior_sd is None else prior_sd
+
+    def _per_pose(self, cells: Tensor, values: Tensor) -> Tensor:
+        """Return the sum of values (M,) in each of some cells (M, C) and pose, (U, cells)."""
+        sums = torch.zeros(self._study.sums.num_units, len(self._used), dtype=torch.float64)
+        for group in cells.unbind(1):
+            sums.index_put_((self._study.unit_of_pixel, group), values, accumulate=True)
+        return sums
+
+    def _agreed(self) -> float:
+        """Return the root mean square of what poses agree in, cell by cell, metres.
+
+        The noise of two poses is independent, so that the products of different poses estimate it.
+        """
+        weight, square = self._study.fit.weight, 0.0
+        for group in self._cells.split(1, dim=1):
+            own, seen = (self._per_pose(group, x) for x in (weight * self._observed, weight))
+            products, pairs = (float((x.sum(0) ** 2 - (x**2).sum(0)).sum()) for x in (own, seen))
+            if pairs > 0:
+                square = max(square, products / pairs)
+        return square**0.5
+
+    @cached_property
+    def _systems(self) -> Tensor:
+        """Each fold's normal matrix, (folds, cells, cells), or its diagonal (folds, cells).
+
+        Where a pixel lies in one cell only, the matrix is diagonal.
+        """
+        size, weight = [len(self._used)] * self._cells.shape[1], self._study.fit.weight
+        systems = torch.zeros(len(self._study.folds), *size, dtype=torch.float64)
+        for places in product(self._cells.unbind(1), repeat=len(size)):
+            systems.index_put_((self._fold, *places), weight, accumulate=True)
+        return systems
+
+    @property
+    def _fold(self) -> Tensor:
+        """The fold that holds out each pixel, shape (M,)."""
+        return self._study.folds.argmax(0)[self._study.unit_of_pixel]
+
+    def _solved(self, system: Tensor, right: Tensor) -> Tensor:
+        """Return the values of right sides (cells, R)."""
+        prior = self.prior_sd**-2
+        if system.ndim == 1:
+            return right / (system + prior)[:, None]
+        return torch.linalg.solve(system + prior * torch.eye(len(system)).double(), right)
+
+    def _without_folds(self, sums: Tensor) -> list[Tensor]:
+        """Return what every pose adds to the map without each fold, shape (cells, U) each."""
+        systems, kept = self._systems, 1 - self._study.folds
+        whole = systems.sum(0)
+        pairs = zip(systems, kept, strict=True)
+        return [self._solved(whole - own, (sums * inside[:, None]).T) for own, inside in pairs]
+
+    def whole(self) -> Tensor:
+        """Return the map's values estimated from all poses, shape (cells,), metres."""
+        found = self._solved(self._systems.sum(0), self._sums.sum(0)[:, None])[:, 0]
+        every = torch.zeros(self._effect.num_cells(self._effect.shape), dtype=torch.float64)
+        return every.index_copy(0, self._used, found)
+
+    @cached_property
+    def values(self) -> Tensor:
+        """The map's value in every pixel, estimated without the pixel's fold, (M,), metres."""
+        of_folds = torch.stack([own.sum(1) for own in self._without_folds(self._sums)])
+        return of_folds[self._fold[:, None], self._cells].sum(-1)
+
+    def gain(self) -> Tensor:
+        """Return the fall of chi-squared of each held-out pose, shape (U,)."""
+        gain = self._study.weight * (2 * self._observed * self.values - self.values**2)
+        zeros = torch.zeros(self._study.sums.num_units, dtype=torch.float64)
+        return zeros.index_add(0, self._study.unit_of_pixel, gain)
+
+    def null(self, left_out: Tensor) -> Tensor:
+        """Return the total gain under every sign flip, shape (B,).
+
+        The gain is a quadratic form of the signs, so that one matrix (U, U) serves all flips.
+
+        Args:
+            left_out: The residual with every pose left out of its own fit, shape (M,), metres.
+        """
+        study = self._study
+        # What the map explains would widen the null distribution of a strong one.
+        unexplained = _without_pose(study, left_out) - self.values
+        sums = self._per_pose(self._cells, study.fit.weight * unexplained)
+        form = torch.zeros(len(sums), len(sums), dtype=torch.float64)
+        for fold, values in enumerate(self._without_folds(sums)):
+            system = self._systems[fold]
+            curved = system[:, None] * values if system.ndim == 1 else system @ values
+            form.addmm_(values.T, 2 * (sums * study.folds[fold][:, None]).T - curved)
+        return ((study.signs @ form) * study.signs).sum(1) / study.sums.dispersion
+
+
+def _without_pose(study: Study, residual: Tensor) -> Tensor:
+    """Subtract the most probable offset and tilts of each pose, shape (M,)."""
+    inner, score = study.pose_equations(residual)
+    guess = torch.linalg.solve(inner + torch.diag(study.sums.pose_sd**-2), score)
+    return residual - study.pose_surface(guess)

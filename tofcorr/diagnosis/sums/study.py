@@ -19,11 +19,14 @@ from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.linear_system import (
     LinearSystem,
     PoseSums,
+    Tiles,
+    cut_into_tiles,
+    draw_folds,
+    draw_signs,
     linear_system,
     tile_sums,
 )
 from tofcorr.diagnosis.sums.observations import TINY, Observations
-from tofcorr.diagnosis.sums.resampling import Tiles, cut_into_tiles, draw_folds, draw_signs
 from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
