@@ -78,12 +78,13 @@ class HeldOutSquares:
 
     def _squares(self, names: Sequence[str]) -> Tensor:
         """Return the squares of each held-out unit, by the model of some effects, (U,)."""
-        theta = self._fitted(names, self._folds @ self._sums.of(names)[1])[1]
-        return self._sums.squares_at(names, theta[self._folds.argmax(0)])
+        gram, score, prior = self._sums.of(names)
+        theta = self._fitted(gram, prior, self._folds @ score)[1][self._folds.argmax(0)]
+        curved = (gram @ theta[:, :, None])[..., 0]
+        return self._sums.square - (theta * (2 * score - curved)).sum(1) / self._sums.scale
 
-    def _fitted(self, names: Sequence[str], right: Tensor) -> tuple[Tensor, Tensor]:
+    def _fitted(self, gram: Tensor, prior: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         """Return A over each fold (folds, K, K), and the others' fit to scores (folds, K, ...)."""
-        gram, _, prior = self._sums.of(names)
         own = torch.tensordot(self._folds, gram, dims=1)
         return own, torch.linalg.solve(own.sum(0) + prior - own, right.sum(0) - right)
 
@@ -101,8 +102,9 @@ class HeldOutSquares:
 
         def explained(names: Sequence[str]) -> Tensor:
             """Return the fall of the sum of squares by a whole model, (B,)."""
+            gram, _, prior = self._sums.of(names)
             right = drawn[:, self._sums.layout.of(names)].double()
-            own, theta = self._fitted(names, right)
+            own, theta = self._fitted(gram, prior, right)
             return (theta * (2 * right - own @ theta)).sum((0, 1)) / self._sums.scale
 
         model = explained(self._chosen)
@@ -127,13 +129,13 @@ def flipped_gains(
     """
     gains = {}
     for name in names:
-        larger = [*chosen, name]
-        gram, score, _ = sums.of(larger)
+        larger, size = [*chosen, name], len(range(*sums.layout.effects[name]))
+        gram, score, prior = sums.of(larger)
         left = score - (gram @ sums.left_out_solutions(larger)[:, :, None])[..., 0]
         # A flip and a fold are both sums over units.
         flipped = (left * folds[:, :, None]).mT @ signs.T
         right = torch.cat([(folds @ score)[:, :, None], flipped], dim=2)
-        gains[name] = _fall(sums, larger, folds, right)
+        gains[name] = _fall(gram, prior, size, folds, right)
     return gains
 
 
@@ -157,59 +159,63 @@ def student_gains(
     """
     gains = {}
     for name in names:
-        larger = [*chosen, name]
-        scores = sums.of(larger)[1][:, :, None]
-        if null is not None:
-            drawn = null.scores[:, sums.layout.of(larger)].double()
-            scores = torch.cat([scores, drawn], dim=2)
-        fall = _fall(sums, larger, folds, torch.tensordot(folds, scores, dims=1))
-        noise = _gain_noise(sums, larger, scores)
+        larger, size = [*chosen, name], len(range(*sums.layout.effects[name]))
+        gram, score, prior = sums.of(larger)
+        if null is None:
+            gains[name] = _fall(gram, prior, size, folds, (folds @ score)[:, :, None])
+            continue
+        drawn = null.scores[:, sums.layout.of(larger)].double()
+        scores = torch.cat([score[:, :, None], drawn], dim=2)
+        fall = _fall(gram, prior, size, folds, torch.tensordot(folds, scores, dims=1))
+        noise = _gain_noise(gram, prior, size, scores)
         gains[name] = fall / noise * noise[0]
     return gains
 
 
-def _fall(sums: Sums, larger: Sequence[str], folds: Tensor, right: Tensor) -> Tensor:
+def _fall(gram: Tensor, prior: Tensor, size: int, folds: Tensor, right: Tensor) -> Tensor:
     """Return the held-out falls of chi-squared by the last effect of a model, (R,).
 
     Args:
-        sums: Generalised sums of every unit.
-        larger: Effects of the model, the added one last.
+        gram: A of the model's columns, those of the effect last, shape (U, K, K).
+        prior: Prior precision, shape (K, K).
+        size: Number of columns of the effect, E.
         folds: Which units each fold holds out, shape (folds, U).
-        right: Scores of the model's columns over each fold, shape (folds, K, R).
+        right: Scores of the columns over each fold, shape (folds, K, R).
     """
-    gram, _, prior = sums.of(larger)
     own, whole = torch.tensordot(folds, gram, dims=1), gram.sum(0)
     normal = torch.cat([whole - own, whole[None]]) + prior
     total = right.sum(0, keepdim=True)
-    inner = _reduced(sums, larger, normal, torch.cat([total - right, total]))
-    squares = inner.square().sum(1)
+    squares = _reduced(normal, torch.cat([total - right, total]), size).square().sum(1)
     return (squares[-1] - squares[:-1]).sum(0)
 
 
-def _reduced(sums: Sums, larger: Sequence[str], normal: Tensor, right: Tensor) -> Tensor:
-    """Return R s, with R' R = S^-1, from equations N (..., K, K) and right sides (..., K, B).
+def _reduced(normal: Tensor, right: Tensor, size: int) -> Tensor:
+    """Return R s of the last columns, with R' R = S^-1, shape (..., E, B).
 
     With the factor N = L L', they are the last rows of L^-1 b.
+
+    Args:
+        normal: N, shape (..., K, K).
+        right: Scores b, shape (..., K, B).
+        size: How many columns, E.
     """
-    low, high = sums.layout.effects[larger[-1]]
     ridge = _ROUNDING * normal.diagonal(dim1=-2, dim2=-1) + TINY
     factor = torch.linalg.cholesky(normal + ridge.diag_embed())
-    return torch.linalg.solve_triangular(factor, right, upper=False)[..., low - high :, :]
+    return torch.linalg.solve_triangular(factor, right, upper=False)[..., -size:, :]
 
 
-def _gain_noise(sums: Sums, larger: Sequence[str], scores: Tensor) -> Tensor:
+def _gain_noise(gram: Tensor, prior: Tensor, size: int, scores: Tensor) -> Tensor:
     """Return Q of the last effect of a model, for scores of every pose (U, K, R), shape (R,).
 
-    The coefficients of the larger model are those of `Sums.left_out_solutions`.
+    The coefficients of the larger model are those of `Sums.left_out_solutions`; the other arguments
+    are those of `_fall`.
     """
-    gram, _, prior = sums.of(larger)
     whole = gram.sum(0) + prior
-    beside = _reduced(sums, larger, whole, torch.eye(len(whole), dtype=whole.dtype))
-    lever = (beside @ gram).mT
+    beside = _reduced(whole, torch.eye(len(whole), dtype=whole.dtype), size)
     # What gives R l from the scores of the pose itself, and from those of all poses together.
-    without = [torch.linalg.solve(whole - t * gram, lever).mT for t in LEFT_OUT]
-    of_pose = beside + sum(t * part for t, part in zip(LEFT_OUT, without, strict=True)) / 3
-    of_all = torch.stack(without).mean(0)
+    shares = whole.new_tensor(LEFT_OUT)[:, None, None, None]
+    without = torch.linalg.solve(whole - shares * gram, (beside @ gram).mT[None]).mT
+    of_pose, of_all = beside + (shares * without).mean(0), without.mean(0)
     left = of_pose @ scores - of_all @ scores.sum(0)
     # An effect that the model absorbs entirely has none, in units of chi-squared.
     return left.square().sum((0, 1)).clamp(min=1e-9)

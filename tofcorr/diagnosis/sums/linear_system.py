@@ -149,11 +149,17 @@ class Sums:
         """Return the sum of squares of each unit, predicted by all others, shape (U,), m^2."""
         return self.squares_at(names, self.left_out_coefficients(names))
 
-    def left_out_coefficients(self, names: Sequence[str], share: float = 1.0) -> Tensor:
-        """Return for every unit the coefficients of all without it, or a share of it, (U, K)."""
+    def left_out_coefficients(self, names: Sequence[str], *shares: float) -> Tensor:
+        """Return for every unit the coefficients that all others give, shape (U, K).
+
+        Args:
+            names: The effects.
+            shares: What is left out of the unit, in one fit each; their mean is returned.
+        """
         gram, score, prior = self.of(names)
-        normal, right = gram.sum(0) + prior - share * gram, score.sum(0) - share * score
-        return torch.linalg.solve(normal, right)
+        whole, right = gram.sum(0) + prior, score.sum(0)
+        fits = [torch.linalg.solve(whole - t * gram, right - t * score) for t in shares or (1.0,)]
+        return torch.stack(fits).mean(0)
 
     def left_out_solutions(self, names: Sequence[str]) -> Tensor:
         r"""Return for every unit the coefficients that give its residual the variance of its error.
@@ -172,7 +178,7 @@ class Sums:
         Returns:
             Shape (U, K).
         """
-        return torch.stack([self.left_out_coefficients(names, t) for t in LEFT_OUT]).mean(0)
+        return self.left_out_coefficients(names, *LEFT_OUT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -411,7 +417,7 @@ def pose_sums(
     parts = [*columns.values(), pose, residual[:, None]]
     unit = observations.unit[observations.frame]
     pixels = unit.argsort(stable=True).split(torch.bincount(unit).tolist())
-    weighted, plain, count = _products(parts, fit, pixels)
+    weighted, plain, count = _products(parts, (fit.weight, fit.share), pixels)
     return PoseSums(
         weighted=weighted,
         plain=plain,
@@ -424,7 +430,7 @@ def pose_sums(
 
 
 def _products(
-    parts: Sequence[Tensor], fit: BaseFit, pixels: Sequence[Tensor]
+    parts: Sequence[Tensor], weights: tuple[Tensor, Tensor], pixels: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the products of columns (M, K) over the pixels of each unit, with both weights.
 
@@ -434,11 +440,10 @@ def _products(
 
     def of_unit(own: Tensor) -> tuple[Tensor, ...]:
         everything = torch.cat([part[own] for part in parts], dim=1)
-        weights = fit.weight[own], fit.share[own]
         # NumPy sees a matrix times itself, and computes half of the products: that takes half of
         # the time of torch's.
-        roots = [(everything * weight[:, None].sqrt()).numpy() for weight in weights]
-        return *(torch.from_numpy(root.T @ root) for root in roots), weights[1].sum()
+        roots = [(everything * weight[own, None].sqrt()).numpy() for weight in weights]
+        return *(torch.from_numpy(root.T @ root) for root in roots), weights[1][own].sum()
 
     weighted, plain, count = zip(*in_threads(of_unit, pixels), strict=True)
     return torch.stack(weighted), torch.stack(plain), torch.stack(count)
@@ -547,7 +552,11 @@ def tile_sums(system: LinearSystem, names: Sequence[str], tiles: Tiles, fit: Bas
     """
     whole = system.sums.of(names)
     parts = [*system.of(names), system.pose, system.residual[:, None]]
-    weighted, plain, count = _products(parts, fit, tiles.pixels.split(tiles.counts))
+    # Tiles are many and small: their columns are joined once.
+    joined = [torch.cat([part[tiles.pixels] for part in parts], dim=1)]
+    weights = fit.weight[tiles.pixels], fit.share[tiles.pixels]
+    places = torch.arange(len(tiles.pixels)).split(tiles.counts)
+    weighted, plain, count = _products(joined, weights, places)
     weighted = _without_pose(weighted, tiles.pose[len(tiles.whole) :])
     return replace(
         whole,
