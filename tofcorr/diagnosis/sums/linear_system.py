@@ -28,7 +28,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
@@ -430,22 +430,23 @@ def pose_sums(
 
 
 def _products(
-    parts: Sequence[Tensor], weights: tuple[Tensor, Tensor], pixels: Sequence[Tensor]
+    parts: Sequence[Tensor], weights: tuple[Tensor, Tensor], units: Sequence[Tensor | slice]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the products of columns (M, K) over the pixels of each unit, with both weights.
 
     Returns:
         Weighted and plain sums, shape (U, S, S), and the sums of the plain weights, shape (U,).
     """
+    roots = [weight.sqrt()[:, None] for weight in weights]
 
-    def of_unit(own: Tensor) -> tuple[Tensor, ...]:
+    def of_unit(own: Tensor | slice) -> tuple[Tensor, ...]:
         everything = torch.cat([part[own] for part in parts], dim=1)
         # NumPy sees a matrix times itself, and computes half of the products: that takes half of
         # the time of torch's.
-        roots = [(everything * weight[own, None].sqrt()).numpy() for weight in weights]
-        return *(torch.from_numpy(root.T @ root) for root in roots), weights[1][own].sum()
+        scaled = [(everything * root[own]).numpy() for root in roots]
+        return *(torch.from_numpy(one.T @ one) for one in scaled), weights[1][own].sum()
 
-    weighted, plain, count = zip(*in_threads(of_unit, pixels), strict=True)
+    weighted, plain, count = zip(*in_threads(of_unit, units), strict=True)
     return torch.stack(weighted), torch.stack(plain), torch.stack(count)
 
 
@@ -555,7 +556,7 @@ def tile_sums(system: LinearSystem, names: Sequence[str], tiles: Tiles, fit: Bas
     # Tiles are many and small: their columns are joined once.
     joined = [torch.cat([part[tiles.pixels] for part in parts], dim=1)]
     weights = fit.weight[tiles.pixels], fit.share[tiles.pixels]
-    places = torch.arange(len(tiles.pixels)).split(tiles.counts)
+    places = [slice(low, high) for low, high in pairwise(accumulate([0, *tiles.counts]))]
     weighted, plain, count = _products(joined, weights, places)
     weighted = _without_pose(weighted, tiles.pose[len(tiles.whole) :])
     return replace(
