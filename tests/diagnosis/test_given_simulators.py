@@ -101,8 +101,8 @@ def test_rendered_frames_of_the_built_in_simulator_are_the_simulator_itself(
     assert torch.allclose(one.study.fit.residual, other.study.fit.residual, atol=1e-4)
 
 
-def _error(simulated: tuple[SimulatorError, list[str]]) -> torch.Tensor:
-    return simulated[0].error
+def _error(simulated: SimulatorError) -> torch.Tensor:
+    return simulated.error
 
 
 def test_order_and_number_of_renders_do_not_matter(
@@ -121,7 +121,7 @@ def test_order_and_number_of_renders_do_not_matter(
     plain = RenderedSimulator(once).simulate(observations, OPTIONS)
     again = RenderedSimulator(twice).simulate(observations, OPTIONS)
     assert torch.allclose(_error(plain), _error(again), atol=ROUNDING, equal_nan=True)
-    assert not plain[1]
+    assert not plain.limits
 
 
 def test_a_function_gives_what_its_frames_give(
@@ -156,7 +156,7 @@ def test_the_mean_of_several_renders_has_less_noise(
     order = np.tile(np.arange(count), times)
     written = _written(tmp_path / "sim", nothing_missing, options, noisy, order)
     simulated = RenderedSimulator(written).simulate(observations, OPTIONS)
-    sigma = float(simulated[0].sigma.square().mean().sqrt())
+    sigma = float(simulated.sigma.square().mean().sqrt())
     assert sigma == pytest.approx(sd / times**0.5, rel=0.05)
 
 

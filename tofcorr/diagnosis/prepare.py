@@ -95,7 +95,8 @@ def _both_known(
     With fewer than a tenth of the pixels the comparison would be about another recording; a
     thousandth without a distance is worth a warning.
     """
-    error, warnings = simulator.simulate(observations, options)
+    error = simulator.simulate(observations, options)
+    limits = list(error.limits)
     known = error.error.isfinite()
     share = float(known.double().mean())
     frames = len(torch.unique(observations.frame[known]))
@@ -106,11 +107,11 @@ def _both_known(
             "a range of distances and amplitudes that covers it."
         )
     if 1000 * (1 - share) >= 1:
-        warnings.append(
+        limits.append(
             f"The simulator has no distance for {100 * (1 - share):.1f} % of the recording's "
             "pixels; they are left out."
         )
-    return observations.at(known), error.at(known), warnings
+    return observations.at(known), error.at(known), limits
 
 
 def _with_base_pattern(study: Study) -> Study:

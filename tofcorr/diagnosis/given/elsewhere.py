@@ -51,7 +51,7 @@ def true_distance(frames: Observations) -> Tensor:
 
 def simulated_elsewhere(
     frames: Observations, real: Observations, options: DiagnosisOptions
-) -> tuple[SimulatorError, list[str]]:
+) -> SimulatorError:
     """Fit the simulator's error to its own frames, and predict it for a recording's pixels.
 
     Args:
@@ -111,14 +111,14 @@ def simulated_elsewhere(
         f"frames, to {1000 * misfit:.1f} mm on held-out ones, and carried to the recording's "
         "pixels."
     )
-    carried = SimulatorError(
+    return SimulatorError(
         error=torch.where(outside, torch.nan, error),
         sigma=torch.full_like(error, misfit),
         tool_from_camera=pose,
         uncertain=uncertain,
         carried=True,
+        limits=(first, *warnings),
     )
-    return carried, [first, *warnings]
 
 
 def _amplitude_scale(

@@ -106,9 +106,7 @@ class RenderedSimulator(GivenSimulator):
         del recording
         return self.recording
 
-    def simulate(
-        self, observations: Observations, options: DiagnosisOptions
-    ) -> tuple[SimulatorError, list[str]]:
+    def simulate(self, observations: Observations, options: DiagnosisOptions) -> SimulatorError:
         """Compare pixel by pixel at the same poses; at others, through the covariates."""
         refuse_other_camera(observations.recording, self.recording)
         frames = observe(self.recording, options.most_pixels)
@@ -125,12 +123,14 @@ class RenderedSimulator(GivenSimulator):
         if missing > len(matches) / 2:
             return simulated_elsewhere(frames, observations, options)
         error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
-        warning = (
+        known = SimulatorError.exact(error, pose, sigma)
+        if not missing:
+            return known
+        limit = (
             f"{self.recording.path}: {missing} of {len(matches)} recorded frames were not "
             "rendered (no pose within 1 mm and 1 mrad); they are left out."
         )
-        known = SimulatorError.exact(error, pose, sigma)
-        return known, [warning] if missing else []
+        return replace(known, limits=(limit,))
 
 
 def _pixel_by_pixel(
@@ -187,9 +187,7 @@ class PythonSimulator(GivenSimulator):
             self._rendered = self.rendered(recording)
         return self._rendered.recording
 
-    def simulate(
-        self, observations: Observations, options: DiagnosisOptions
-    ) -> tuple[SimulatorError, list[str]]:
+    def simulate(self, observations: Observations, options: DiagnosisOptions) -> SimulatorError:
         """Call the function, and compare its frames pixel by pixel."""
         self._rendered = self.rendered(observations.recording)
         with _refused_by_name(self._rendered.recording.path):

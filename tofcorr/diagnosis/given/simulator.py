@@ -19,14 +19,13 @@ class GivenSimulator(ABC):
 
     Class attributes:
         kind: What `diagnosis.json` calls it.
+
+    Attributes:
+        options: Of the built-in simulator; None where another one rendered frames.
     """
 
     kind: ClassVar[SimulatorKind]
-
-    @property
-    def options(self) -> SimulatorOptions | None:
-        """Options of the built-in simulator; None where another one rendered frames."""
-        return None
+    options: SimulatorOptions | None = None
 
     def rendered_frames(self, recording: Recording) -> Recording | None:
         """Return the frames that another simulator rendered; None for the built-in one.
@@ -38,13 +37,8 @@ class GivenSimulator(ABC):
         return None
 
     @abstractmethod
-    def simulate(
-        self, observations: Observations, options: DiagnosisOptions
-    ) -> tuple[SimulatorError, list[str]]:
+    def simulate(self, observations: Observations, options: DiagnosisOptions) -> SimulatorError:
         """Return the error that the simulator makes in the chosen pixels of a recording.
-
-        Returns:
-            The error, and what limits the comparison, a sentence each.
 
         Raises:
             CalibrationDataError: The simulator cannot be compared with the recording.

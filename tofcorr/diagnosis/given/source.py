@@ -27,22 +27,15 @@ class BuiltInSimulator(GivenSimulator):
     kind = "given"
 
     def __init__(self, options: SimulatorOptions) -> None:
-        self._options = options
+        self.options = options
 
-    @property
-    def options(self) -> SimulatorOptions:
-        """What is run."""
-        return self._options
-
-    def simulate(
-        self, observations: Observations, options: DiagnosisOptions
-    ) -> tuple[SimulatorError, list[str]]:
+    def simulate(self, observations: Observations, options: DiagnosisOptions) -> SimulatorError:
         """Run the simulator at the recording's poses."""
         del options
-        pose = default_hand_eye(self._options, observations.recording)
-        distance = twin_distance(observations, self._options, pose)
-        error = distance - predicted_distance(observations, pose)
-        return SimulatorError.exact(error, pose), []
+        assert self.options is not None
+        pose = default_hand_eye(self.options, observations.recording)
+        distance = twin_distance(observations, self.options, pose)
+        return SimulatorError.exact(distance - predicted_distance(observations, pose), pose)
 
 
 Simulator = (

@@ -49,6 +49,7 @@ class SimulatorError:
             seen at the recording's own poses.
         carried: Whether it was fitted at other poses and carried to these, so that the form of the
             fit matters.
+        limits: What limits the comparison with it, a sentence each.
     """
 
     error: Tensor
@@ -56,6 +57,7 @@ class SimulatorError:
     tool_from_camera: Tensor
     uncertain: Tensor
     carried: bool = False
+    limits: tuple[str, ...] = ()
 
     @classmethod
     def exact(cls, error: Tensor, pose: Tensor, sigma: Tensor | None = None) -> "SimulatorError":
