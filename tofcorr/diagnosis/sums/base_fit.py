@@ -9,6 +9,7 @@ they look at images without it.
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -172,9 +173,8 @@ def fit_base(
     """
     known = torch.zeros_like(observations.measured) if simulator is None else simulator.error
     few = slice(None, None, max(1, len(known) // _COARSE_PIXELS))
-    recording, own = observations.recording, torch.eye(4, dtype=torch.float64)
-    if recording.moves:
-        own = torch.from_numpy(recording.tool_from_camera)
+    recording = observations.recording
+    own = torch.from_numpy(recording.tool_from_camera if recording.moves else np.eye(4))
     guesses = [own] if simulator is None else [simulator.tool_from_camera, own]
     coarse, start = _best_start(model.on(observations.at(few)), known[few], guesses)
     model = model.on(with_planes(observations, coarse.observations.facts))
@@ -278,8 +278,7 @@ def _descend(
         distance, columns = model.linearised(pose)
         usable = (distance > 0) & distance.isfinite()
         response = torch.where(usable, target - distance, 0.0)
-        if not bool(usable.all()):
-            columns = torch.where(usable[:, None], columns, 0.0)
+        columns = torch.where(usable[:, None], columns, 0.0)
         now, scale, hold = weight, 1.0, 1.0
         if now is None:
             residual = (response - columns[:, count:] @ coefficients).abs()

@@ -72,12 +72,9 @@ class Layout:
 
     def only(self, names: Sequence[str]) -> "Layout":
         """Return the layout of the columns `of(names)` alone."""
-        places, start = {}, self.base
-        for name in names:
-            low, high = self.effects[name]
-            places[name] = (start, start + high - low)
-            start += high - low
-        return Layout(base=self.base, effects=places, prior=self.prior_of(self.of(names)))
+        ends = accumulate((high - low for low, high in self.spans(names)), initial=0)
+        places = dict(zip((BASE, *names), pairwise(ends), strict=True))
+        return Layout(base=places.pop(BASE)[1], effects=places, prior=self.prior_of(self.of(names)))
 
     def of(self, names: Sequence[str]) -> Tensor:
         """Return the numbers of the base model's columns, then those of some effects, int64."""
@@ -409,7 +406,7 @@ def pose_sums(
         fit: Its noise and robust weights.
         prior: Prior precision of the base model, shape (K, K).
     """
-    ends = torch.tensor([0, *(own.shape[1] for own in columns.values())]).cumsum(0).tolist()
+    ends = list(accumulate((own.shape[1] for own in columns.values()), initial=0))
     spans = dict(zip(columns, pairwise(ends), strict=True))
     del spans[BASE]
     ones = torch.eye(ends[-1] - len(prior), dtype=torch.float64)

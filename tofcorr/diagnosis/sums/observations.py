@@ -181,10 +181,10 @@ def observe(recording: Recording, most_pixels: int, *, least_per_frame: int = 64
         masks.append(torch.ones_like(batch.valid) if mask is None else torch.from_numpy(mask) > 0)
         chosen += [order[own[order]][:budget].sort().values for own in batch.valid.flatten(1)]
     counts = torch.tensor([len(own) for own in chosen])
-    if int((counts > 0).sum()) < 2:
+    if (seen := int((counts > 0).sum())) < 2:
         raise CalibrationDataError(
             f"{recording.path}: a diagnosis needs at least two frames with usable pixels, "
-            f"got {int((counts > 0).sum())}."
+            f"got {seen}."
         )
     none = torch.empty(0, dtype=torch.int64)
     every = Observations(
@@ -340,6 +340,8 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
     distance, slope, points = seen_points(observations, tool_from_camera)
     target_from_world = planes_from_world(facts.normal_world, facts.offset)
     target_xy = by_frame(points, target_from_world[:, :2, :3].mT, frame)
+    chunks = frame_chunks(observations)
+    images = [distance_images(observations, tool_from_camera, c).float() for c in chunks]
     return EffectInputs(
         camera=observations.recording.camera,
         modulation_frequency=observations.recording.modulation_frequency,
@@ -354,12 +356,7 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
         target_xy=target_xy + target_from_world[frame, :2, 3],
         amplitude=observations.amplitude,
         amplitude_images=observations.amplitude_images,
-        distance_images=torch.cat(
-            [
-                distance_images(observations, tool_from_camera, part).float()
-                for part in frame_chunks(observations)
-            ]
-        ),
+        distance_images=torch.cat(images),
         planes_are_measured=observations.wall is None,
     )
 

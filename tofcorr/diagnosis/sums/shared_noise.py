@@ -231,7 +231,8 @@ def _found(
     Without repeats a mean correlation in a tile below 0.05 does not count, even if it is
     significant: it may be structure. Some of the noise is each pixel's own: at most 0.95 is shared.
     """
-    lags, share, error = Lags(values, used), {}, {}
+    # Clipped at six standard deviations, as in the noise estimate.
+    lags, share, error = Lags(np.clip(values, -6, 6), used), {}, {}
     # Noise over that assumed: less where a filter over time makes repeats alike.
     whole = max(lags.at(0, 0) - (0.0 if from_repeats else lags.plateau("squares")), _TINY)
     for form, cells in tiles.items():
@@ -279,7 +280,7 @@ def _around_mean(images: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.n
     around = images - images.mean(0)
     around = around - around[:, everywhere].mean(1)[:, None, None] if everywhere.any() else around
     freedom = (len(images) - 1) / len(images)
-    return _clipped(around / freedom**0.5), np.broadcast_to(everywhere, images.shape)
+    return around / freedom**0.5, np.broadcast_to(everywhere, images.shape)
 
 
 def _apart_from_pattern(
@@ -307,12 +308,7 @@ def _apart_from_pattern(
     flat, inside = own.reshape(len(own), -1), use.reshape(len(use), -1).astype(float)
     inner = np.einsum("fp,ip,jp->fij", inside, basis, basis, optimize=True) + _TINY * np.eye(3)
     tilts = np.linalg.solve(inner, ((flat * inside) @ basis.T)[..., None])[..., 0]
-    return _clipped(own - (tilts @ basis).reshape(own.shape)), use
-
-
-def _clipped(values: np.ndarray) -> np.ndarray:
-    """Clip residuals at six standard deviations, as in the noise estimate."""
-    return np.clip(values, -6, 6)
+    return own - (tilts @ basis).reshape(own.shape), use
 
 
 def _edges(observations: Observations, frames: np.ndarray) -> np.ndarray:
