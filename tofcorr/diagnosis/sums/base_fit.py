@@ -29,7 +29,7 @@ from tofcorr.diagnosis.sums.observations import (
     predicted_distance,
     predicted_images,
 )
-from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, with_level_of_images
+from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, whole_images
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.simulation.effects.inputs import EffectInputs
@@ -198,13 +198,12 @@ def fit_base(
     model, pose, coefficients = _descend(model, known, pose, 2, trust / sigma**2)
     residual = model.residual(pose, coefficients) - known
     shared = shared_noise(observations, residual, sigma, trust)
-    if simulator is None:
-        shared = with_level_of_images(
-            shared,
-            model.observations,
-            noise,
-            lambda others: model.on(others).residual(pose, coefficients),
-        )
+    if simulator is None and observations.is_sample:
+        whole = whole_images(model.observations)
+        of_whole = model.on(whole).residual(pose, coefficients)
+        own = noise.at(brightness_of(whole), whole.frame)
+        weights = robust_weights(of_whole, own, common_of_neighbours(whole, of_whole))
+        shared = shared.with_level_of(shared_noise(whole, of_whole, own, weights))
     held = noise.held_to_neighbours(shared.level, shared.striped and shared.from_repeats)
     return BaseFit(
         model=model,

@@ -25,7 +25,7 @@ has an uncertain offset and two tilts of its own, so that only what happens insi
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
@@ -334,18 +334,15 @@ class LinearSystem:
 
 
 def linear_system(
-    observations: Observations,
-    fit: BaseFit,
-    inputs: EffectInputs,
-    sources: Mapping[str, Callable[[EffectInputs], Tensor]],
+    observations: Observations, fit: BaseFit, inputs: EffectInputs, effects: Mapping[str, Tensor]
 ) -> LinearSystem:
-    """Compute all columns and sum them up.
+    """Sum up the columns of the base model and of some effects.
 
     Args:
         observations: The pixels.
         fit: The base model, fitted.
         inputs: What effects may depend on.
-        sources: What computes the columns of each effect and probe, metres at one prior standard
+        effects: Columns of each effect and probe, (M, K) each, metres at one prior standard
             deviation.
     """
     uncertain = unknown_amplitude_columns(observations, inputs)
@@ -354,9 +351,8 @@ def linear_system(
     # The ordinary weights of a pose add up to one value with a variance of OLS_SD^2.
     prior = fit.model.prior_precision(observations.num_units / OLS_SD**2)
     prior = torch.block_diag(prior, torch.eye(uncertain.shape[1], dtype=torch.float64))
-    found = in_threads(lambda source: source(inputs), sources.values())
     base = torch.cat([fit.model.columns(fit.tool_from_camera), uncertain], dim=1)
-    columns = {BASE: base, **dict(zip(sources, found, strict=True))}
+    columns = {BASE: base, **effects}
     pose = pose_columns(inputs)
     sums = pose_sums(observations, columns, pose, fit.residual, fit, prior).with_pose_uncertainty()
     return LinearSystem(columns=columns, pose=pose, residual=fit.residual, sums=sums)
@@ -427,7 +423,10 @@ def pose_sums(
 
 
 def _products(
-    parts: Sequence[Tensor], weights: tuple[Tensor, Tensor], units: Sequence[Tensor | slice]
+    parts: Sequence[Tensor],
+    weights: tuple[Tensor, Tensor],
+    units: Sequence[Tensor | slice],
+    threads: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the products of columns (M, K) over the pixels of each unit, with both weights.
 
@@ -443,7 +442,7 @@ def _products(
         scaled = [(everything * root[own]).numpy() for root in roots]
         return *(torch.from_numpy(one.T @ one) for one in scaled), weights[1][own].sum()
 
-    weighted, plain, count = zip(*in_threads(of_unit, units), strict=True)
+    weighted, plain, count = zip(*in_threads(of_unit, units, threads), strict=True)
     return torch.stack(weighted), torch.stack(plain), torch.stack(count)
 
 
@@ -554,7 +553,7 @@ def tile_sums(system: LinearSystem, names: Sequence[str], tiles: Tiles, fit: Bas
     joined = [torch.cat([part[tiles.pixels] for part in parts], dim=1)]
     weights = fit.weight[tiles.pixels], fit.share[tiles.pixels]
     places = [slice(low, high) for low, high in pairwise(accumulate([0, *tiles.counts]))]
-    weighted, plain, count = _products(joined, weights, places)
+    weighted, plain, count = _products(joined, weights, places, threads=1)
     weighted = _without_pose(weighted, tiles.pose[len(tiles.whole) :])
     return replace(
         whole,

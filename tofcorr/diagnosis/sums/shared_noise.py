@@ -8,7 +8,7 @@ than a filter. Pixels beside an edge of brightness are not used then, because so
 edges, unless hardly any others are left.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -16,12 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.noise import (
-    PixelNoise,
-    brightness_of,
-    common_of_neighbours,
-    robust_weights,
-)
 from tofcorr.diagnosis.sums.observations import (
     Observations,
     same_exposure,
@@ -176,6 +170,11 @@ class SharedNoise:
     striped: bool
     whole: float
 
+    def with_level_of(self, other: "SharedNoise") -> "SharedNoise":
+        """Return the same with the level of another estimate, if that is larger."""
+        level = max(self.level, other.level)
+        return replace(self, level=level, whole=self.whole * (self.level / level) ** 2)
+
     @property
     def precise(self) -> bool:
         """Whether a filter that is there would be found: filters leave shares of 0.1 to 0.6."""
@@ -325,33 +324,15 @@ def _edges(observations: Observations, frames: np.ndarray) -> np.ndarray:
     return edges
 
 
-def with_level_of_images(
-    shared: SharedNoise,
-    observations: Observations,
-    noise: PixelNoise,
-    residual_of: Callable[[Observations], Tensor],
-) -> SharedNoise:
-    """Return what neighbours share, its level from whole images where pixels were chosen.
+def whole_images(observations: Observations) -> Observations:
+    """Return all pixels of some evenly spread frames; chosen pixels have no near neighbours.
 
-    Chosen pixels have no near neighbours, in which a filter shows.
-
-    Args:
-        shared: As the chosen pixels show it.
-        observations: The chosen pixels.
-        noise: That differences between neighbours see.
-        residual_of: Returns the residual of a fit in other pixels, metres.
+    Of some 400 000 pixels, in eight frames at least, correlations are known to a per cent.
     """
-    if not observations.is_sample:
-        return shared
     usable = observations.usable.flatten(1)
     counts = usable.sum(1)
     seen = counts.nonzero()[:, 0]
-    # Of some 400 000 pixels, in eight frames at least, correlations are known to a per cent.
     most = max(int(400_000 / counts[seen].double().mean()), 8)
     frames = seen[torch.linspace(0, len(seen) - 1, min(most, len(seen))).round().long()]
     number, pixel = usable[frames].nonzero(as_tuple=True)
-    whole = observations.choosing(frames[number], pixel)
-    residual, sigma = residual_of(whole), noise.at(brightness_of(whole), whole.frame)
-    trust = robust_weights(residual, sigma, common_of_neighbours(whole, residual))
-    level = max(shared.level, shared_noise(whole, residual, sigma, trust).level)
-    return replace(shared, level=level, whole=shared.whole * (shared.level / level) ** 2)
+    return observations.choosing(frames[number], pixel)

@@ -28,6 +28,7 @@ from tofcorr.diagnosis.sums.linear_system import (
 )
 from tofcorr.diagnosis.sums.observations import TINY, Observations
 from tofcorr.geometry.rays import phase_from_radial_distance
+from tofcorr.pixels.dataset import in_threads
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
@@ -249,15 +250,16 @@ def build_study(
     folds = draw_folds(num_units, tests.folds, generator)
     signs = draw_signs(tests.flips, num_units, generator)
     candidates = candidate_effects(options, inputs)
-    sources = {name: partial(_scaled_columns, e) for name, e in candidates.effects.items()}
-    sources |= {name: probe.columns for name, probe in candidates.probes.items()}
+    sources = {**candidates.effects, **candidates.probes}
+    found = in_threads(partial(_scaled_columns, inputs), sources.values())
+    system = linear_system(observations, fit, inputs, dict(zip(sources, found, strict=True)))
     study = Study(
         options=options,
         observations=observations,
         fit=fit,
         inputs=inputs,
         candidates=candidates,
-        system=linear_system(observations, fit, inputs, sources),
+        system=system,
         folds=folds,
         signs=signs,
         tiles=None,
@@ -271,8 +273,9 @@ def build_study(
     return replace(study, tiles=cut_into_tiles(observations, energy, tests, generator, filtered))
 
 
-def _scaled_columns(effect: CatalogueEffect, inputs: EffectInputs) -> Tensor:
-    return effect.columns(inputs) * effect.prior_sd()
+def _scaled_columns(inputs: EffectInputs, source: CatalogueEffect | Probe) -> Tensor:
+    columns = source.columns(inputs)
+    return columns if isinstance(source, Probe) else columns * source.prior_sd()
 
 
 def absent_forms(study: Study) -> list[str]:
