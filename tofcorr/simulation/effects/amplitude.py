@@ -9,7 +9,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import AMPLITUDE, EffectInputs
-from tofcorr.simulation.effects.numerics import inner_range, legendre, side_by_side
+from tofcorr.simulation.effects.numerics import legendre, side_by_side
 
 
 class AmplitudeShape(Options):
@@ -45,12 +45,14 @@ class AmplitudeEffect(LinearDelay):
             CalibrationDataError: No amplitude is above zero.
         """
         known = inputs.known_amplitude
-        if not bool((known > 0).any()):
+        ordered = known[known > 0].sort().values
+        if not len(ordered):
             raise CalibrationDataError(
                 "amplitude.npy holds 0 in every pixel used, so it was not measured: remove the "
                 "file; what is missing is unknown, never zero."
             )
-        low, high = inner_range(known[known > 0], 0.002)
+        beyond = int(0.002 * len(ordered))
+        low, high = ordered[[beyond, min(len(ordered) - 1, int(0.998 * len(ordered)))]].tolist()
         return cls(AmplitudeShape(low_counts=low, high_counts=high))
 
     @classmethod
