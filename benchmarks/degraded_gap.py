@@ -28,7 +28,7 @@ from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.findings.gap import resampled
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.rerun.checks import Excess
+from tofcorr.diagnosis.rerun.checks import excess_gaps
 from tofcorr.diagnosis.rerun.sensor import expected_images, light_images, sensor_of
 from tofcorr.diagnosis.rerun.simulator import solution_of
 from tofcorr.diagnosis.sums.noise import (
@@ -101,9 +101,14 @@ def written(
 
 
 def excess_over(
-    observations: Observations, sigma: Tensor, floor_factor: float, counted: Tensor, depth: Tensor
-) -> Excess:
-    """Sum up measured minus simulated distances, less the noise.
+    observations: Observations,
+    sigma: Tensor,
+    floor_factor: float,
+    counted: Tensor,
+    depth: Tensor,
+    resamples: Tensor | None = None,
+) -> Tensor:
+    """Return the gap of measured to simulated distances, and of resamples of the poses, metres.
 
     Args:
         observations: The M pixels.
@@ -111,13 +116,14 @@ def excess_over(
         floor_factor: So much larger is the noise of a gap.
         counted: Which count, (M,).
         depth: The simulated images (F, H, W), of the recording's kind.
+        resamples: How often each holds each pose, (B, U).
     """
     simulated = radial_at(observations, depth)
     known = simulated.isfinite() & (simulated > 0) & counted
     residual = torch.where(known, observations.measured - simulated, 0.0)
     trust = robust_weights(residual, sigma, common_of_neighbours(observations, residual))
     share = trust * gap_weight(sigma) * known
-    return Excess.of(observations, residual, share, floor_factor * sigma)
+    return excess_gaps(observations, residual, share, floor_factor * sigma, resamples)
 
 
 def radial_at(observations: Observations, depth: Tensor) -> Tensor:
@@ -233,14 +239,14 @@ def degraded_gap(
         sigma = noise.at(brightness_of(observations), observations.frame)
         covered = model.base.covers(radial_at(observations, depth), observations.amplitude)
         counted = (observations, sigma, found.gap.floor / study.fit.floor, covered)
-        remains = excess_over(*counted, distance * slant)
         generator = torch.Generator().manual_seed(seed)
-        gaps = remains.gaps(resampled(observations.num_units, resamples, generator))
+        drawn = resampled(observations.num_units, resamples, generator)
+        remains, gaps = excess_over(*counted, distance * slant, drawn).split([1, len(drawn)])
         low, high = gaps.quantile(torch.tensor([0.025, 0.975], dtype=gaps.dtype)).tolist()
         both = [observe(each) for each in (rest, degraded)]
         return DegradedGap(
-            ideal=excess_over(*counted, depth).gap(),
-            degraded=remains.gap(),
+            ideal=float(excess_over(*counted, depth)),
+            degraded=float(remains),
             degraded_interval=(low, high),
             with_effects=found.gap.after,
             noise=(noise_of(both[0]).temporal_m, noise_of(both[1]).temporal_m),

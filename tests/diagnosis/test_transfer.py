@@ -1,7 +1,6 @@
 """Corrections trained on simulated and on real images, tested on held-out real poses."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import diagnosed_recordings
 import numpy as np
@@ -60,19 +59,19 @@ def test_the_simulator_that_took_the_recording_has_its_noise(
 
 
 def test_noisy_frames_have_the_poses_of_the_recording(
-    nothing_missing: Recording, tmp_path: Path
+    nothing_missing: Recording,
 ) -> None:
     simulator = diagnosed_recordings.options(31)
-    frames = noisy_frames(nothing_missing, simulator, 3, tmp_path / "frames")
+    frames = noisy_frames(nothing_missing, simulator, 3)
     assert frames.num_frames == nothing_missing.num_frames
     poses = torch.from_numpy(frames.frames.world_from_tool)
     torch.testing.assert_close(poses, torch.from_numpy(nothing_missing.frames.world_from_tool))
 
 
 def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
-    nothing_missing: Recording, tmp_path: Path
+    nothing_missing: Recording,
 ) -> None:
-    frames = noisy_frames(nothing_missing, diagnosed_recordings.options(31), 3, tmp_path / "frames")
+    frames = noisy_frames(nothing_missing, diagnosed_recordings.options(31), 3)
     rendered = RenderedSimulator(frames).rendered_frames(nothing_missing)
     compared = observables_of(nothing_missing, rendered, seed=7, level=0.05)
     assert compared.noise is not None

@@ -57,12 +57,13 @@ def conclude(
 
     patterns = whole_patterns(study, named, given)
     with_effects = None if rendered else simulator_of(study, named, given)
-    beyond = () if rendered else tables_of(study, named, given).beyond
+    beyond = [] if rendered else tables_of(study, named, given)[1]
     warnings = list(prepared.warnings)
     if beyond:
         warnings.append(
             "simulator_with_effects.yaml lacks these terms of the base model: "
-            f"{', '.join(beyond)}. The simulator has no table for them; the findings include them."
+            f"{', '.join(term.options.kind for term, _ in beyond)}. The simulator has no table for "
+            "them; the findings include them."
         )
     closure = transfer = degraded = None
     if options.simulate_anew:

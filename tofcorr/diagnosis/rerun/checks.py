@@ -2,16 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import Recording
-from tofcorr.data.table import FrameRow
-from tofcorr.data.writing import RecordingWriter
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.where import Interval, interval_of
 from tofcorr.diagnosis.rerun.simulator import (
@@ -20,73 +16,62 @@ from tofcorr.diagnosis.rerun.simulator import (
     simulated_frames,
     solution_of,
 )
-from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
+from tofcorr.diagnosis.sums.observations import TINY, Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.files import scratch_folder
+from tofcorr.error_terms.model import Pixels
 from tofcorr.fit.fitting import fit_hand_eye, fit_model
 from tofcorr.fit.problem import FitOptions
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.observables.compare import Observables, compare_observables
 from tofcorr.pixels.dataset import Dataset, HandEyeOptions, covered_domain
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.simulator import Reflectivity, twin_frames
+from tofcorr.simulation.simulator import twin_frames
 
 
 def fitted_to(study: Study, units: Tensor, names: Sequence[str]) -> Study:
-    """Return the study with ordinary sums of some poses alone, of which coefficients are fitted.
+    """Return the study with ordinary sums, and maps, of some poses alone.
 
     Args:
         study: The recording.
         units: Which poses, shape (U,), bool.
         names: Effects with columns that the model has; the sums of all others are left out.
     """
+    used = units.double()
     sums = study.sums.of(names)
-    sums = replace(sums, plain=sums.plain * units.double()[:, None, None])
-    return replace(study, system=replace(study.system, sums=sums))
+    sums = replace(sums, plain=sums.plain * used[:, None, None])
+    fit = replace(study.fit, trust=study.fit.trust * used[study.unit_of_pixel])
+    return replace(study, system=replace(study.system, sums=sums), fit=fit)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Excess:
-    """What the gap of any resample of the poses is computed from.
+def excess_gaps(
+    observations: Observations,
+    left: Tensor,
+    share: Tensor,
+    noise: Tensor | float,
+    resamples: Tensor | None = None,
+) -> Tensor:
+    """Return the root mean square beyond the noise, of all poses and of resamples of them, metres.
 
-    Attributes:
-        squares: Sum of a pose's weighted squares less those of the noise, shape (U,), m^2.
-        weight: Sum of its weights, shape (U,).
+    Args:
+        observations: The M pixels.
+        left: Measured less expected, shape (M,), metres; what is not finite does not count.
+        share: Weights, shape (M,).
+        noise: Standard deviation of the pixels, shape (M,) or one number, metres.
+        resamples: How often each resample holds each pose, shape (B, U); None: there are none.
+
+    Returns:
+        Shape (1 + B,), all poses first; 0 where noise explains more.
     """
-
-    squares: Tensor
-    weight: Tensor
-
-    @classmethod
-    def of(
-        cls, observations: Observations, left: Tensor, share: Tensor, noise: Tensor | float
-    ) -> "Excess":
-        """Sum up over the poses.
-
-        Args:
-            observations: The M pixels.
-            left: Measured less expected, shape (M,), metres; what is not finite does not count.
-            share: Weights, shape (M,).
-            noise: Standard deviation of the pixels, shape (M,) or one number, metres.
-        """
-        share = share * left.isfinite()
-        unit = observations.unit[observations.frame]
-        none = torch.zeros(observations.num_units, dtype=torch.float64)
-        squares = share * (left.nan_to_num(0.0, 0.0, 0.0) ** 2 - noise**2)
-        return cls(squares=none.index_add(0, unit, squares), weight=none.index_add(0, unit, share))
-
-    def gap(self) -> float:
-        """Return the root mean square of all poses, metres; 0 where noise explains more."""
-        return float(self.gaps(torch.ones_like(self.weight)[None]))
-
-    def gaps(self, resamples: Tensor) -> Tensor:
-        """Return the same of resamples, shape (B,), metres.
-
-        Args:
-            resamples: How often each resample holds each pose, shape (B, U).
-        """
-        mean = (resamples @ self.squares) / (resamples @ self.weight).clamp(min=1e-30)
-        return mean.clamp(min=0.0).sqrt()
+    share = share * left.isfinite()
+    squares = share * (left.nan_to_num(0.0, 0.0, 0.0) ** 2 - noise**2)
+    poses = observations.unit[observations.frame]
+    sums = torch.zeros(observations.num_units, 2, dtype=torch.float64)
+    sums.index_add_(0, poses, torch.stack([squares, share], dim=1))
+    drawn = torch.ones(1, len(sums), dtype=torch.float64)
+    if resamples is not None:
+        drawn = torch.cat([drawn, resamples])
+    square, weight = (drawn @ sums).unbind(dim=1)
+    return (square / weight.clamp(min=TINY)).clamp(min=0.0).sqrt()
 
 
 def observables_of(
@@ -101,17 +86,13 @@ def observables_of(
         seed: Of noise, resamples and permutations.
         level: Significance level of what is reported.
     """
-    if sim is None or isinstance(sim, Recording):
-        return compare_observables(recording, sim, seed=seed, level=level)
-    with scratch_folder() as folder:
-        frames = noisy_frames(recording, sim, seed, folder / "frames")
-        return compare_observables(recording, frames, seed=seed, level=level)
+    if isinstance(sim, SimulatorOptions):
+        sim = noisy_frames(recording, sim, seed)
+    return compare_observables(recording, sim, seed=seed, level=level)
 
 
-def noisy_frames(
-    recording: Recording, simulator: SimulatorOptions, seed: int, folder: Path
-) -> Recording:
-    """Run the built-in simulator with noise at the poses of a recording, and write its frames.
+def noisy_frames(recording: Recording, simulator: SimulatorOptions, seed: int) -> Recording:
+    """Run the built-in simulator with noise at the poses of a recording; return it in memory.
 
     The targets are those of the simulator's scene. Where the scene lacks a target, reflectivities
     come from the recorded amplitudes instead.
@@ -120,41 +101,34 @@ def noisy_frames(
         recording: Poses, planes, targets, conditions and masks.
         simulator: What to run.
         seed: Of the noise.
-        folder: The folder to write; it must not exist yet.
     """
-    camera = recording.camera
     frames = simulated_frames(recording)
     named = set(recording.frames.target.tolist()) <= simulator.scene.targets.keys()
-    source: Reflectivity = "from_recording"
-    if named or recording.amplitude is None:
-        source = "pattern"
     states = twin_frames(
         simulator,
         recording,
         torch.Generator().manual_seed(seed),
-        reflectivity=source,
+        reflectivity="pattern" if named or recording.amplitude is None else "from_recording",
         indices=frames,
     )
-    with RecordingWriter(
-        folder,
-        camera=camera,
-        depth_kind=recording.depth_kind,
-        modulation_frequency=recording.modulation_frequency,
-        tool_from_camera=recording.tool_from_camera,
-    ) as writer:
-        for frame, state in zip(frames, states, strict=True):
-            depth = state.measured_distance
-            if recording.depth_kind == "z":
-                depth = z_depth_from_radial_distance(depth, ray_directions(camera))
-            mask = recording.read("mask", np.array([frame]))
-            row: FrameRow = recording.frames.row(frame)
-            writer.append(
-                depth.numpy(),
-                row=row,
-                amplitude=state.measured_amplitude.nan_to_num(0.0).numpy(),
-                mask=None if mask is None else mask[0],
-            )
-    return Recording.open(folder, check_contents=False)
+    depth, amplitude = zip(
+        *((one.measured_distance, one.measured_amplitude.nan_to_num(0.0)) for one in states),
+        strict=True,
+    )
+    depth = torch.stack(depth)
+    if recording.depth_kind == "z":
+        depth = z_depth_from_radial_distance(depth, ray_directions(recording.camera))
+    return replace(
+        recording,
+        saturation_amplitude=None,
+        frames=recording.frames.select(np.array(frames)),
+        depth=depth.float().numpy(),
+        amplitude=torch.stack(amplitude).float().numpy(),
+        mask=recording.read("mask", np.array(frames)),
+        raw=None,
+        true_depth=None,
+        planes="recorded",
+    )
 
 
 def recording_of(
@@ -226,12 +200,14 @@ def check_in_simulator(
     bare = replace(named, names=(), refined_terms=(), study=study)
     models = (bare, named) if named.adds_something else (bare,)
     gaps = [
-        Excess.of(
-            study.observations,
-            measured - _held_out(study, model, given, frames),
-            study.fit.share,
-            study.fit.sigma,
-        ).gap()
+        float(
+            excess_gaps(
+                study.observations,
+                measured - _held_out(study, model, given, frames),
+                study.fit.share,
+                study.fit.sigma,
+            )
+        )
         for model in models
     ]
     return Closure(without_effects=gaps[0], with_effects=gaps[-1], frames=len(frames))
@@ -308,18 +284,18 @@ def measure_transfer(
         half = replace(model, study=fitted_to(model.study, first_half, model.columns))
         distance = fitted_distance(half.study, half, given, generator, split[0].tolist())
         pose = solution_of(half.study, half)[0]
-        found.append(_tested(study, observed_by(study, half), distance, pose, split))
+        walls = observed_by(study, half)
+        found.append(_tested(study, walls, distance, pose, split, resamples))
     walls = observed_by(study, half)
-    found.append(_tested(study, walls, observations.measured, pose, split))
-    compared = found[0], found[-2], found[-1]
-    sizes, draws = [each.gap() for each in compared], [each.gaps(resamples) for each in compared]
-    sim, effects, real = map(interval_of, (drawn.tolist() for drawn in draws), sizes)
+    real = _tested(study, walls, observations.measured, pose, split, resamples)
+    compared = found[0], found[-1], real, found[0] - found[-1]
+    intervals = [interval_of(gaps[1:].tolist(), float(gaps[0])) for gaps in compared]
     return Transfer(
-        trained_on_sim=sizes[0],
-        trained_on_sim_with_effects=sizes[1],
-        trained_on_real=sizes[2],
-        intervals=(sim, effects, real),
-        gain_interval=interval_of((draws[0] - draws[1]).tolist(), sizes[0] - sizes[1]),
+        trained_on_sim=float(found[0][0]),
+        trained_on_sim_with_effects=float(found[-1][0]),
+        trained_on_real=float(real[0]),
+        intervals=(intervals[0], intervals[1], intervals[2]),
+        gain_interval=intervals[3],
     )
 
 
@@ -344,7 +320,8 @@ def _tested(
     distance: Tensor,
     pose: Tensor,
     split: tuple[np.ndarray, np.ndarray],
-) -> Excess:
+    resamples: Tensor,
+) -> Tensor:
     """Train a correction on distances (M,), and return its error on held-out real poses.
 
     Args:
@@ -353,40 +330,29 @@ def _tested(
         distance: What the camera to train on measures in the chosen pixels; NaN: not used.
         pose: Its hand-eye transform, where the fit starts, shape (4, 4).
         split: Which frames train, and which test.
+        resamples: As of `excess_gaps`, and so is what is returned.
     """
     training, test = split
     use, free = study.fit.trust > 0, study.fit.model.hand_eye_free
     hand_eye = HandEyeOptions(estimate="yes" if free else "no", start="recording")
     options = FitOptions(model=study.fit.model.options, hand_eye=hand_eye)
-    images = recording_of(observations, torch.where(use, distance, torch.nan), pose)
-    dataset = Dataset((images,))
+    dataset = Dataset((recording_of(observations, torch.where(use, distance, torch.nan), pose),))
     domain = covered_domain(dataset, training)
     trained = fit_model(dataset, training, options, domain)
-    corrected = torch.where(use, observations.measured - _error(study, trained), torch.nan)
+    measured, width = observations.measured, observations.distance_images.shape[2]
+    pixels = Pixels(
+        measured,
+        measured if observations.amplitude is None else observations.amplitude,
+        (observations.pixel // width).double(),
+        (observations.pixel % width).double(),
+        observations.conditions[observations.frame],
+    )
+    with torch.no_grad():
+        corrected = torch.where(use, measured - trained.error.error_at(pixels), torch.nan)
     if free:
         real = Dataset((recording_of(observations, corrected, pose),))
         pose = fit_hand_eye(real, training, options, domain).tool_from_camera
     left = corrected - predicted_distance(observations, pose)
     tested = torch.from_numpy(np.isin(observations.frame.numpy(), test))
-    return Excess.of(study.observations, left, study.fit.share * tested, study.fit.sigma)
-
-
-def _error(study: Study, trained: CalibrationModel) -> Tensor:
-    """Return the error that a correction predicts for the measured pixels, shape (M,), metres."""
-    observations = study.observations
-    shape = observations.distance_images.shape[1:]
-    conditions = observations.conditions
-    error = torch.full_like(observations.measured, torch.nan)
-    for frame, (start, end) in enumerate(observations.frame_ends):
-        measured = torch.full((shape[0] * shape[1],), torch.nan, dtype=torch.float64)
-        pixel = observations.pixel[start:end]
-        measured[pixel] = observations.measured[start:end]
-        amplitude = None
-        if observations.amplitude_images is not None:
-            amplitude = observations.amplitude_images[frame][None].double()
-        with torch.no_grad():
-            predicted = trained.error(
-                measured.reshape(1, *shape), amplitude, conditions[frame][None]
-            )
-        error[start:end] = predicted.reshape(-1)[pixel]
-    return error
+    weights = study.fit.share * tested
+    return excess_gaps(study.observations, left, weights, study.fit.sigma, resamples)

@@ -15,7 +15,7 @@ from tofcorr.data.recording import Recording, RigidTransform
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE
 from tofcorr.diagnosis.findings.where import Interval, interval_of
-from tofcorr.diagnosis.rerun.checks import Excess, fitted_to
+from tofcorr.diagnosis.rerun.checks import excess_gaps, fitted_to
 from tofcorr.diagnosis.rerun.simulator import (
     NO_PATTERNS,
     Patterns,
@@ -137,10 +137,6 @@ def _sections(
     }
 
 
-# Pixels measured at once. Chosen to bound memory to some 100 MB.
-_CHUNK_PIXELS = 500_000
-
-
 def expected_images(
     model: SensorModel,
     recording: Recording,
@@ -157,23 +153,21 @@ def expected_images(
         distance: True distances along the rays, shape (F, H, W), metres.
         amplitude: Light that returns, shape (F, H, W), counts; None: unknown.
     """
-    known = conditions_of_frames(recording)
-    shift = model.frame_shift(recording.num_frames, **known)
+    shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
     slant = ray_directions(recording.camera)[..., 2]
     scale = slant if model.sensor.depth_kind == "z" else torch.ones_like(slant)
-    measured = []
+    measured = torch.empty_like(distance, dtype=torch.float64)
     with torch.inference_mode():
-        for part in torch.arange(len(frames)).split(max(1, _CHUNK_PIXELS // scale.numel())):
-            chosen = frames[part]
+        for place, number in enumerate(frames.tolist()):
             found = model(
-                distance[part].double() * scale,
-                None if amplitude is None else amplitude[part].double(),
+                distance[place].double() * scale,
+                None if amplitude is None else amplitude[place].double(),
                 noise=False,
-                frame_shift=shift[chosen],
-                **{name: torch.as_tensor(value)[chosen] for name, value in known.items()},
+                frame_shift=shift[number],
+                **conditions_of_frames(recording, number),
             )
-            measured.append(found.depth / scale)
-    return torch.cat(measured)
+            measured[place] = found.depth / scale
+    return measured
 
 
 def light_images(
@@ -233,59 +227,40 @@ def degraded_stage(
         floor: Noise of a pixel, root mean square, metres, as in the other stages.
         resamples: How often each resample holds each pose, shape (B, U).
     """
-    observations, unit = study.observations, study.unit_of_pixel
+    observations = study.observations
     frames = max(_MOST_PIXELS // observations.distance_images[0].numel(), 1)
-    count = int(np.clip(observations.num_units * frames / observations.num_frames, 1, None))
-    count = min(count, observations.num_units)
-    chosen = torch.linspace(0, observations.num_units - 1, count).round().long()
-    among = torch.zeros(observations.num_units, dtype=torch.bool)
+    units = observations.num_units
+    count = int(np.clip(units * frames / observations.num_frames, 1, units))
+    chosen = torch.linspace(0, units - 1, count).round().long()
+    among = torch.zeros(units, dtype=torch.bool)
     among[chosen] = True
     expected = torch.full_like(observations.measured, torch.nan)
     left_out: tuple[str, ...] = ()
     for held in ((members > 0) & among for members in study.folds):
         if not bool(held.any()):
             continue
-        own = _without(study, held, named.columns)
-        model_named = replace(named, study=_without(named.study, held, named.columns))
+        own = fitted_to(study, ~held, named.columns)
+        model_named = replace(named, study=fitted_to(named.study, ~held, named.columns))
         with catch_warnings():
             simplefilter("ignore", SensorWarning)  # `left_out` says so once, and not in each fold.
             model = SensorModel(sensor_of(own, model_named, simulator, None), torch.float64)
             left_out = model.left_out
             frames_held = torch.nonzero(held[observations.unit]).reshape(-1)
-            images = _expected(model, own, model_named, frames_held)
-        place = torch.full((observations.num_frames,), -1)
-        place[frames_held] = torch.arange(len(frames_held))
-        pixels = held[unit].nonzero().reshape(-1)
-        at = place[observations.frame[pixels]], observations.pixel[pixels]
-        expected[pixels] = images[at]
+            seen, light = (
+                observed_by(own, model_named),
+                light_images(model, observations, own.inputs),
+            )
+            ideal = distance_images(seen, solution_of(own, model_named)[0], frames_held)
+            lit = None if light is None else light[frames_held]
+            images = expected_images(model, seen.recording, frames_held, ideal, lit).flatten(1)
+        pixels = held[study.unit_of_pixel].nonzero().reshape(-1)
+        place = torch.searchsorted(frames_held, observations.frame[pixels])
+        expected[pixels] = images[place, observations.pixel[pixels]]
     left = observations.measured - expected
-    excess = Excess.of(observations, left, study.fit.share, floor)
-    gap = excess.gap()
+    gap, *draws = excess_gaps(observations, left, study.fit.share, floor, resamples).tolist()
     return DegradedStage(
-        gap=gap,
-        interval=interval_of(excess.gaps(resamples).tolist(), gap),
-        poses=len(chosen),
-        left_out=left_out,
+        gap=gap, interval=interval_of(draws, gap), poses=len(chosen), left_out=left_out
     )
-
-
-def _without(study: Study, held: Tensor, names: Sequence[str]) -> Study:
-    """Return a study whose sums of a model's effects, and whose maps, leave some poses out."""
-    trust = study.fit.trust * (~held).double()[study.unit_of_pixel]
-    return replace(fitted_to(study, ~held, names), fit=replace(study.fit, trust=trust))
-
-
-def _expected(model: SensorModel, study: Study, named: NamedEffects, frames: Tensor) -> Tensor:
-    """Return the expected radial distance of all pixels of some frames, (F, H W), metres."""
-    observations = observed_by(study, named)
-    light = light_images(model, study.observations, study.inputs)
-    return expected_images(
-        model,
-        observations.recording,
-        frames,
-        distance_images(observations, solution_of(study, named)[0], frames),
-        None if light is None else light[frames],
-    ).flatten(1)
 
 
 @dataclass(frozen=True)

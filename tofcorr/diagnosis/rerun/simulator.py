@@ -1,7 +1,7 @@
 """The simulator that a fit describes: its options can be written out, and run at the same poses."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -13,7 +13,6 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorption import fitted_coefficients
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.base_model import BaseModel
 from tofcorr.diagnosis.sums.gains import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
@@ -31,6 +30,7 @@ from tofcorr.simulation.options import (
 from tofcorr.simulation.scene import SceneOptions, UniformTarget
 from tofcorr.simulation.signal import (
     AmplitudeTable,
+    Curve,
     CurveTable,
     LatticeTable,
     LightOptions,
@@ -45,54 +45,40 @@ from tofcorr.simulation.simulator import twin_frames
 # Chosen; a test compares simulator and fit to 0.2 mm.
 _LEAST_KNOTS, _AMPLITUDE_KNOTS, _LATTICE = 13, 26, 9
 
-Variable = Literal["amplitude", "normalised_amplitude"]
+Variable = Literal["distance", "amplitude", "normalised_amplitude"]
 Numbered = tuple[Any, Tensor]
 """A term, and the numbers of its coefficients in the model."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ErrorTables:
-    """A fitted error model, as far as the simulator has tables for it.
-
-    Attributes:
-        tables: The tables.
-        beyond: Kinds of the terms that fit into no table.
-        numbers: Numbers of their coefficients in the model, int64.
-        coefficients: Of the whole model, shape (K,), metres.
-    """
-
-    tables: MeasuredErrorOptions
-    beyond: tuple[str, ...]
-    numbers: Tensor
-    coefficients: Tensor
-
-    def error_beyond(self, model: BaseModel, distance: Tensor) -> Tensor:
-        """Return the error that the tables lack, at predicted distances (M,), metres."""
-        columns = model.error_columns(distance)[:, self.numbers]
-        return columns @ self.coefficients[self.numbers]
-
-
-def error_tables(study: Study, coefficients: Tensor, already: MeasuredErrorOptions) -> ErrorTables:
-    """Return the error model as tables, added to those that the simulator has.
+def tables_of(
+    study: Study, named: NamedEffects | None, given: SimulatorOptions | None
+) -> tuple[MeasuredErrorOptions, list[Numbered]]:
+    """Return a fitted error model as tables, added to those that a given simulator has.
 
     The simulator has one table of the distance, one of the image, and one of the amplitude or the
     normalised amplitude. Terms of conditions, of distance and amplitude together, or of a second
     amplitude variable fit into none.
 
-    Args:
-        study: The recording.
-        coefficients: Of constant and terms, shape (K,), metres.
-        already: Tables that the simulator has.
+    Returns:
+        The tables, and the terms that fit into none.
     """
-    model, start = study.fit.model, 1
+    already = MeasuredErrorOptions() if given is None else given.sensor.delays.measured
+    coefficients, model, start = solution_of(study, named)[1], study.fit.model, 1
     numbered: list[Numbered] = []
     for term in model.terms:
         numbered.append((term, torch.arange(start, start + len(term.symbols))))
         start += len(term.symbols)
-    count = len(model.error_model.signal_terms)
-    pixels = len(model.error_model.pixel_terms)
-    by_distance, by_amplitude, variable, beyond = _sorted(study, numbered[:count], already)
-    beyond = [*numbered[count + pixels :], *beyond]
+    count, pixels = len(model.error_model.signal_terms), len(model.error_model.pixel_terms)
+    signal, rest = numbered[:count], numbered[count:]
+    of_pixels, beyond = rest[:pixels], rest[pixels:]
+    reads = [_variable_of(term, study.observations) for term, _ in signal]
+    variable = next((one for one in reads if one in ("amplitude", "normalised_amplitude")), None)
+    if already.amplitude is not None:
+        variable = already.amplitude.variable
+    by_distance = [each for each, one in zip(signal, reads, strict=True) if one == "distance"]
+    by_amplitude = [each for each, one in zip(signal, reads, strict=True) if one == variable]
+    known = ("distance", variable)
+    beyond += [each for each, one in zip(signal, reads, strict=True) if one not in known or not one]
 
     def total(terms: Sequence[Numbered], first: Tensor, second: Tensor) -> Tensor:
         found = torch.zeros(len(first), dtype=torch.float64)
@@ -100,30 +86,24 @@ def error_tables(study: Study, coefficients: Tensor, already: MeasuredErrorOptio
             found = found + coefficients[numbers] @ term.basis(first, second).detach()
         return found
 
-    measured, camera = study.observations.measured, study.observations.recording.camera
+    def curve(at: Tensor, values: Tensor, known: CurveTable | None) -> dict[str, Any]:
+        if known is not None:
+            values = values + Curve(known.knots, known.values_m)(at)
+        return {"knots": tuple(at.tolist()), "values_m": tuple(values.tolist())}
+
+    measured, seen = study.observations.measured, study.observations.amplitude
     finest = max((len(numbers) for _, numbers in by_distance), default=0)
-    at = torch.linspace(
-        float(measured.min()),
-        float(measured.max()),
-        max(_LEAST_KNOTS, 2 * finest + 1),
-        dtype=torch.float64,
-    )
-    values = total(by_distance, at, at)
-    if already.distance is not None:
-        values = values + already.distance.curve()(at)
-    distance = CurveTable(knots=tuple(at.tolist()), values_m=tuple(values.tolist()))
-    amplitude, seen = already.amplitude, study.observations.amplitude
+    count = max(_LEAST_KNOTS, 2 * finest + 1)
+    at = torch.linspace(float(measured.min()), float(measured.max()), count, dtype=torch.float64)
+    distance = CurveTable(**curve(at, total(by_distance, at, at), already.distance))
+    amplitude = already.amplitude
     if by_amplitude and variable is not None and seen is not None:
         at = _dense_where_dark(seen if variable == "amplitude" else seen * measured**2)
         values = total(by_amplitude, torch.ones_like(at), at)
-        if amplitude is not None:
-            values = values + amplitude.curve()(at)
-        knots = tuple(at.tolist())
-        amplitude = AmplitudeTable(knots=knots, values_m=tuple(values.tolist()), variable=variable)
+        amplitude = AmplitudeTable(**curve(at, values, amplitude), variable=variable)
+    camera = study.observations.recording.camera
     sides = (torch.linspace(0, end - 1, _LATTICE).double() for end in (camera.height, camera.width))
-    lattice = total(numbered[count : count + pixels], *torch.cartesian_prod(*sides).T).reshape(
-        _LATTICE, _LATTICE
-    )
+    lattice = total(of_pixels, *torch.cartesian_prod(*sides).T).reshape(_LATTICE, _LATTICE)
     if already.pixel is not None:
         lattice = lattice + image_from_lattice(already.pixel.values_m, _LATTICE, _LATTICE)
     tables = {
@@ -132,31 +112,7 @@ def error_tables(study: Study, coefficients: Tensor, already: MeasuredErrorOptio
         "pixel": LatticeTable(values_m=tuple(map(tuple, lattice.tolist()))),
         "amplitude": amplitude,
     }
-    nothing = torch.zeros(0, dtype=torch.int64)
-    return ErrorTables(
-        tables=already.model_copy(update=tables),
-        beyond=tuple(term.options.kind for term, _ in beyond),
-        numbers=torch.cat([nothing, *(numbers for _, numbers in beyond)]),
-        coefficients=coefficients,
-    )
-
-
-def _sorted(
-    study: Study, signal: Sequence[Numbered], already: MeasuredErrorOptions
-) -> tuple[list[Numbered], list[Numbered], Variable | None, list[Numbered]]:
-    """Return terms of the distance, those of one amplitude variable, which, and all others."""
-    by_distance, by_amplitude, beyond = [], [], []
-    variable = None if already.amplitude is None else already.amplitude.variable
-    for each in signal:
-        reads = _variable_of(each[0], study.observations) if each[0].needs_amplitude else None
-        if not each[0].needs_amplitude:
-            by_distance.append(each)
-        elif reads is None or variable not in (None, reads):
-            beyond.append(each)
-        else:
-            by_amplitude.append(each)
-            variable = reads
-    return by_distance, by_amplitude, variable, beyond
+    return already.model_copy(update=tables), beyond
 
 
 def _dense_where_dark(values: Tensor) -> Tensor:
@@ -168,7 +124,9 @@ def _dense_where_dark(values: Tensor) -> Tensor:
 
 
 def _variable_of(term: SignalTerm, observations: Observations) -> Variable | None:
-    """Return the one variable that a term of the amplitude depends on; None: it depends on two."""
+    """Return the one variable that a term depends on; None: it depends on two."""
+    if not term.needs_amplitude:
+        return "distance"
     if observations.amplitude is None:
         return None
     low, high = float(observations.measured.min()), float(observations.measured.max())
@@ -249,14 +207,6 @@ def fitted_effects(
     return effects
 
 
-def tables_of(
-    study: Study, named: NamedEffects | None, given: SimulatorOptions | None
-) -> ErrorTables:
-    """Return the error model of a model as tables, added to those of a given simulator."""
-    already = MeasuredErrorOptions() if given is None else given.sensor.delays.measured
-    return error_tables(study, solution_of(study, named)[1], already)
-
-
 def simulator_of(
     study: Study,
     named: NamedEffects | None,
@@ -275,7 +225,7 @@ def simulator_of(
     recording = study.observations.recording
     pose = solution_of(study, named)[0]
     options = _plain(recording, study.observations, study.fit) if given is None else given
-    measured = tables_of(study, named, given).tables
+    measured = tables_of(study, named, given)[0]
     delays = options.sensor.delays.model_copy(update={"measured": measured})
     sensor = options.sensor.model_copy(update={"delays": delays})
     effects = tuple(options.effects)
@@ -367,11 +317,12 @@ def fitted_distance(
     distance = twin_distance(observations, simulator, pose, generator, frames)
     if given is None and study.fit.known is not None:
         distance = distance + study.fit.known.error
-    tables = tables_of(study, named, given)
-    if not tables.beyond:
-        return distance
-    predicted = predicted_distance(observations, pose)
-    return distance + tables.error_beyond(study.fit.model, predicted)
+    beyond, coefficients = tables_of(study, named, given)[1], solution_of(study, named)[1]
+    if beyond:
+        numbers = torch.cat([own for _, own in beyond])
+        columns = study.fit.model.error_columns(predicted_distance(observations, pose))
+        distance = distance + columns[:, numbers] @ coefficients[numbers]
+    return distance
 
 
 def twin_distance(
@@ -435,7 +386,7 @@ def whole_patterns(
     rendered = given is None and study.fit.known is not None
     if not maps or not study.observations.is_sample or rendered:
         return {}
-    if tables_of(study, named, given).beyond:
+    if tables_of(study, named, given)[1]:
         return {}
     return {effect.name: _of_all_pixels(study, named, given, effect) for effect in maps}
 
