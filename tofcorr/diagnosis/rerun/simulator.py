@@ -100,7 +100,8 @@ def tables_of(
     if by_amplitude and variable is not None and seen is not None:
         at = _dense_where_dark(seen if variable == "amplitude" else seen * measured**2)
         values = total(by_amplitude, torch.ones_like(at), at)
-        amplitude = AmplitudeTable(**curve(at, values, amplitude), variable=variable)
+        found = curve(at, values, amplitude) | {"variable": variable}
+        amplitude = AmplitudeTable.model_validate(found)
     camera = study.observations.recording.camera
     sides = (torch.linspace(0, end - 1, _LATTICE).double() for end in (camera.height, camera.width))
     lattice = total(of_pixels, *torch.cartesian_prod(*sides).T).reshape(_LATTICE, _LATTICE)
