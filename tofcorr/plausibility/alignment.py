@@ -199,28 +199,15 @@ def _starts(scene: Scene, subsets: int = 12, size: int = 4) -> list[np.ndarray]:
         tried = [_procrustes(in_tool[one], own[one]) for one in drawn]
         off = [np.median(np.abs(in_tool @ one - own).sum(1)) for one in tried]
         rotations.append(tried[int(np.argmin(off))])
-    return [scene.guess, *(_with_translation(scene, one) for one in rotations)]
+    starts = np.tile(np.eye(4), (len(rotations), 1, 1))
+    starts[:, :3, :3] = rotations
+    return [scene.guess, *starts]
 
 
 def _procrustes(to: np.ndarray, of: np.ndarray) -> np.ndarray:
     """Return the rotation that turns directions `of` (N, 3) into `to` (N, 3)."""
     left, _, right = np.linalg.svd(to.T @ of)
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-
-
-def _with_translation(scene: Scene, rotation: np.ndarray) -> np.ndarray:
-    """Return the transform of a rotation with the translation that fits most frames."""
-    start = np.eye(4)
-    start[:3, :3] = rotation
-    residual, _, in_tool = _linear(scene, start, 0.0, 0.0)
-    mean = np.einsum("fa,fa->f", residual, scene.moments[:, 3])
-    weight = np.ones(len(mean))
-    for _ in range(5):
-        weighted = (in_tool * weight[:, None]).T
-        start[:3, 3] = -np.linalg.solve(weighted @ in_tool + 1e-6 * np.eye(3), weighted @ mean)
-        left = np.abs(mean + in_tool @ start[:3, 3])
-        weight = 1 / np.maximum(left, max(float(np.median(left)), _LEAST))
-    return start
 
 
 def _single_ray_start(scene: Scene) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tofcorr.plausibility.alignment import Alignment, Scene, align_with_free_walls
+from tofcorr.plausibility.alignment import Alignment, Scene, align, align_with_free_walls
 from tofcorr.plausibility.look import Look
 
 FAR_BETTER = 0.5
@@ -162,15 +162,11 @@ def best_explanations(
 
 def explanations(look: Look) -> Iterator[Explanation]:
     """Yield every mistake that can be undone, with the alignment then."""
-    for cause, advice, scene in (*_of_poses(look), *_of_planes(look)):
-        if (found := look.aligned(scene)) is not None:
-            yield cause, advice, found, False
-    for cause, advice, alignment in _of_unknowns(look):
-        if alignment is not None:
-            yield cause, advice, alignment, True
-    for cause, advice, scene in _of_images(look):
-        if (found := look.aligned(scene)) is not None:
-            yield cause, advice, found, False
+    for cause, advice, undone in (*_of_poses(look), *_of_planes(look), *_of_images(look)):
+        frees = not isinstance(undone, Scene)
+        found = undone if frees else look.aligned(undone)
+        if found is not None:
+            yield cause, advice, found, frees
 
 
 def _of_poses(look: Look, narrowest: float = 0.02) -> Iterator[tuple[str, str, Scene]]:
@@ -187,40 +183,25 @@ def _of_poses(look: Look, narrowest: float = 0.02) -> Iterator[tuple[str, str, S
             yield cause, advice, replace(scene, poses=poses)
 
 
-def _of_planes(look: Look) -> Iterator[tuple[str, str, Scene]]:
-    scene = look.scene
-    if look.planes == "known":
-        yield (
-            "the planes' normals nx, ny, nz point the wrong way and d does not",
-            "turn nx, ny, nz round",
-            replace(scene, normal=-scene.normal),
-        )
-        for unit, factor in _UNITS.items():
-            offset = factor * scene.offset
-            what = f"the planes' offsets d are in {unit}"
-            yield what, "write d in metres", replace(scene, offset=offset)
-
-
 WRONG_PLANES = "the recorded planes are wrong or of another frame"
 """Planes that are a few degrees off are no reason to refuse a recording."""
 
 
-def _of_unknowns(look: Look) -> Iterator[tuple[str, str, Alignment | None]]:
-    """Yield mistakes in what a fit takes as known."""
+def _of_planes(look: Look) -> Iterator[tuple[str, str, Scene | Alignment | None]]:
+    """Yield mistakes in planes, and then those in what else a fit takes as known."""
     scene = look.scene
     if look.planes != "known":
         return
-    yield (
-        WRONG_PLANES,
-        "measure them again, or train with `planes: unknown`",
-        align_with_free_walls(scene),
-    )
+    turned = "the planes' normals nx, ny, nz point the wrong way and d does not"
+    yield turned, "turn nx, ny, nz round", replace(scene, normal=-scene.normal)
+    for unit, factor in _UNITS.items():
+        in_metres = replace(scene, offset=factor * scene.offset)
+        yield f"the planes' offsets d are in {unit}", "write d in metres", in_metres
+    free = align_with_free_walls(scene)
+    yield WRONG_PLANES, "measure them again, or train with `planes: unknown`", free
     if scene.moves:
-        yield (
-            "two cameras, or one camera mounted twice, are in one recording",
-            "split it where the camera was changed",
-            _in_two_parts(look),
-        )
+        cause = "two cameras, or one camera mounted twice, are in one recording"
+        yield cause, "split it where the camera was changed", _in_two_parts(look)
     else:
         yield (
             "the planes are not in the camera's frame, which a recording without robot poses asks "
@@ -235,16 +216,13 @@ def _in_two_parts(look: Look, fewest: int = 6) -> Alignment | None:
 
     Either side has `fewest` frames at least: seven unknowns, three from a frame.
     """
-    scene, number, found = look.scene, np.arange(len(look.scene.poses)), []
+    number, found = np.arange(len(look.scene.poses)), []
     for share in (1 / 2, 1 / 4, 3 / 4, 1 / 3, 2 / 3):
         before = number < round(share * len(number))
         if min(before.sum(), (~before).sum()) >= fewest:
-            sides = [look.aligned(scene.some(part)) for part in (before, ~before)]
-            known = [side for side in sides if side is not None]
-            if len(known) == 2:
-                rms = np.concatenate([side.rms for side in known])
-                angle = np.concatenate([side.angle for side in known])
-                found.append(Alignment(np.eye(4), 0.0, 0.0, rms, angle))
+            one, other = (align(look.scene.some(part)) for part in (before, ~before))
+            rms, angle = np.append(one.rms, other.rms), np.append(one.angle, other.angle)
+            found.append(Alignment(np.eye(4), 0.0, 0.0, rms, angle))
     return min(found, key=lambda one: one.misfit, default=None)
 
 

@@ -20,7 +20,6 @@ from tofcorr.plausibility.finding import Inspection
 from tofcorr.plausibility.look import Look
 from tofcorr.version import __version__
 
-_TEMPLATE = "inspection.html.j2"
 _BLUE, _RED, _GREY = "#2166ac", "#b2182b", "#777777"
 
 
@@ -31,8 +30,17 @@ def write_page(found: Inspection, path: Path) -> None:
         CalibrationDataError: `path` does not end in .html, exists, or cannot be written.
     """
     refuse_page(path)
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    template = files("tofcorr.plausibility").joinpath("inspection.html.j2")
+    text = environment.from_string(template.read_text(encoding="utf-8")).render(
+        inspection=found,
+        figures={name: Markup(_svg(figure)) for name, figure in all_figures(found).items()},
+        version=__version__,
+    )
     with staged_file(path, CalibrationDataError) as part:
-        part.write_text(render(found), encoding="utf-8")
+        part.write_text(text, encoding="utf-8")
 
 
 def refuse_page(path: Path) -> None:
@@ -42,20 +50,6 @@ def refuse_page(path: Path) -> None:
             f"{path}: the page of an inspection is one file; expected a name that ends in .html"
         )
     refuse_existing(path)
-
-
-def render(found: Inspection) -> str:
-    """Return the page of an inspection."""
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    text = files("tofcorr.plausibility").joinpath(_TEMPLATE).read_text(encoding="utf-8")
-    return environment.from_string(text).render(
-        inspection=found,
-        worst=found.findings[0].severity if found.findings else "nothing",
-        figures={name: Markup(_svg(figure)) for name, figure in all_figures(found).items()},
-        version=__version__,
-    )
 
 
 def _svg(figure: Figure) -> str:
@@ -87,11 +81,11 @@ def depth_maps(look: Look, across: int = 64, frames: int = 40) -> Figure:
     used = np.isfinite(depth) & (depth > 0)
     if recording.mask is not None:
         used &= np.array(recording.mask[chosen, ::step, ::step]) > 0
-    figure = Figure(figsize=(9.4, 3.6), layout="constrained")
+    figure = Figure(figsize=(9, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _map(figure, left, _median(np.where(used, depth, np.nan)), "median depth, m")
-    share = _map(figure, right, 100 * used.mean(0), "frames in which a pixel is used, %")
-    share.set_clim(0, 100)
+    _map(figure, left, np.ma.median(np.ma.masked_where(~used, depth), axis=0), "median depth, m")
+    share = "frames in which a pixel is used, %"
+    _map(figure, right, 100 * used.mean(0), share).set_clim(0, 100)
     return figure
 
 
@@ -101,34 +95,29 @@ def poses_from_above(look: Look, found: Inspection) -> Figure:
     guess = np.asarray(look.recording.tool_from_camera)
     axis = (look.poses @ guess)[:, :3, 2]
     first, second = np.sort(np.argsort(-np.ptp(place, axis=0))[:2])
-    figure = Figure(figsize=(5.4, 4.2), layout="constrained")
+    figure = Figure(figsize=(5, 4), layout="constrained")
     axes = figure.subplots()
     length = max(float(np.ptp(place, axis=0).max()), 1e-3) / 8
     across, along = place[:, first], place[:, second]
-    axes.quiver(
-        *(across, along, length * axis[:, first], length * axis[:, second]),
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        color=_GREY,
-        width=0.004,
-    )
-    axes.update_datalim(place[:, [first, second]] + length * axis[:, [first, second]])
+    reach = length * axis[:, [first, second]]
+    # One unit of an arrow is one of the axes.
+    scale = {"angles": "xy", "scale_units": "xy", "scale": 1}
+    axes.quiver(across, along, *reach.T, color=_GREY, width=1 / 250, **scale)
+    axes.update_datalim(place[:, [first, second]] + reach)
     axes.plot(across, along, "o", color=_BLUE, markersize=4)
     odd = np.isin(look.sampled, list(found.outlying))
     axes.plot(across[odd], along[odd], "o", color=_RED, markersize=7)
     for k in np.flatnonzero(odd):
         axes.annotate(str(look.sampled[k]), (across[k], along[k]), color=_RED)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"{'xyz'[first]} of the world, m")
-    axes.set_ylabel(f"{'xyz'[second]} of the world, m")
+    axes.set(xlabel=f"{'xyz'[first]} of the world, m", ylabel=f"{'xyz'[second]} of the world, m")
     return figure
 
 
 def residuals(look: Look, found: Inspection) -> Figure:
     """Draw each frame's distance to its plane before and after the best alignment."""
     before = judged(look.scene, look.scene.guess if look.scene.moves else np.eye(4), 0.0, 0.0)
-    figure = Figure(figsize=(9.4, 3.4), layout="constrained")
+    figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
     axes.plot(look.frames, 1e3 * before.rms, "o", color=_GREY, markersize=4, label="as recorded")
     axes.plot(look.frames, 1e3 * look.rms, "o", color=_BLUE, markersize=4, label="best alignment")
@@ -140,8 +129,7 @@ def residuals(look: Look, found: Inspection) -> Figure:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_xlabel("frame")
-    axes.set_ylabel("distance to the plane, mm RMS")
+    axes.set(xlabel="frame", ylabel="distance to the plane, mm RMS")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(ncols=4, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     return figure
@@ -151,14 +139,5 @@ def _map(figure: Figure, axes: Axes, values: np.ndarray, title: str) -> AxesImag
     shown = axes.imshow(values)
     figure.colorbar(shown, ax=axes, shrink=0.9)
     axes.set_title(title, fontsize=10)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     return shown
-
-
-def _median(values: np.ndarray) -> np.ndarray:
-    """Return the median over the first axis; NaN where there is no value."""
-    some = np.isfinite(values).any(0)
-    found = np.full(values.shape[1:], np.nan)
-    found[some] = np.nanmedian(values[:, some], axis=0)
-    return found

@@ -285,10 +285,7 @@ class FittedValue:
 
 
 def fitted_values(
-    study: Study,
-    named: NamedEffects,
-    given_effects: Sequence[Mapping[str, Any]],
-    resamples: Tensor,
+    study: Study, named: NamedEffects, given_effects: Sequence[Mapping[str, Any]], resamples: Tensor
 ) -> tuple[FittedValue, ...]:
     """Return hand-eye transform, coefficients of the base terms, and those of the named effects.
 

@@ -348,7 +348,7 @@ def agreement(
         if abs(given.constant) > _LARGE_CONSTANT:
             yield note(
                 f"The distances are {1e3 * given.constant:+.0f} mm off on the whole, much for a "
-                "camera: is this the depth of the target, and in metres?",
+                "camera: is this the depth of the target, and in metres?"
             )
 
 
@@ -389,31 +389,29 @@ def _explained(
 
 def _unexplained(look: Look, excess: float, unusable: float = 0.008) -> Finding:
     """Return what says that no mistake explains the misfit; `unusable` metres spoil a fit."""
-    known = look.planes == "known"
-    unmeasured = "; if nobody measured the planes, use `planes: unknown`" if known else ""
+    hints = "; if nobody measured the planes, use `planes: unknown`"
+    hints = hints if look.planes == "known" else ""
     # Without the frequency, waves of the circular error cannot be told from wrong poses.
-    waves = look.recording.modulation_frequency is None
-    unstated = "; state `modulation_frequency_hz` if you know it" if waves else ""
+    if look.recording.modulation_frequency is None:
+        hints += "; state `modulation_frequency_hz` if you know it"
     far = int((look.rms > _HOPELESS).sum())
     others = f", {far} of {len(look.rms)} frames more than {_mm(_HOPELESS)}" if far else ""
     return Finding(
         "impossible" if excess > _HOPELESS else "doubtful",
         f"{_misfit(look)}{others}, and no usual mistake explains it: poses, planes or depth are of "
-        f"something else, or the poses scatter{unmeasured}{unstated}.",
+        f"something else, or the poses scatter{hints}.",
         spoils=excess > unusable,
     )
 
 
 def _misfit(look: Look) -> str:
-    given = look.given
-    angle = math.degrees(given.typical_angle)
-    turned = f" and {angle:.0f} degrees" if np.isfinite(angle) and angle >= 2 else ""
+    given, angle = look.given, math.degrees(look.given.typical_angle)
+    turned = f" and {angle:.0f} degrees" if angle >= 2 else ""
     far = abs(given.constant) > _LARGE_CONSTANT
     constant = f", with all distances {1e3 * given.constant:+.0f} mm off" if far else ""
-    planes = "walls" if look.planes == "unknown" else "recorded planes"
     return (
         f"After the best alignment of the camera the points lie {_mm(given.misfit)}{turned} off "
-        f"the {planes}{constant}"
+        f"the {'walls' if look.planes == 'unknown' else 'recorded planes'}{constant}"
     )
 
 
@@ -442,7 +440,7 @@ def _scale(
             check="scale",
         )
         return
-    share, error = given.slope, math.inf
+    share, error = 0.0, math.inf
     if look.linear is not None and look.scene.moves:
         share, error = length_scale(given, look.linear)
     if error > unsure:

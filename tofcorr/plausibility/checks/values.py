@@ -51,7 +51,7 @@ def units(
         )
     elif median > far:
         yield doubtful(
-            f"The median distance is {median:.3g} m, far for a wall: is depth.npy in metres?",
+            f"The median distance is {median:.3g} m, far for a wall: is depth.npy in metres?"
         )
     place = look.poses[:, :3, 3]
     extent = float(np.linalg.norm(place - np.median(place, axis=0), axis=1).max())
@@ -384,11 +384,7 @@ def _two_groups(score: np.ndarray) -> tuple[np.ndarray, float, float] | None:
 
 
 def two_cameras(
-    look: Look,
-    fewest: int = 16,
-    smaller: float = 0.25,
-    agree: float = 0.95,
-    apart: float = 2.5,
+    look: Look, fewest: int = 16, smaller: float = 0.25, agree: float = 0.95, apart: float = 2.5
 ) -> Iterator[Finding]:
     """Is the pattern of the pixels the same in all frames?
 
