@@ -13,6 +13,7 @@ from tofcorr.comparison.evaluate import evaluate_set
 from tofcorr.comparison.experiment import Experiment
 from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
 from tofcorr.correction.model import CalibrationModel, HandEye
+from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit, fit_hand_eye
@@ -21,10 +22,14 @@ from tofcorr.pixels.metrics import frame_errors
 from tofcorr.training.calibration import TrainingOptions
 
 
+@pytest.fixture
+def domain(dataset: Dataset) -> Domain:
+    return covered_domain(dataset, np.arange(dataset.num_frames))
+
+
 def test_every_split_is_measured_as_a_training_on_its_frames_would_be(
-    dataset: Dataset, evaluation: Experiment
+    dataset: Dataset, evaluation: Experiment, domain: Domain
 ) -> None:
-    domain = covered_domain(dataset, np.arange(dataset.num_frames))
     for protocol in ("half", "folds", "repeats"):
         values = evaluation.values[protocol]
         test = list(evaluation.splits[protocol].values())[-1]
@@ -40,9 +45,8 @@ def test_every_split_is_measured_as_a_training_on_its_frames_would_be(
 
 
 def test_before_is_the_recorded_hand_eye_without_correction(
-    dataset: Dataset, evaluation: Experiment
+    dataset: Dataset, evaluation: Experiment, domain: Domain
 ) -> None:
-    domain = covered_domain(dataset, np.arange(dataset.num_frames))
     hand_eye = HandEye(dataset.first.tool_from_camera)
     bare = CalibrationModel(ErrorModel(ErrorModelOptions(), domain), hand_eye)
     test = evaluation.splits["half"]["half"]
@@ -53,9 +57,8 @@ def test_before_is_the_recorded_hand_eye_without_correction(
 
 
 def test_hand_eye_only_is_the_fit_of_the_hand_eye_without_any_term(
-    dataset: Dataset, evaluation: Experiment
+    dataset: Dataset, evaluation: Experiment, domain: Domain
 ) -> None:
-    domain = covered_domain(dataset, np.arange(dataset.num_frames))
     train = np.setdiff1d(np.arange(dataset.num_frames), evaluation.splits["half"]["half"])
     alone = fit_hand_eye(
         dataset, train, TrainingOptions(name="x", model=ErrorModelOptions()), domain

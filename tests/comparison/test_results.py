@@ -48,6 +48,8 @@ def test_evaluate_returns_what_the_command_prints_and_writes(
     assert repr(evaluation) in printed
     written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert written == json.loads(json.dumps(evaluation.to_mapping()))
+    assert "Table 2" in printed
+    assert evaluation.options.num_fits == 8
 
 
 def test_select_returns_what_the_command_prints_and_writes(
@@ -57,6 +59,8 @@ def test_select_returns_what_the_command_prints_and_writes(
     assert repr(selection) in printed
     written = json.loads((tmp_path / "out" / "selection.json").read_text())
     assert written == json.loads(json.dumps(selection.to_mapping()))
+    assert (tmp_path / "out" / "selection.md").read_text() == selection.markdown()
+    assert "| EA |" in selection.markdown()
     assert selection.winner == "EA"
     assert selection.ties == []
 

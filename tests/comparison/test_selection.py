@@ -5,16 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from simulated_walls import EA, simulated_wall
 
-from tofcorr.cli.main import group as cli
 from tofcorr.comparison.experiment import groupings
 from tofcorr.comparison.options import SelectionOptions
 from tofcorr.comparison.select import rank_models
 from tofcorr.comparison.statistics import rank
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.options import dump_yaml
 from tofcorr.pixels.dataset import Dataset
 
 E0 = {
@@ -106,15 +103,3 @@ def test_a_recording_of_one_target_is_not_compared_by_target(tmp_path: Path) -> 
 def test_two_models_of_one_name_are_refused() -> None:
     with pytest.raises(ConfigError, match="'E0' stands twice"):
         SelectionOptions.from_mapping({"models": [MODELS[0], MODELS[0]]}, "test")
-
-
-def test_the_command_writes_the_choice(wall: Dataset, tmp_path: Path) -> None:
-    config = tmp_path / "select.yaml"
-    config.write_text(dump_yaml({"models": MODELS, "by": ["image"], "folds": 3}))
-    out = tmp_path / "out"
-    arguments = ["select", "--config", str(config), "--recording", str(wall.first.path)]
-    result = CliRunner().invoke(cli, [*arguments, "--out", str(out)], catch_exceptions=False)
-    assert result.exit_code == 0
-    found = json.loads((out / "selection.json").read_text())
-    assert found["winner"] == "EA"
-    assert "| EA |" in (out / "selection.md").read_text()

@@ -59,18 +59,16 @@ def wavy_fit(wavy: Dataset) -> Fit:
 def test_network_is_kept_and_helps_where_the_truth_is_outside_every_polynomial(
     wavy: Dataset, wavy_fit: Fit
 ) -> None:
-    assert wavy_fit.residual is not None
-    assert wavy_fit.residual.kept
-    assert "was kept" in wavy_fit.residual.in_words()
+    assert wavy_fit.model.error.residual is not None
+    assert "was kept" in str(wavy_fit.residual)
     assert held_out(wavy, wavy_fit) < 0.7 * held_out(wavy, fitted(wavy, CORE))
 
 
 def test_network_is_dropped_where_the_core_is_the_truth(tmp_path: Path) -> None:
     dataset = simulated_wall(tmp_path / "recording")
     found = fitted(dataset, CORE, residual=NETWORK)
-    assert found.residual is not None
-    assert not found.residual.kept
-    assert "was dropped" in found.residual.in_words()
+    assert found.model.error.residual is None
+    assert "was dropped" in str(found.residual)
     assert held_out(dataset, found) == held_out(dataset, fitted(dataset, CORE))
 
 

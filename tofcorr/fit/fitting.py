@@ -55,7 +55,7 @@ from tofcorr.estimation.uncertainty import (
     observability,
     prior_on_undetermined,
 )
-from tofcorr.fit.problem import Core, Fit, FitOptions, Problem, ResidualOutcome, Shift, build_model
+from tofcorr.fit.problem import Core, Fit, FitOptions, Problem, Shift, build_model
 from tofcorr.fit.residual import fit_residual
 from tofcorr.fit.walls import recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights
@@ -333,7 +333,7 @@ def _with_covariance(problem: Problem, core: Core, weights: PixelWeights | None)
         **vars(core),
         model=model,
         domain=problem.domain,
-        optimum=core.solution.parameters if outcome is not None and outcome.kept else optimum,
+        optimum=optimum if model.error.residual is None else core.solution.parameters,
         hand_eye_only=hand_eye_only,
         covariance=covariance,
         poses=poses,
@@ -347,9 +347,7 @@ def _with_covariance(problem: Problem, core: Core, weights: PixelWeights | None)
 
 def _completed(
     problem: Problem, core: Core, weights: PixelWeights | None
-) -> tuple[
-    Problem, Core, CalibrationModel, ResidualOutcome | None, DistanceNoise | None, Shift | None
-]:
+) -> tuple[Problem, Core, CalibrationModel, str | None, DistanceNoise | None, Shift | None]:
     """Decide on the residual network, take the noise's shift off, and add the fixed pattern.
 
     Returns:

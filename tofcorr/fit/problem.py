@@ -222,30 +222,6 @@ class Problem:
         return min(candidates, key=lambda candidate: float(objective.loss(candidate)))
 
 
-class ResidualOutcome(NamedTuple):
-    """How the residual network was decided on.
-
-    Attributes:
-        kept: Whether the model has it.
-        core_mm: RMS distance of held-out pixels to their planes without it, millimetres.
-        network_mm: The same with it.
-        p_value: One-sided, of a network that does not help.
-    """
-
-    kept: bool
-    core_mm: float
-    network_mm: float
-    p_value: float
-
-    def in_words(self) -> str:
-        """Return the decision in one sentence."""
-        return (
-            f"The residual network was {'kept' if self.kept else 'dropped'}: on held-out images "
-            f"{self.network_mm:.2f} mm RMS with it, {self.core_mm:.2f} mm without "
-            f"(p = {self.p_value:.3g})."
-        )
-
-
 class Shift(NamedTuple):
     """How far something moves the hand-eye transform that the fit does not estimate.
 
@@ -347,7 +323,7 @@ class Fit(Core):
         hand_eye_only: The best hand-eye transform without any depth correction.
         covariance: Uncertainty of the parameters, by leaving out one pose at a time.
         poses: The pose of each image fitted, shape (N,), counted from zero.
-        residual: How the residual network was decided on; None if none was asked for.
+        residual: How the residual network was decided on, one sentence; None if none was asked for.
         weights: The weight of each pixel; None if all have the same.
         walls: The estimated walls; None if the recorded ones were used.
         noise: Of a measured distance; None if unknown.
@@ -366,7 +342,7 @@ class Fit(Core):
     hand_eye_only: Parameters
     covariance: Covariance
     poses: Tensor
-    residual: ResidualOutcome | None
+    residual: str | None
     weights: PixelWeights | None
     walls: FoundWalls | None
     noise: DistanceNoise | None

@@ -14,13 +14,13 @@ from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.regularisation import total_weight
 from tofcorr.estimation.robust import student_tail
 from tofcorr.estimation.solvers import SolverOptions, minimise, whitening
-from tofcorr.fit.problem import Core, Problem, ResidualOptions, ResidualOutcome
+from tofcorr.fit.problem import Core, Problem, ResidualOptions
 from tofcorr.pixels.sample import FramePixels, draw_pixels
 
 
 def fit_residual(
     problem: Problem, core: Core, error: ErrorModel, options: ResidualOptions, level: float = 0.05
-) -> tuple[ResidualOutcome, ResidualNetwork | None, Parameters]:
+) -> tuple[str, ResidualNetwork | None, Parameters]:
     """Train a network on what a core leaves, and decide by cross-validation whether it stays.
 
     Args:
@@ -33,8 +33,8 @@ def fit_residual(
             probability.
 
     Returns:
-        The decision; the network, trained on all images, None if it was dropped; hand-eye and
-        coefficients that go with it.
+        The decision in one sentence; the network, trained on all images, None if it was dropped;
+        hand-eye and coefficients that go with it.
     """
     frames, domain = np.sort(problem.frames), problem.domain
     sample = draw_pixels(problem.dataset, frames, options.pixels, options.network.seed)
@@ -57,8 +57,11 @@ def fit_residual(
     if options.keep == "always" or p_value < level:
         network, best = _train(core, error, sample, domain, options)
     without, with_network = (1e3 * float(np.nanmean(row)) ** 0.5 for row in square)
-    outcome = ResidualOutcome(network is not None, without, with_network, p_value)
-    return outcome, network, best
+    words = (
+        f"The residual network was {'dropped' if network is None else 'kept'}: on held-out images "
+        f"{with_network:.2f} mm RMS with it, {without:.2f} mm without (p = {p_value:.3g})."
+    )
+    return words, network, best
 
 
 def _p_value(gain: np.ndarray) -> float:

@@ -241,7 +241,7 @@ def warnings(
         *shortcomings(support, moves=free, with_intensity=fit.model.error.needs_amplitude()),
         few if images < 10 else None,
         *uncertain,
-        None if fit.residual is None else fit.residual.in_words(),
+        fit.residual,
         None
         if robot_moves
         else "No robot pose changes: the hand-eye transform is held at the identity.",
