@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from training.trained import CONFIG
 
 import tofcorr
@@ -22,17 +23,6 @@ CAMERA = tofcorr.CameraIntrinsics(
 )
 WALL = 0.9
 """Distance of the wall from the tool in every frame, metres."""
-
-
-def _turned(across: float, down: float, roll: float) -> np.ndarray:
-    """Return a rotation about the camera's x, y and z axes, shape (3, 3)."""
-    rotation = np.eye(3)
-    for angle, (a, b) in ((down, (1, 2)), (across, (2, 0)), (roll, (0, 1))):
-        turn = np.eye(3)
-        turn[a, a] = turn[b, b] = np.cos(angle)
-        turn[b, a], turn[a, b] = np.sin(angle), -np.sin(angle)
-        rotation = rotation @ turn
-    return rotation
 
 
 def _recording(folder: Path, frames: int, spread: float) -> Path:
@@ -51,7 +41,8 @@ def _recording(folder: Path, frames: int, spread: float) -> Path:
     ) as writer:
         for number in range(frames):
             pose = np.eye(4)
-            pose[:3, :3] = _turned(*generator.uniform((-0.5, -0.5, -1.5), (0.5, 0.5, 1.5)).tolist())
+            across, down, roll = generator.uniform((-0.5, -0.5, -1.5), (0.5, 0.5, 1.5))
+            pose[:3, :3] = Rotation.from_euler("XYZ", (down, across, roll)).as_matrix()
             pose[:2, 3] = generator.uniform(-0.3, 0.3, 2)
             pose[2, 3] = generator.uniform(-spread, spread)
             camera = pose @ tool_from_camera

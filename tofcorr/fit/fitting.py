@@ -106,7 +106,26 @@ def fit(
     """
     with solvable(dataset.first.path, "fit"), thread_number(1):
         problem = Problem(dataset, np.asarray(frames), options, domain, watcher, resumed)
-        return _with_covariance(*_solved(problem, moments))
+        problem, core, weights = _solved(problem, moments)
+        optimum, prior, poses = core.solution.parameters, core.total_prior, problem.poses()
+        # At the least loss, where the gradients of the poses sum to zero.
+        covariance = jackknife_covariance(core.moments, optimum, prior, poses, problem.estimated)
+        hand_eye_only = hand_eye_alone(problem, core.moments)
+        problem, core, model, outcome, noise, shift = _completed(problem, core, weights)
+        return Fit(
+            **vars(core),
+            model=model,
+            domain=problem.domain,
+            optimum=optimum if model.error.residual is None else core.solution.parameters,
+            hand_eye_only=hand_eye_only,
+            covariance=covariance,
+            poses=poses,
+            residual=outcome,
+            weights=weights,
+            walls=problem.walls,
+            noise=noise,
+            noise_shift=shift,
+        )
 
 
 def fit_model(
@@ -320,29 +339,6 @@ def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
     hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
     hand_eye.rebase(parameters.tool_from_camera)
     return CalibrationModel(error, hand_eye)
-
-
-def _with_covariance(problem: Problem, core: Core, weights: PixelWeights | None) -> Fit:
-    """Add the covariance, the hand-eye transform alone, and all that is not in the core."""
-    optimum, prior, poses = core.solution.parameters, core.total_prior, problem.poses()
-    # At the least loss, where the gradients of the poses sum to zero.
-    covariance = jackknife_covariance(core.moments, optimum, prior, poses, problem.estimated)
-    hand_eye_only = hand_eye_alone(problem, core.moments)
-    problem, core, model, outcome, noise, shift = _completed(problem, core, weights)
-    return Fit(
-        **vars(core),
-        model=model,
-        domain=problem.domain,
-        optimum=optimum if model.error.residual is None else core.solution.parameters,
-        hand_eye_only=hand_eye_only,
-        covariance=covariance,
-        poses=poses,
-        residual=outcome,
-        weights=weights,
-        walls=problem.walls,
-        noise=noise,
-        noise_shift=shift,
-    )
 
 
 def _completed(
