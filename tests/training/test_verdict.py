@@ -11,6 +11,7 @@ from training.trained import CONFIG, Trained
 
 import tofcorr
 from tofcorr.estimation.solvers import Stopped
+from tofcorr.fit.problem import Fit
 from tofcorr.training.judgement import beyond_noise, judge
 from tofcorr.training.support import recording_support
 
@@ -49,6 +50,12 @@ def test_an_error_that_the_model_lacks_is_no_good_run(tmp_path: Path) -> None:
     assert (np.abs(1e3 * off) <= report["hand_eye"]["translation_ci95_mm"]).all()
 
 
+def judged(trained: Trained, fit: Fit) -> tuple[str, str]:
+    train, hand_eye = trained.result.calibration.train, fit.solution.parameters.tool_from_camera
+    support, found = recording_support(trained.data, train, hand_eye), trained.report()
+    return judge(fit, found["error_mm"], support, tofcorr.inspect(trained.recording))
+
+
 @pytest.mark.parametrize(
     ("stopped", "expected"), [("not_finite", "do not use"), ("iteration_limit", "usable")]
 )
@@ -56,25 +63,18 @@ def test_a_fit_that_was_rolled_back_from_nan_is_not_to_be_used(
     trained: Trained, stopped: Stopped, expected: str
 ) -> None:
     """It was `usable`, as one that was merely not finished."""
-    fit, data = trained.result.fit, trained.data
-    train = trained.result.calibration.train
-    support = recording_support(data, train, fit.solution.parameters.tool_from_camera)
-    inspection = tofcorr.inspect(trained.recording)
+    fit = trained.result.fit
     ended = replace(fit, solution=replace(fit.solution, stopped=stopped))
-    assert judge(ended, trained.report()["error_mm"], support, inspection)[0] == expected
+    assert judged(trained, ended)[0] == expected
 
 
 def test_a_good_run_knows_the_hand_eye_by_its_own_standard_errors(trained: Trained) -> None:
     """A run whose poses scattered, with a standard error of 11 mm, said that it was determined."""
-    fit, data = trained.result.fit, trained.data
-    train = trained.result.calibration.train
-    support = recording_support(data, train, fit.solution.parameters.tool_from_camera)
-    inspection = tofcorr.inspect(trained.recording)
-    errors = trained.report()["error_mm"]
-    assert judge(fit, errors, support, inspection)[0] == "good"
+    fit = trained.result.fit
+    assert judged(trained, fit)[0] == "good"
     matrix = fit.covariance.matrix.clone()
     matrix[2, 2] += 11e-3**2
     scattered = replace(fit, covariance=replace(fit.covariance, matrix=matrix))
-    verdict, reason = judge(scattered, errors, support, inspection)
+    verdict, reason = judged(trained, scattered)
     assert verdict == "usable"
     assert "known to 11." in reason
