@@ -58,102 +58,67 @@ def _adding(*options: Callable[[Command], Command]) -> Callable[[Command], Comma
     return add
 
 
-def shown_option(
-    flag: str,
-    default: float | str,
-    text: str,
-    *names: str,
-    **more: Any,  # noqa: ANN401
-) -> Callable[[Command], Command]:
-    """Return an option whose help shows its default."""
-    return click.option(flag, *names, default=default, show_default=True, help=text, **more)
+def option(flag: str, text: str, *names: str, **more: Any) -> Callable[[Command], Command]:  # noqa: ANN401
+    """Return an option with its help, of which a default is shown."""
+    return click.option(flag, *names, show_default="default" in more, help=text, **more)
 
 
-depth_kind_option = shown_option(
-    "--depth-kind",
-    "z",
-    "z: along the optical axis; radial: along the viewing ray.",
-    type=click.Choice(["z", "radial"]),
+depth_kind_option = option(
+    "--depth-kind", "z: along the optical axis; radial: along the viewing ray.",
+    default="z", type=click.Choice(["z", "radial"]),
+)  # fmt: skip
+pose_format_option = option(
+    "--pose-format", "Left out: told from the file.",
+    type=click.Choice(["tum", "csv", "matrix", "matrices", "moveit"]),
+)  # fmt: skip
+
+_FILES = (
+    "YAML or JSON with K and distortion, ROS camera_info, OpenCV file, text of a 3x3 matrix, or a "
+    "shipped name."
 )
-
+_LENS = "With --focal: K1,K2,P1,P2[,K3...]."
 intrinsics_options = _adding(
-    click.option(
-        "--intrinsics",
-        help="YAML or JSON with K and distortion, ROS camera_info, OpenCV file, text of a 3x3 "
-        "matrix, or a shipped name.",
-    ),
-    click.option("--calibrate", is_flag=True, help="Calibrate the intrinsics from the boards."),
-    click.option("--focal", type=NumberList(1, 2), help="Focal length F or FX,FY, pixels."),
-    click.option("--centre", type=NumberList(2), help="Principal point CX,CY, pixels."),
-    click.option(
-        "--distortion", type=NumberList(4, 5, 8, 12, 14), help="With --focal: K1,K2,P1,P2[,K3...]."
-    ),
+    option("--intrinsics", _FILES),
+    option("--calibrate", "Calibrate the intrinsics from the boards.", is_flag=True),
+    option("--focal", "Focal length F or FX,FY, pixels.", type=NumberList(1, 2)),
+    option("--centre", "Principal point CX,CY, pixels.", type=NumberList(2)),
+    option("--distortion", _LENS, type=NumberList(4, 5, 8, 12, 14)),
 )
 """Adds the options that say where the camera intrinsics come from."""
 
-pose_format_option = click.option(
-    "--pose-format",
-    type=click.Choice(["tum", "csv", "matrix", "matrices", "moveit"]),
-    help="Left out: told from the file.",
-)
-
+_COUNTS = "Millimetres per count; left out: 1 for whole numbers, 1000 (metres) for floats."
+_NONE = "Numbers that mean 'no return', besides NaN."
+_TURNS = "Degrees clockwise by which images are turned to fit the intrinsics."
 coding_options = _adding(
-    click.option(
-        "--depth-unit-mm",
-        "unit_mm",
-        type=float,
-        help="Millimetres per count; left out: 1 for whole numbers, 1000 (metres) for floats.",
-    ),
-    shown_option(
-        "--invalid",
-        "0,65535",
-        "Numbers that mean 'no return', besides NaN.",
-        type=NumberList(*range(1, 9)),
-    ),
-    click.option("--big-endian", is_flag=True, help="The two bytes of each number are swapped."),
-    shown_option(
-        "--rotate",
-        "0",
-        "Degrees clockwise by which images are turned to fit the intrinsics.",
-        type=click.Choice(["0", "90", "180", "270"]),
-    ),
+    option("--depth-unit-mm", _COUNTS, "unit_mm", type=float),
+    option("--invalid", _NONE, default="0,65535", type=NumberList(*range(1, 9))),
+    option("--big-endian", "The two bytes of each number are swapped.", is_flag=True),
+    option("--rotate", _TURNS, default="0", type=click.Choice(["0", "90", "180", "270"])),
 )
 """Adds the options that say how the numbers of depth images are to be read."""
 
+_MOVED = "The camera stands still; the robot moves the target in front of it."
 _CLOCKS = "Added to the images' time stamps, if the clocks differ by a known amount."
+_LATE = "How much later images are stamped than poses; left out: estimated."
 _TOLERANCE = "How far a pixel of a wall may be from its plane: the error before calibration."
-
+_CAMERA = "Of the camera; left out: as images call it, else 'camera'."
+_FULL = "Pixels at or above this amplitude are saturated and not used."
 posed_options = _adding(
-    click.option(
-        "--eye-to-hand",
-        is_flag=True,
-        help="The camera stands still; the robot moves the target in front of it.",
-    ),
+    option("--eye-to-hand", _MOVED, is_flag=True),
     depth_kind_option,
-    shown_option("--time-offset-s", 0.0, _CLOCKS),
-    click.option(
-        "--lag-s",
-        type=float,
-        help="How much later images are stamped than poses; left out: estimated.",
+    option("--time-offset-s", _CLOCKS, default=0.0),
+    option("--lag-s", _LATE, type=float),
+    option(
+        "--pose-tolerance-s", "Largest time between an image and the nearest pose.", default=0.2
     ),
-    shown_option("--pose-tolerance-s", 0.2, "Largest time between an image and the nearest pose."),
-    click.option(
-        "--keep-moving", is_flag=True, help="Also use images taken while the robot moved."
-    ),
-    shown_option("--images-per-stop", 3, "At most so many images of one stop of the robot."),
-    shown_option("--tolerance-mm", 30.0, _TOLERANCE),
-    shown_option("--base-frame", "base", "Name of the base."),
-    shown_option("--tool-frame", "tool", "Name of the tool."),
-    click.option(
-        "--camera-frame", help="Of the camera; left out: as images call it, else 'camera'."
-    ),
-    click.option(
-        "--saturation",
-        "saturation_amplitude",
-        type=float,
-        help="Pixels at or above this amplitude are saturated and not used.",
-    ),
-    click.option("--modulation-frequency-hz", type=float, help="If known."),
+    option("--keep-moving", "Also use images taken while the robot moved.", is_flag=True),
+    option("--images-per-stop", "At most so many images of one stop of the robot.", default=3),
+    option("--tolerance-mm", _TOLERANCE, default=30.0),
+    option("--base-frame", "Name of the base.", default="base"),
+    option("--tool-frame", "Name of the tool.", default="tool"),
+    option("--camera-frame", _CAMERA),
+    option("--saturation", _FULL, "saturation_amplitude", type=float),
+    option("--modulation-frequency-hz", "If known.", type=float),
 )
 """Adds the options that say how images and poses of a moving robot become a recording."""
 
@@ -194,7 +159,7 @@ def take_coding(given: dict[str, Any]) -> "DepthCoding":
     """
     from tofcorr.importing.images import DepthCoding
 
-    values = {key: given.pop(key) for key in ("unit_mm", "invalid", "big_endian", "rotate")}
+    values = {key: given.pop(key) for key in DepthCoding.model_fields}
     return DepthCoding.from_mapping(values | {"rotate": int(values["rotate"])}, _command_name())
 
 
@@ -210,20 +175,17 @@ def take_posed_options(given: dict[str, Any], camera_frame: str = "") -> "PosedO
     """
     from tofcorr.importing.robot_images import PosedOptions
 
-    lag, world, tool = (given.pop(key) for key in ("lag_s", "base_frame", "tool_frame"))
-    camera = given.pop("camera_frame") or camera_frame or "camera"
-    mapping = {
-        "walls": {"tolerance_mm": given.pop("tolerance_mm")},
-        "lag_s": "auto" if lag is None else lag,
-        "moving": "keep" if given.pop("keep_moving") else "leave_out",
-        "frames": {"world": world, "tool": tool, "camera": camera},
+    given["frames"] = {
+        "world": given.pop("base_frame"),
+        "tool": given.pop("tool_frame"),
+        "camera": given.pop("camera_frame") or camera_frame or "camera",
     }
-    same = (
-        *("eye_to_hand", "depth_kind", "time_offset_s", "pose_tolerance_s", "images_per_stop"),
-        *("saturation_amplitude", "modulation_frequency_hz"),
-    )
-    given_same = {key: given.pop(key) for key in same}
-    return PosedOptions.from_mapping(mapping | given_same, _command_name())
+    given["walls"] = {"tolerance_mm": given.pop("tolerance_mm")}
+    given["moving"] = "keep" if given.pop("keep_moving") else "leave_out"
+    if given["lag_s"] is None:
+        del given["lag_s"]
+    own = {key: given.pop(key) for key in PosedOptions.model_fields if key in given}
+    return PosedOptions.from_mapping(own, _command_name())
 
 
 def _command_name() -> str:

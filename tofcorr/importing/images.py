@@ -158,7 +158,7 @@ def read_array(path: Path) -> np.ndarray:
         size = path.stat().st_size
     except OSError as error:
         raise RefusedViewError(f"{path.name} cannot be read ({error.strerror})") from None
-    if size > _LARGEST_GB * 1e9:
+    if size > _LARGEST_GB * 10**9:
         raise RefusedViewError(f"{path.name} is larger than {_LARGEST_GB} GB")
     array = {".npy": _npy, ".exr": _exr}.get(path.suffix.lower(), read_image)(path)
     if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
@@ -275,7 +275,7 @@ def coded_image(
     values = counts.astype(np.float64)
     usable = np.isfinite(values) & (values > 0) & ~np.isin(values, coding.invalid)
     unit_mm = coding.unit_mm or (1000.0 if counts.dtype.kind == "f" else 1.0)
-    metres = np.where(usable, values * (1e-3 * unit_mm), np.nan)
+    metres = np.where(usable, values * unit_mm / 1000, np.nan)
     image = DepthImage(turned(metres.astype(np.float32), coding.rotate))
     if amplitude is None:
         return image

@@ -10,14 +10,13 @@ from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.images import DepthImage
 from tofcorr.importing.robot_images import Chosen, ImagesOfPlanes
-from tofcorr.importing.walls.finding import OFF_WALL_MM, FoundWalls, walls_of_planes
-from tofcorr.importing.walls.hand_eye import distances, seen_planes
-from tofcorr.importing.walls.image_planes import WallOptions
+from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
+from tofcorr.importing.walls.hand_eye import distances, exact
+from tofcorr.importing.walls.image_planes import ImagePlane, WallOptions, seen_planes
 from tofcorr.plausibility.mistakes import FAR_BETTER, IN_IMAGES, IN_POSES
 
 _NEAREST, _FARTHEST = 0.03, 50.0
@@ -50,7 +49,7 @@ def refuse_impossible_depth(median_depth: np.ndarray, origin: str) -> None:
         )
     if typical < _NEAREST:
         raise CalibrationDataError(
-            f"{origin}: the median depth is {1e3 * typical:.3g} mm. Is it in metres? Add "
+            f"{origin}: the median depth is {1000 * typical:.3g} mm. Is it in metres? Add "
             "--depth-unit-mm 1000."
         )
 
@@ -76,7 +75,7 @@ def refuse_impossible_poses(world_from_tool: np.ndarray, origin: str, least: flo
         )
     if max(extent, turned) < least:
         raise CalibrationDataError(
-            f"{origin}: all poses are the same to {1e3 * extent:.2g} mm; expected a robot that "
+            f"{origin}: all poses are the same to {1000 * extent:.2g} mm; expected a robot that "
             "moves and turns the camera."
         )
 
@@ -91,41 +90,12 @@ _OF_POSES = {
 }
 """What undoes usual mistakes in poses, and advice."""
 
-Image = tuple[Tensor, Tensor]
-"""Distances along the ray, metres, and where they are valid, each of shape (H, W)."""
 
-
-def _of_images(
-    images: ImagesOfPlanes, *, amplitudes: bool
-) -> dict[str, Callable[[DepthImage], Image]]:
-    """Return mistakes in images: what undoes them, and advice; and how."""
-
-    def scaled(factor: float, image: DepthImage) -> Image:
-        distance, valid = images.along_rays(image)
-        return factor * distance, valid
-
-    def mirrored(image: DepthImage) -> Image:
-        depth = IN_IMAGES["mirrored"].undo(image.depth)
-        return images.along_rays(DepthImage(np.ascontiguousarray(depth)))
-
-    def exchanged(image: DepthImage) -> Image:
-        assert image.amplitude is not None
-        counts = np.where(image.amplitude > 0, image.amplitude, np.nan)
-        unit = 1e-3 if np.nanmedian(counts) > _FARTHEST else 1.0
-        return images.along_rays(DepthImage((unit * counts).astype(np.float32)))
-
-    mistakes = {
-        "the columns mirrored: does the camera's driver flip its images? Turn that off, or flip "
-        "them back.": mirrored
-    } | {
-        f"all distances multiplied by {factor:g}: is --depth-unit-mm right?": partial(
-            scaled, factor
-        )
-        for factor in (1 / 10, 10)
-    }
-    if amplitudes:
-        mistakes["depth and amplitude exchanged: swap --depth and --amplitude."] = exchanged
-    return mistakes
+def _amplitudes(image: DepthImage) -> np.ndarray:
+    """Return the amplitudes of an image as if they were its depth, metres."""
+    assert image.amplitude is not None
+    counts = np.where(image.amplitude > 0, image.amplitude, np.nan)
+    return counts / (1000 if np.nanmedian(counts) > _FARTHEST else 1)
 
 
 def _shifts() -> list[int]:
@@ -134,6 +104,52 @@ def _shifts() -> list[int]:
     Each costs a search for walls, and more than three images are rarely dropped in a row.
     """
     return [shift for most in (1, 2, 3) for shift in (most, -most)]
+
+
+def _mistakes(*, lists: bool, amplitudes: bool) -> dict[str, dict[str, Callable[..., np.ndarray]]]:
+    """Return what undoes each mistake, in `poses` or in the `depth` of an image, by its advice."""
+    found = {said: {"poses": IN_POSES[name].undo} for name, said in _OF_POSES.items()}
+    for shift in _shifts() if lists else ():
+        said = f"the poses shifted by {shift:+d}: was an image or a pose dropped?"
+        found[said] = {"poses": partial(np.roll, shift=shift, axis=0)}
+    said = "the columns mirrored: does the camera's driver flip its images? Turn that off, or flip "
+    found[said + "them back."] = {"depth": lambda image: IN_IMAGES["mirrored"].undo(image.depth)}
+    for factor in (1 / 10, 10):
+        said = f"all distances multiplied by {factor:g}: is --depth-unit-mm right?"
+        found[said] = {"depth": lambda image, factor=factor: factor * image.depth}
+    if amplitudes:
+        said = "depth and amplitude exchanged: swap --depth and --amplitude."
+        found[said] = {"depth": _amplitudes}
+    return found
+
+
+def _misfit(
+    images: ImagesOfPlanes,
+    options: WallOptions,
+    used: Chosen,
+    poses: Callable[[np.ndarray], np.ndarray] = np.asarray,
+    depth: Callable[[DepthImage], np.ndarray] | None = None,
+) -> float:
+    """Return the misfit of 30 images with a mistake undone: enough for every wall of a room."""
+    few = np.unique(np.linspace(0, len(used.images) - 1, 30).round().astype(int))
+
+    def planes(k: int) -> list[ImagePlane]:
+        if depth is None:
+            return images.planes(k)
+        undone = depth(images.read(k)).astype(np.float32)
+        return images.planes_in(DepthImage(np.ascontiguousarray(undone)))
+
+    try:
+        return walls_of_planes(
+            [planes(k) for k in used.images[few].tolist()],
+            [images.source.names[k] for k in used.images[few]],
+            images.rays[..., 0].numel(),
+            poses(used.world_from_tool)[few],
+            options,
+            images.source.origin,
+        ).misfit_mm
+    except CalibrationDataError:
+        return FoundWalls.OFF_WALL_MM
 
 
 def explain_misfit(
@@ -164,35 +180,18 @@ def explain_misfit(
     Raises:
         CalibrationDataError: A mistake explains it; the message names it, and both misfits.
     """
-    before, origin = OFF_WALL_MM if given is None else given.misfit_mm, images.source.origin
+    farthest, origin = FoundWalls.OFF_WALL_MM, images.source.origin
+    before = farthest if given is None else given.misfit_mm
     if before <= _SUSPICIOUS_MM:
         return []
     if lists and given is not None:
         _refuse_shifted_part(images, chosen, given)
 
-    def misfit(
-        used: Chosen,
-        poses: Callable[[np.ndarray], np.ndarray] = np.asarray,
-        image: Callable[[DepthImage], Image] | None = None,
-    ) -> float:
-        """Return the misfit of 30 images with a mistake undone: enough for every wall of a room."""
-        few = np.unique(np.linspace(0, len(used.images) - 1, 30).round().astype(int))
-        names = [images.source.names[k] for k in used.images[few]]
-        planes = [
-            images.planes_in(*image(images.read(k))) if image else images.planes(k)
-            for k in used.images[few].tolist()
-        ]
-        size, own = images.rays[..., 0].numel(), poses(used.world_from_tool)[few]
-        return walls_of_planes(planes, names, size, own, options, origin).misfit_mm
-
     def refuse_best(given_as: str, trials: Mapping[str, Callable[[], float]]) -> None:
         """Refuse the mistake that leaves least, if that is little; what leaves none ends it."""
         left = {}
         for said, trial in trials.items():
-            try:
-                left[said] = trial()
-            except CalibrationDataError:
-                left[said] = OFF_WALL_MM
+            left[said] = trial()
             if left[said] <= FAR_BETTER * _SUSPICIOUS_MM:
                 break
         best = min(left, key=left.__getitem__, default="")
@@ -202,29 +201,28 @@ def explain_misfit(
                 f"{left[best]:.0f} mm with {best}"
             )
 
-    of_poses = {said: IN_POSES[name].undo for name, said in _OF_POSES.items()}
-    of_pairs = {
-        f"the poses shifted by {shift:+d}: was an image or a pose dropped?": partial(
-            np.roll, shift=shift, axis=0
-        )
-        for shift in (_shifts() if lists else ())
-    }
+    def late_by(late: float) -> float:
+        """Return the misfit of the images paired with other poses."""
+        try:
+            return _misfit(images, options, at_lag(late))
+        except CalibrationDataError:
+            return farthest
+
     amplitudes = images.read(int(chosen.images[0])).amplitude is not None
-    of_images = _of_images(images, amplitudes=amplitudes)
-    refuse_best("images and poses", {
-        **{said: partial(misfit, chosen, undo) for said, undo in (of_poses | of_pairs).items()},
-        **{said: partial(misfit, chosen, image=undo) for said, undo in of_images.items()},
-    })  # fmt: skip
-    refuse_best("the time stamps", {
-        f"images {abs(late):.1f} s {'late' if late > 0 else 'early'}: add --time-offset-s "
-        f"{-late:.1f}.": lambda late=late: misfit(at_lag(late))
+    mistakes = _mistakes(lists=lists, amplitudes=amplitudes)
+    tried = partial(_misfit, images, options, chosen)
+    refuse_best("images and poses", {said: partial(tried, **mistakes[said]) for said in mistakes})
+    said = "images {:.1f} s {}: add --time-offset-s {:.1f}."
+    trials = {
+        said.format(abs(late), "late" if late > 0 else "early", -late): partial(late_by, late)
         for late in far_lags()
-    })  # fmt: skip
+    }
+    refuse_best("the time stamps", trials)
     if given is None:
         return []
     return [
         f"{len(np.unique(given.image))} of {len(chosen.images)} images show a wall, and planes are "
-        f"off by {before:.0f} mm (one on no wall counts {OFF_WALL_MM:.0f}); up to "
+        f"off by {before:.0f} mm (one on no wall counts {farthest:.0f}); up to "
         f"{_SUSPICIOUS_MM:.0f} are expected. Do images and poses belong together, and are there "
         "large walls in view?"
     ]
@@ -249,7 +247,7 @@ def _refuse_shifted_part(
         CalibrationDataError: There is such a part.
     """
     planes = [images.planes(k) for k in chosen.images.tolist()]
-    hand_eye, walls = torch.from_numpy(found.tool_from_camera), torch.from_numpy(found.walls)
+    hand_eye, walls = exact(torch.from_numpy(found.tool_from_camera)), torch.from_numpy(found.walls)
 
     def on_walls(poses: np.ndarray) -> np.ndarray:
         """Return which images have most of their planes on a wall, shape (N,)."""

@@ -37,8 +37,8 @@ from tofcorr.importing.run import (
 )
 from tofcorr.importing.timing import Lag, estimate_lag, far_lags, refine_lag
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
-from tofcorr.importing.walls.hand_eye import distances, seen_planes
-from tofcorr.importing.walls.image_planes import plane_masks
+from tofcorr.importing.walls.hand_eye import distances, exact
+from tofcorr.importing.walls.image_planes import plane_masks, seen_planes
 
 _LAG_OF_STOPS = 0.02
 """A refined lag that differs by more than this from the first (seconds) changes which images are
@@ -177,7 +177,7 @@ class PosedImport:
             if not bool(pose.isfinite().all()) or not self._images.planes(k):
                 continue
             seen = seen_planes([self._images.planes(k)], pose, 1)
-            off, nearest = distances(*seen.in_world(hand_eye), walls).min(dim=1)
+            off, nearest = distances(*seen.in_world(exact(hand_eye)), walls).min(dim=1)
             # A tool at 1 m/s is off by 0.1 m after 0.1 s of lag.
             near = off < 1 / 10
             times += [self._times[k]] * int(near.sum())
@@ -212,14 +212,13 @@ class PosedImport:
 
     def _reported(self, chosen: Chosen, found: FoundWalls) -> list[dict[str, Any]]:
         """Return what `import.json` says of each frame: one image of one wall."""
+        times = [None] * len(self._source.names) if self._times is None else self._times.tolist()
         return [
             {
                 "view": self._source.names[chosen.images[image]],
                 "wall": found.names[wall],
                 "stop": int(chosen.stop[image]),
-                "timestamp_s": None
-                if self._times is None
-                else float(self._times[chosen.images[image]]),
+                "timestamp_s": times[chosen.images[image]],
             }
             for image, wall in zip(found.image, found.wall, strict=True)
         ]
@@ -233,7 +232,7 @@ class PosedImport:
             masks = valid.expand(int(own.sum()), *valid.shape)
             if found.gradient is not None:
                 gradients = torch.from_numpy(found.gradient[own])
-                tolerance = 1e-3 * self._options.walls.tolerance_mm
+                tolerance = self._options.walls.tolerance_mm / 1000
                 masks = plane_masks(distance, valid, self._images.rays, gradients, tolerance)
             timestamp = float(place)
             if self._times is not None:
@@ -259,7 +258,7 @@ def _lag_warnings(lag: Lag) -> list[str]:
         return []
     when = "late" if lag.seconds > 0 else "early"
     return [
-        f"Images are stamped {1e3 * abs(lag.seconds):.0f} ± {2e3 * lag.standard_error:.0f} ms "
+        f"Images are stamped {1000 * abs(lag.seconds):.0f} ± {2000 * lag.standard_error:.0f} ms "
         f"{when} against the poses; this lag was removed. Add --lag-s 0 to keep the stamps as they "
         "are."
     ]
@@ -280,9 +279,9 @@ def _contradiction(
     if known is None:
         return []
     shift, turn = se3.apart(torch.as_tensor(known), torch.as_tensor(found))
-    if 1e3 * shift < far_mm and math.degrees(turn) < far_deg:
+    if 1000 * shift < far_mm and math.degrees(turn) < far_deg:
         return []
     return [
-        f"The walls fit best with the camera {1e3 * shift:.0f} mm and {math.degrees(turn):.1f} "
+        f"The walls fit best with the camera {1000 * shift:.0f} mm and {math.degrees(turn):.1f} "
         "degrees away from where its poses place it. Are the poses those of the depth camera?"
     ]

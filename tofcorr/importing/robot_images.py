@@ -158,13 +158,13 @@ class ImagesOfPlanes:
     def planes(self, number: int) -> list[ImagePlane]:
         """Return the planes of an image, found once."""
         if number not in self._planes:
-            self._planes[number] = self.planes_in(*self.along_rays(self.read(number)))
+            self._planes[number] = self.planes_in(self.read(number))
         return self._planes[number]
 
-    def planes_in(self, distance: Tensor, valid: Tensor) -> list[ImagePlane]:
-        """Find the planes of an image of this camera, both (H, W)."""
-        named = self.source.targets is not None
-        return planes_of_image(distance, valid, self.rays, self._options.walls, named=named)
+    def planes_in(self, image: DepthImage) -> list[ImagePlane]:
+        """Find the planes of an image of this camera."""
+        named, options = self.source.targets is not None, self._options.walls
+        return planes_of_image(*self.along_rays(image), self.rays, options, named=named)
 
     def along_rays(self, image: DepthImage) -> tuple[Tensor, Tensor]:
         """Return distances along the ray in metres, and where they are usable, both (H, W)."""

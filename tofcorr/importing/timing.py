@@ -35,10 +35,6 @@ times the repeatability of an industrial arm (0.05 to 0.1 mm), and 1 mm at 1 m."
 _STEP = 0.005
 """Step of the search for a lag, seconds: half of the 10 ms that matter at 0.1 m/s (1 mm)."""
 
-_LEAST_CORRELATION = 0.5
-"""Below this correlation the images do not follow the poses, and no lag is stated. Set by hand: the
-poses then explain less than a quarter of the changes."""
-
 _FARTHEST, _FAR_STEP = 30.0, 0.1
 """Lags beyond a delay are looked for up to this many seconds, in steps of so many. Set by hand:
 clocks farther apart share no stops."""
@@ -222,7 +218,8 @@ def estimate_lag(
         return _best(lags, _correlations(moved[:, usable][:, kept], change[usable][kept]))
 
     seconds, correlation = best()
-    if correlation < _LEAST_CORRELATION:
+    # The images do not follow poses that explain less than a quarter of their changes.
+    if correlation < 1 / 2:
         return None
     error = _jackknife_error(lambda kept: best(kept)[0], int(usable.sum()))
     return Lag(seconds=seconds, standard_error=error, correlation=correlation)
@@ -332,7 +329,7 @@ def refine_lag(
         bounds = (first.seconds - window, first.seconds + window)
         found: Any = minimize_scalar(
             lambda lag: float(np.nanmean(losses(lag)[used])), bounds=bounds, method="bounded",
-            options={"xatol": 1e-4},
+            options={"xatol": _STEP / 50},
         )  # fmt: skip
         return float(found.x)
 

@@ -7,6 +7,7 @@ import click
 
 from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
+    option,
     posed_options,
     print_report,
     progress_bar,
@@ -17,12 +18,8 @@ from tofcorr.importing.command_line import (
 @click.command(name="bop")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=NewPath(), help="Recording to write.")
-@click.option(
-    "--amplitude",
-    "amplitude_pattern",
-    help="Names of 16-bit amplitude images, such as 'gray/*.png'; left out: none.",
-)
-@click.option("--intrinsics", help="For HDF5 without cam_K: a file, or a shipped name.")
+@option("--amplitude", "Names of 16-bit amplitude images, such as 'gray/*.png'; left out: none.")
+@option("--intrinsics", "For HDF5 without cam_K: a file, or a shipped name.")
 @posed_options
 def command(scene: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
     """Import SCENE: a folder of BOP's layout, or of BlenderProc's HDF5 files.
@@ -33,13 +30,5 @@ def command(scene: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cli
     """
     from tofcorr.importing.bop.scene import import_scene
 
-    amplitude, intrinsics = given.pop("amplitude_pattern"), given.pop("intrinsics")
-    report = import_scene(
-        scene,
-        out,
-        take_posed_options(given),
-        amplitude_pattern=amplitude,
-        intrinsics=intrinsics,
-        progress=progress_bar,
-    )
-    print_report(report, out)
+    options = take_posed_options(given)
+    print_report(import_scene(scene, out, options, **given, progress=progress_bar), out)

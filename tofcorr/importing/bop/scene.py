@@ -23,8 +23,6 @@ from tofcorr.importing.robot_images import PosedOptions, RobotImages
 from tofcorr.importing.run import Progress, RefusedViewError, no_progress
 
 _FILE_NAME = "scene_camera.json"
-_TOOL_IS_CAMERA = np.eye(4)
-
 _POSE_KEYS = ("cam2world_matrix", "cam2world", "cam_pose")
 _STATE = "campose"
 """Text of the camera's state (BlenderProc's CameraStateWriter)."""
@@ -35,7 +33,7 @@ def import_scene(
     out: Path,
     options: PosedOptions,
     *,
-    amplitude_pattern: str | None = None,
+    amplitude: str | None = None,
     intrinsics: str | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
@@ -45,7 +43,7 @@ def import_scene(
         scene: The folder.
         out: The recording to write; it must not exist yet.
         options: How to choose images and look for walls.
-        amplitude_pattern: Names of amplitude images; BOP alone.
+        amplitude: Names of amplitude images; BOP alone.
         intrinsics: A file or a shipped name; HDF5 alone.
         progress: Shows how far a step has come.
 
@@ -55,7 +53,7 @@ def import_scene(
     """
     path = scene / _FILE_NAME
     if not path.exists() and any(scene.glob("*.hdf5")):
-        if amplitude_pattern is not None:
+        if amplitude is not None:
             raise ConfigError("--amplitude is for BOP's layout; HDF5 scenes have no amplitudes.")
         given = None if intrinsics is None else read_named_intrinsics(intrinsics)
         source, key = _open_hdf5(scene, given)
@@ -71,8 +69,8 @@ def import_scene(
             lens,
             DepthCoding(unit_mm=unit_mm),
             track,
-            amplitude_pattern=amplitude_pattern,
-            tool_from_camera=_TOOL_IS_CAMERA,
+            amplitude_pattern=amplitude,
+            tool_from_camera=np.eye(4),
         )
     return import_posed(source, out, options, progress)
 
@@ -202,7 +200,7 @@ def _open_hdf5(folder: Path, intrinsics: GivenIntrinsics | None) -> tuple[RobotI
         camera=camera,
         read=read,
         track=PoseTrack.checked(poses, str(folder)),
-        tool_from_camera=_TOOL_IS_CAMERA,
+        tool_from_camera=np.eye(4),
     )
     return images, key
 

@@ -14,9 +14,9 @@ from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
     depth_kind_option,
     intrinsics_options,
+    option,
     print_report,
     progress_bar,
-    shown_option,
     take_intrinsics,
 )
 
@@ -39,46 +39,31 @@ class BoardType(click.ParamType):
             self.fail(str(error), param, ctx)
 
 
+_DEPTH = "Names of the depth images; {view} (or *) is what a pair of images shares."
+_BOARD = (
+    "Inner corners (not squares), such as 5x7; or charuco:5x7:4X4_50:0.75 (squares, markers, their "
+    "share of a square), or apriltag:6x6:APRILTAG_36H11:0.3 (tags, family, spacing)."
+)
+_COUNTS = "Millimetres per count of the depth images; 0 counts mean no return."
+_FULL = "Pixels at or above this many infrared counts are saturated and not used."
+_MARGIN = "How far the mask extends beyond the outermost inner corners; 1: edge of the squares."
+_ERROR = "Views with a larger reprojection error (root mean square) are refused."
+
+
 @click.command(name="checkerboard")
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=NewPath(), help="Recording to write.")
-@shown_option(
-    "--depth",
-    "{view}_depth.png",
-    "Names of the depth images; {view} (or *) is what a pair of images shares.",
-    "depth_pattern",
-)
-@shown_option("--infrared", "{view}_ir.png", "Names of the infrared images.", "infrared_pattern")
-@click.option(
-    "--board",
-    required=True,
-    type=BoardType(),
-    help="Inner corners (not squares), such as 5x7; or charuco:5x7:4X4_50:0.75 (squares, markers, "
-    "their share of a square), or apriltag:6x6:APRILTAG_36H11:0.3 (tags, family, spacing).",
-)
-@click.option("--square-mm", required=True, type=float, help="Side of a square or tag, mm.")
-@shown_option(
-    "--depth-unit-mm", 1.0, "Millimetres per count of the depth images; 0 counts mean no return."
-)
+@option("--depth", _DEPTH, "depth_pattern", default="{view}_depth.png")
+@option("--infrared", "Names of the infrared images.", "infrared_pattern", default="{view}_ir.png")
+@option("--board", _BOARD, required=True, type=BoardType())
+@option("--square-mm", "Side of a square or tag, mm.", required=True, type=float)
+@option("--depth-unit-mm", _COUNTS, default=1.0)
 @depth_kind_option
 @intrinsics_options
-@shown_option(
-    "--saturation",
-    65535.0,
-    "Pixels at or above this many infrared counts are saturated and not used.",
-    "saturation_counts",
-)
-@shown_option(
-    "--margin-squares",
-    0.0,
-    "How far the mask extends beyond the outermost inner corners; 1: edge of the squares.",
-)
-@shown_option(
-    "--max-reprojection-px",
-    0.5,
-    "Views with a larger reprojection error (root mean square) are refused.",
-)
-@click.option("--modulation-frequency-hz", "modulation_frequency", type=float, help="If known.")
+@option("--saturation", _FULL, "saturation_counts", default=65535.0)
+@option("--margin-squares", _MARGIN, default=0.0)
+@option("--max-reprojection-px", _ERROR, default=0.5)
+@option("--modulation-frequency-hz", "If known.", "modulation_frequency", type=float)
 def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
     """Import 16-bit PNG depth and infrared images of a checkerboard in FOLDER.
 
@@ -89,7 +74,7 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
 
     intrinsics = take_intrinsics(given)
     given |= given.pop("board")
-    given["square_length"] = given.pop("square_mm") * 1e-3
-    given["depth_unit"] = given.pop("depth_unit_mm") * 1e-3
+    given["square_length"] = given.pop("square_mm") / 1000
+    given["depth_unit"] = given.pop("depth_unit_mm") / 1000
     options = CheckerboardOptions.from_mapping(given, "tofcorr import checkerboard")
     print_report(import_checkerboard(folder, out, options, intrinsics, progress_bar), out)

@@ -144,7 +144,7 @@ class Board(FlatBoard):
         patch = np.log1p(image[low[1] : high[1], low[0] : high[0]].astype(np.float32))
         # The window must not contain the next corner. Set on 102 real views: 0.4 had the smallest
         # reprojection error and lost no corner.
-        return _to_subpixels(patch, corners - low, 0.4 * spacing) + low
+        return _to_subpixels(patch, corners - low, 2 * spacing / 5) + low
 
 
 class CharucoBoard(FlatBoard):
@@ -252,7 +252,7 @@ def _renderings(infrared: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
     logarithmic = _eight_bit(np.log1p(counts), 99.9)
     contrasts = (
         cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(logarithmic),
-        _eight_bit(counts, 99.0),
+        _eight_bit(counts, 99),
         logarithmic,
     )
     for scale in (2, 1) if infrared.size <= _SMALL_IMAGE_PIXELS else (1, 2):
@@ -262,7 +262,7 @@ def _renderings(infrared: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
 
 def _eight_bit(values: np.ndarray, high_percentile: float) -> np.ndarray:
     low, high = np.percentile(values, [1, high_percentile])
-    stretched = (values - low) * (255 / max(high - low, 1e-6))
+    stretched = (values - low) * (255 / max(high - low, np.finfo(np.float32).eps))
     return np.clip(stretched, 0, 255).astype(np.uint8)
 
 

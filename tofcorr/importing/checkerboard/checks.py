@@ -214,13 +214,13 @@ def study_degeneracy(
         distances = np.array([distance(pose, larger) for pose in poses])
         errors = np.array([error + distance(pose, board) for _, pose, error in views]) - distances
         # Over less than 0.1 m a slope says nothing.
-        slope = None if np.ptp(distances) < _TENTH else np.polyfit(distances, 1e3 * errors, 1)[0]
+        slope = None if np.ptp(distances) < _TENTH else np.polyfit(distances, 1000 * errors, 1)[0]
         return {
             "focal_factor": focal,
             "square_factor": square,
             "reprojection_rms_px": float(np.sqrt(np.mean([p.reprojection_rms**2 for p in poses]))),
             "slope_mm_per_m": None if slope is None else float(slope),
-            "mean_error_mm": 1e3 * float(errors.mean()),
+            "mean_error_mm": 1000 * float(errors.mean()),
         }
 
     def distance(pose: BoardPose, board: FlatBoard) -> float:

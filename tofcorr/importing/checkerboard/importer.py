@@ -289,6 +289,6 @@ def _reported(view: BoardView, board: FlatBoard, files: Files, folder: Path) -> 
         "usable_pixels": view.usable_pixels,
         "distance_m": view.distance,
         "incidence_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))),
-        "plane_sd_mm": 1e3 * pose.plane_deviation,
-        "depth_error_mm": 1e3 * view.error,
+        "plane_sd_mm": 1000 * pose.plane_deviation,
+        "depth_error_mm": 1000 * view.error,
     }

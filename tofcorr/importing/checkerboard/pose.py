@@ -79,7 +79,7 @@ class BoardPose:
         """
         # The normal points to the camera: rays that meet the board have a negative cosine, and
         # those almost parallel to it are left out.
-        meets = rays @ self.plane()[0] < -1e-6
+        meets = rays @ self.plane()[0] < -np.finfo(np.float32).eps
         distance = self.distance(np.where(meets[..., None], rays, -self.plane()[0]))
         on_plane = np.where(meets, distance, 0.0)[..., None] * rays
         in_squares = (on_plane - self.translation) @ self.rotation[:, :2] / board.square_length
@@ -238,7 +238,7 @@ def calibration_warning(camera: CameraIntrinsics, about: dict[str, Any]) -> str:
     return (
         f"The focal length calibrated from {about['views']} views is {focal_length:.1f} ± "
         f"{deviation:.1f} px (one standard deviation); by itself that leaves the slope of the "
-        f"distance error uncertain by {1e3 * deviation / focal_length:.1f} mm/m."
+        f"distance error uncertain by {1000 * deviation / focal_length:.1f} mm/m."
     )
 
 

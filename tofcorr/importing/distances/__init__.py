@@ -8,6 +8,7 @@ import click
 from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
     NumberList,
+    option,
     pose_format_option,
     posed_options,
     print_report,
@@ -15,26 +16,19 @@ from tofcorr.importing.command_line import (
     take_posed_options,
 )
 
+_POSES = "Poses beside each file of distances, in the order of the sources."
+_COUNTS = "Millimetres per count; left out: 1 for numbers typically above 20, else 1000."
+
 
 @click.command(name="distances")
 @click.argument("sources", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--out", required=True, type=NewPath(), help="Recording to write.")
-@click.option(
-    "--poses",
-    type=click.Path(path_type=Path),
-    multiple=True,
-    help="Poses beside each file of distances, in the order of the sources.",
-)
+@option("--poses", _POSES, type=click.Path(path_type=Path), multiple=True)
 @pose_format_option
-@click.option("--wall", "walls", multiple=True, help="Name of each wall; left out: the source's.")
-@click.option("--zones", default="1x1", show_default=True, help="COLUMNSxROWS of the sensor.")
-@click.option("--fov-deg", type=NumberList(1, 2), help="Field of view of all zones, degrees: H,V.")
-@click.option(
-    "--depth-unit-mm",
-    "unit_mm",
-    type=float,
-    help="Millimetres per count; left out: 1 for numbers typically above 20, else 1000.",
-)
+@option("--wall", "Name of each wall; left out: the source's.", "names", multiple=True)
+@option("--zones", "COLUMNSxROWS of the sensor.", default="1x1")
+@option("--fov-deg", "Field of view of all zones, degrees: H,V.", type=NumberList(1, 2))
+@option("--depth-unit-mm", _COUNTS, "unit_mm", type=float)
 @posed_options
 def command(sources: tuple[Path, ...], out: Path, **given: Any) -> None:  # noqa: ANN401
     """Import the distances of a single-pixel or few-zone sensor before flat walls.

@@ -75,7 +75,7 @@ def open_distances(
     *,
     poses: Sequence[Path] = (),
     pose_format: str | None = None,
-    walls: Sequence[str] = (),
+    names: Sequence[str] = (),
     unit_mm: float | None = None,
 ) -> RobotImages:
     """Read distances before one or several walls, as images of a few pixels.
@@ -85,14 +85,15 @@ def open_distances(
         camera: The sensor's zones as pixels.
         poses: For each wall a file of poses; none where folders hold them.
         pose_format: Of `tofcorr.importing.pose_files.POSE_FORMATS`; None: told from the content.
-        walls: What each wall is called; none: as its file or folder.
+        names: What each wall is called; none: as its file or folder.
         unit_mm: Millimetres per count; None: inferred.
 
     Raises:
         CalibrationDataError: A file is missing or damaged, or rows and poses are not as many.
         ConfigError: There are not as many poses or names as sources.
     """
-    names, zones = _wall_names(sources, poses, walls), (camera.width, camera.height)
+    zones = camera.width, camera.height
+    names = _wall_names(sources, poses, names)
     tables, tracks, units, typical = [], [], set[float](), []
     for place, source in enumerate(sources):
         metres, unit, usual = read_distances(_file_in(source, "distances"), zones, unit_mm)
@@ -147,14 +148,14 @@ def open_distances(
 
 
 def _wall_names(
-    sources: Sequence[Path], poses: Sequence[Path], walls: Sequence[str]
+    sources: Sequence[Path], poses: Sequence[Path], names: Sequence[str]
 ) -> Sequence[str]:
-    for what, given in (("--poses", poses), ("--wall", walls)):
+    for what, given in (("--poses", poses), ("--wall", names)):
         if given and len(given) != len(sources):
             raise ConfigError(
                 f"{what} is needed once for each of {len(sources)} sources, got {len(given)}."
             )
-    names = [*walls] or [source.stem for source in sources]
+    names = [*names] or [source.stem for source in sources]
     if len(set(names)) < len(names):
         raise ConfigError(f"Two walls have one name: {', '.join(names)}. Name them with --wall.")
     return names

@@ -12,6 +12,7 @@ from tofcorr.importing.checkerboard import BoardType
 from tofcorr.importing.command_line import (
     coding_options,
     intrinsics_options,
+    option,
     pose_format_option,
     posed_options,
     print_report,
@@ -21,45 +22,30 @@ from tofcorr.importing.command_line import (
     take_posed_options,
 )
 
+_DEPTH = "Names of the depth images (PNG, TIFF, NPY, EXR), such as 'depth/*.png'."
+_AMPLITUDE = "Names of the amplitude or infrared images; * stands for the same as in --depth."
+_GREY = (
+    "With --board: images in which its corners are found, 8 bits and colour allowed; left out: the "
+    "amplitude images."
+)
+_POSES = "Poses of the tool in the base: a file, or a folder with a matrix a file."
+_BOARD = (
+    "Instead of --poses: a board that gives the plane of each image; as in import checkerboard."
+)
+_TIMES = "List of 'time name' lines, where the images' names are no times."
+
 
 @click.command(name="frames")
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=NewPath(), help="Recording to write.")
-@click.option(
-    "--depth",
-    "depth_pattern",
-    required=True,
-    help="Names of the depth images (PNG, TIFF, NPY, EXR), such as 'depth/*.png'.",
-)
-@click.option(
-    "--amplitude",
-    "amplitude_pattern",
-    help="Names of the amplitude or infrared images; * stands for the same as in --depth.",
-)
-@click.option(
-    "--grey",
-    "grey_pattern",
-    help="With --board: images in which its corners are found, 8 bits and colour allowed; left "
-    "out: the amplitude images.",
-)
-@click.option(
-    "--poses",
-    type=click.Path(path_type=Path),
-    help="Poses of the tool in the base: a file, or a folder with a matrix a file.",
-)
-@click.option(
-    "--board",
-    type=BoardType(),
-    help="Instead of --poses: a board that gives the plane of each image; as in import "
-    "checkerboard.",
-)
-@click.option("--square-mm", type=float, help="With --board: side of a square or tag, mm.")
+@option("--depth", _DEPTH, "depth_pattern", required=True)
+@option("--amplitude", _AMPLITUDE, "amplitude_pattern")
+@option("--grey", _GREY, "grey_pattern")
+@option("--poses", _POSES, type=click.Path(path_type=Path))
+@option("--board", _BOARD, type=BoardType())
+@option("--square-mm", "With --board: side of a square or tag, mm.", type=float)
 @pose_format_option
-@click.option(
-    "--times",
-    type=click.Path(path_type=Path),
-    help="List of 'time name' lines, where the images' names are no times.",
-)
+@option("--times", _TIMES, type=click.Path(path_type=Path))
 @coding_options
 @intrinsics_options
 @posed_options
@@ -88,21 +74,12 @@ def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any
 
     if given["grey_pattern"] is not None or given["square_mm"] is not None:
         raise ConfigError("--grey and --square-mm are for a board: name it with --board.")
-    intrinsics = take_intrinsics(given)
+    intrinsics, options = take_intrinsics(given), take_posed_options(given)
     if intrinsics is None:
         raise ConfigError("--calibrate needs a board: name it with --board, without --poses.")
-    options = take_posed_options(given)
-    coding = take_coding(given)
-    track = read_poses(given["poses"], given["pose_format"])
-    source = open_folder(
-        folder,
-        given["depth_pattern"],
-        intrinsics,
-        coding,
-        track,
-        amplitude_pattern=given["amplitude_pattern"],
-        times=given["times"],
-    )
+    coding, track = take_coding(given), read_poses(given["poses"], given["pose_format"])
+    more = {key: given[key] for key in ("amplitude_pattern", "times")}
+    source = open_folder(folder, given["depth_pattern"], intrinsics, coding, track, **more)
     return import_posed(source, out, options, progress_bar)
 
 
@@ -119,8 +96,8 @@ def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, An
     mapping = given["board"] | {
         "depth_pattern": given["depth_pattern"],
         "infrared_pattern": corners,
-        "square_length": 1e-3 * given["square_mm"],
-        "depth_unit": 1e-3 * (coding.unit_mm or 1.0),
+        "square_length": given["square_mm"] / 1000,
+        "depth_unit": (coding.unit_mm or 1.0) / 1000,
         "depth_kind": given["depth_kind"],
         "saturation_counts": given["saturation_amplitude"],
         "modulation_frequency": given["modulation_frequency_hz"],

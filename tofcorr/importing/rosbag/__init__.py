@@ -12,6 +12,7 @@ import click
 from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
     coding_options,
+    option,
     posed_options,
     print_report,
     progress_bar,
@@ -23,16 +24,10 @@ from tofcorr.importing.command_line import (
 @click.command(name="rosbag")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=NewPath(), help="Recording to write.")
-@click.option("--depth", "depth_topic", required=True, help="Topic of the depth images.")
-@click.option(
-    "--amplitude", "amplitude_topic", help="Topic of the amplitude (infrared) images, 16 bits."
-)
-@click.option(
-    "--camera-info", "camera_info", help="Topic of the intrinsics; left out: beside the images."
-)
-@click.option(
-    "--intrinsics", help="A file of intrinsics or a shipped name, instead of --camera-info."
-)
+@option("--depth", "Topic of the depth images.", "depth_topic", required=True)
+@option("--amplitude", "Topic of the amplitude (infrared) images, 16 bits.", "amplitude_topic")
+@option("--camera-info", "Topic of the intrinsics; left out: beside the images.")
+@option("--intrinsics", "A file of intrinsics or a shipped name, instead of --camera-info.")
 @coding_options
 @posed_options
 def command(bag: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values

@@ -137,12 +137,12 @@ class TopicMessages:
             for time, message in self._bag.messages(topic):
                 self.frame_id = self.frame_id or str(message.header.frame_id)
                 self._received.append(time)
-                stamps.append(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
+                stamps.append(message.header.stamp.sec + message.header.stamp.nanosec / 10**9)
         except BaseException:
             self.close()
             raise
         self.stamped = bool(stamps) and all(stamp > 0 for stamp in stamps)
-        received = 1e-9 * np.array(self._received, dtype=np.float64)
+        received = np.array(self._received, dtype=np.float64) / 10**9
         self.stamps = np.array(stamps) if self.stamped else received
 
     def close(self) -> None:

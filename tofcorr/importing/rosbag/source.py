@@ -111,7 +111,7 @@ def _images(
         if (gap > _SAME_IMAGE).all():
             raise CalibrationDataError(
                 f"{origin}: no image of {amplitude.topic} is stamped within "
-                f"{1e3 * _SAME_IMAGE:.0f} ms of one of {depth.topic}; the nearest is "
+                f"{1000 * _SAME_IMAGE:.0f} ms of one of {depth.topic}; the nearest is "
                 f"{gap.min():.3f} s away."
             )
         reason = f"{amplitude.topic} has no image of its time"
@@ -298,7 +298,7 @@ def _row(message: Any) -> list[float]:  # noqa: ANN401 - of rosbags
         message.transform.rotation,
     )
     return [
-        stamp.sec + 1e-9 * stamp.nanosec,
+        stamp.sec + stamp.nanosec / 10**9,
         move.x,
         move.y,
         move.z,

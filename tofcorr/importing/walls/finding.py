@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -11,17 +11,11 @@ import torch
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.walls.hand_eye import (
     Joint,
-    SeenPlanes,
     match,
     match_single_ray,
-    seen_planes,
     undetermined,
 )
-from tofcorr.importing.walls.image_planes import ImagePlane, WallOptions
-
-OFF_WALL_MM = 60.0
-"""What a plane that lies on no wall counts, millimetres: the nearness at which planes are gathered
-into walls."""
+from tofcorr.importing.walls.image_planes import ImagePlane, SeenPlanes, WallOptions, seen_planes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +38,8 @@ class FoundWalls:
         left_out: Why images, and planes of images, are on no wall, by their names.
     """
 
+    OFF_WALL_MM: ClassVar[float] = 60.0
+    """What a plane that lies on no wall counts: the nearness at which planes are gathered."""
     names: list[str]
     walls: np.ndarray
     images: np.ndarray
@@ -159,8 +155,8 @@ def _summarised(
         (joint.wall >= 0).nonzero()[:, 0].tolist(),
         key=lambda k: (int(planes.image[k]), int(joint.wall[k])),
     )
-    deviation = 1e3 * joint.deviation
-    off = torch.where(joint.wall >= 0, deviation.clamp(max=OFF_WALL_MM), OFF_WALL_MM)
+    deviation, far = 1000 * joint.deviation, FoundWalls.OFF_WALL_MM
+    off = torch.where(joint.wall >= 0, deviation.clamp(max=far), far)
     return FoundWalls(
         names=names,
         walls=joint.walls.numpy(),
@@ -203,7 +199,8 @@ def _left_out(
         found[k][names[k]] = "none of its planes is on a wall" if k in seen else flat
     for k in (joint.wall < 0).nonzero()[:, 0].tolist():
         off, image = float(joint.deviation[k]), int(planes.image[k])
-        far = f"{1e3 * off:.0f} mm from the nearest wall" if math.isfinite(off) else "faces no wall"
+        near = f"{1000 * off:.0f} mm from the nearest wall"
+        far = near if math.isfinite(off) else "faces no wall"
         name = f"{names[image]}, plane {int(planes.number[k]) + 1}"
         found[image][name] = f"{far}, or not seen in enough images"
     return {name: reason for own in found.values() for name, reason in own.items()}

@@ -5,7 +5,7 @@ A wall of normal :math:`w` is seen by the camera at pose :math:`(R_i, p_i)` with
 :math:`R_i (X x + t) + p_i`. Which planes show one wall is not known, nor are X and t. For the right
 ones the planes of all images fall into a few places; so a start is looked for over all rotations,
 by how many pairs of planes of different images agree, and for the best of them over translations.
-From each start planes are gathered into walls, and everything is fitted jointly (`fit_jointly`).
+From each start planes are gathered into walls, and everything is fitted jointly.
 
 A sensor of one ray sees no normals. Before named walls its start is looked for over the directions
 of its ray.
@@ -17,6 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -27,7 +28,7 @@ from tofcorr.estimation.planes import Walls, estimate_walls, joint_image_equatio
 from tofcorr.estimation.robust import robust_weights
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.geometry import se3
-from tofcorr.importing.walls.image_planes import ImagePlane
+from tofcorr.importing.walls.image_planes import SeenPlanes
 from tofcorr.spread import sigma_from_mad
 
 _TYPICAL = 0.01
@@ -44,8 +45,8 @@ distance. Both are held to that much, so that they cannot stand in for the hand-
 much no camera has: mirrored images would coincide behind the camera, at a slope of two."""
 
 _GRID = 20_000, math.radians(14.0)
-"""Rotations of the grid, some 9 degrees apart, and the width of the search, within which half of
-that lies."""
+"""Rotations that are tried, drawn evenly, and the width of the search: of so many all but one in a
+million places have one nearer than that."""
 
 _USUAL = 0.3
 """Standard deviation of a translation before anything is known of it, metres: tools and brackets
@@ -56,86 +57,9 @@ _AS_GOOD = 0.02
 small. Then the one nearest the guess is taken."""
 
 
-@dataclass(frozen=True)
-class SeenPlanes:
-    """Planes in the frame of the camera that saw them, and the pose it saw them from.
-
-    Attributes:
-        image: The image of each plane, shape (M,).
-        number: Its number among the planes of its image, shape (M,).
-        normal: Unit normals towards the camera, camera frame, shape (M, 3).
-        points: Points that stand for the plane, camera frame, shape (M, P, 3), metres.
-        support: Share of the image's pixels, shape (M,).
-        gradient: The vectors g of the planes g . x = 1, shape (M, 3), per metre.
-        world_from_tool: The pose of each plane's image, shape (M, 4, 4).
-        label: The wall of each plane where it is known, shape (M,), counted from zero; None: not
-            known.
-    """
-
-    image: Tensor
-    number: Tensor
-    normal: Tensor
-    points: Tensor
-    support: Tensor
-    gradient: Tensor
-    world_from_tool: Tensor
-    label: Tensor | None = None
-
-    def __len__(self) -> int:
-        """Return the number of planes."""
-        return len(self.image)
-
-    def take(self, chosen: Tensor) -> "SeenPlanes":
-        """Return some of the planes, by number or by mask."""
-        parts = {name: part for name, part in vars(self).items() if part is not None}
-        return SeenPlanes(**{name: part[chosen] for name, part in parts.items()})
-
-    def may_be_one_wall(self) -> Tensor:
-        """Return which pairs of planes may show one wall, shape (M, M): not two of one image."""
-        pair = self.image[:, None] != self.image
-        return pair if self.label is None else pair & (self.label[:, None] == self.label)
-
-    @property
-    def rotation(self) -> Tensor:
-        """Rotations world_from_tool, shape (M, 3, 3)."""
-        return self.world_from_tool[:, :3, :3]
-
-    def in_world(self, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
-        """Return points (M, P, 3), metres, and normals (M, 3) in the world."""
-        pose = self.world_from_tool @ tool_from_camera
-        points = self.points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
-        return points, (pose[:, :3, :3] @ self.normal[:, :, None])[:, :, 0]
-
-
-def seen_planes(
-    planes: Sequence[Sequence[ImagePlane]],
-    world_from_tool: Tensor,
-    pixels: int,
-    labels: Tensor | None = None,
-) -> SeenPlanes:
-    """Put the planes of all images together, sorted by what was measured, not by images' numbers.
-
-    Args:
-        planes: The planes of each image.
-        world_from_tool: The images' poses, shape (N, 4, 4).
-        pixels: Pixels of an image.
-        labels: The wall that each image shows, shape (N,); None: not known.
-    """
-    every = [(i, k, plane) for i, own in enumerate(planes) for k, plane in enumerate(own)]
-    pose = world_from_tool.flatten(1).tolist()
-    every.sort(key=lambda one: (pose[one[0]], one[2].offset, one[2].normal.tolist()))
-    image = torch.tensor([i for i, _, _ in every], dtype=torch.int64)
-    empty = torch.zeros(0, 3, dtype=torch.float64)
-    return SeenPlanes(
-        image=image,
-        number=torch.tensor([k for _, k, _ in every], dtype=torch.int64),
-        normal=torch.stack([plane.normal for *_, plane in every]) if every else empty,
-        points=torch.stack([plane.points for *_, plane in every]) if every else empty[:, None],
-        support=torch.tensor([plane.support / pixels for *_, plane in every]).double(),
-        gradient=torch.stack([plane.gradient for *_, plane in every]) if every else empty,
-        world_from_tool=world_from_tool[image],
-        label=None if labels is None else labels[image],
-    )
+def exact(tool_from_camera: Tensor) -> Parameters:
+    """Return a hand-eye transform (4, 4) and a camera without error."""
+    return Parameters(tool_from_camera, torch.zeros_like(_ERROR))
 
 
 def distances(points: Tensor, normal: Tensor, walls: Tensor) -> Tensor:
@@ -153,15 +77,15 @@ def distances(points: Tensor, normal: Tensor, walls: Tensor) -> Tensor:
     return torch.where(facing, off.square().mean(dim=1).sqrt(), torch.inf)
 
 
-def _gather(planes: SeenPlanes, tool_from_camera: Tensor, fewest: int) -> Tensor:
+def _gather(planes: SeenPlanes, parameters: Parameters, fewest: int) -> Tensor:
     """Gather planes of many images into walls (G, 4), that of most images first.
 
     Args:
         planes: The planes.
-        tool_from_camera: The hand-eye transform (4, 4), known to some centimetres.
+        parameters: The hand-eye transform, known to some centimetres, and the camera's error.
         fewest: Images that make a wall; planes whose walls are known make one each.
     """
-    points, normal = planes.in_world(tool_from_camera)
+    points, normal = planes.in_world(parameters)
 
     def fitted(members: Tensor) -> Tensor:
         return _plane_of(points[members], normal[members], planes.support[members])
@@ -180,7 +104,7 @@ def _gather(planes: SeenPlanes, tool_from_camera: Tensor, fewest: int) -> Tensor
         proposed = torch.cat([normal[seeds], offset], dim=1)
         close = left[:, None] & (distances(points, normal, proposed) < near + 2 * _TYPICAL)
         # The most planes; between equals the larger ones.
-        best = (close * (1 + 1e-3 * planes.support[:, None])).sum(dim=0).argmax()
+        best = (close * (1 + planes.support[:, None] / 1000)).sum(dim=0).argmax()
         members, wall = close[:, best], proposed[best]
         for _ in range(3):  # The choice hardly changes after the first.
             wall = fitted(members)
@@ -242,7 +166,7 @@ class Joint:
 
         The unit is twice the typical deviation.
         """
-        off = (self.deviation / (2 * _TYPICAL)).square().clamp(max=9.0)
+        off = (self.deviation / (2 * _TYPICAL)).square().clamp(max=9)
         return float(off.sum()) + len(self.walls)
 
 
@@ -255,7 +179,8 @@ def match(planes: SeenPlanes, fewest: int) -> Joint:
         planes: The planes of all images.
         fewest: Images that make a wall.
     """
-    few = _varied(planes)
+    # Some 90 planes, sorted by their poses: pairs grow with the square of their number.
+    few = planes.take(torch.linspace(0, len(planes) - 1, min(len(planes), 90)).long())
     proposed = []
     for rotation in _candidate_rotations(few):
         translation, agreement = _candidate_translation(few, rotation)
@@ -286,11 +211,11 @@ def match_single_ray(planes: SeenPlanes, directions: int = 1500) -> Joint:
     loss, origin, walls = _alternated(planes, along)
     fits = []
     # Neighbours on the grid lead to one fit.
-    for k in _best_apart(along, -loss, math.cos(1.5 * _TILT), 12):
+    for k in _best_apart(along, -loss, math.cos(3 * _TILT / 2), 12):
         turn = Rotation.align_vectors(along[k : k + 1].numpy(), ray[None].numpy())[0].as_matrix()
         start = se3.assemble(torch.from_numpy(turn), origin[k])
-        fitted = _fit_assigned(planes, planes.label, _exact(start), walls[k], start)
-        points = _corrected(planes, fitted[0]).in_world(fitted[0].tool_from_camera)[0][:, 0]
+        fitted = _fit_assigned(planes, planes.label, exact(start), walls[k], start)
+        points = planes.in_world(fitted[0])[0][:, 0]
         own = fitted[1][planes.label]
         fits.append(Joint(*fitted, planes.label, ((points * own[:, :3]).sum(1) + own[:, 3]).abs()))
     return _nearest_of_best(fits)
@@ -353,35 +278,8 @@ def _best_apart(vectors: Tensor, score: Tensor, closest: float, most: int) -> li
 
 def _nearest_of_best(fits: Sequence[Joint]) -> Joint:
     least = min(joint.cost() for joint in fits)
-    good = [joint for joint in fits if joint.cost() <= (1 + _AS_GOOD) * least + 1e-9]
+    good = [joint for joint in fits if joint.cost() <= (1 + _AS_GOOD) * least]
     return min(good, key=lambda joint: float(se3.rotation_angle(joint.tool_from_camera)))
-
-
-def _varied(planes: SeenPlanes, most: int = 90) -> SeenPlanes:
-    """Return about 90 planes, of images whose robot poses are turned as differently as can be.
-
-    Pairs grow with the square of their number.
-    """
-    image, count = torch.unique_consecutive(planes.image, return_counts=True)
-    rotation = planes.rotation[count.cumsum(0) - count].flatten(1)
-    distance = torch.full((len(image),), torch.inf, dtype=torch.float64)
-    taken: list[int] = []
-    while int(count[taken].sum()) < min(most, len(planes)):
-        taken.append(int(distance.argmax()))
-        distance = distance.minimum((rotation - rotation[taken[-1]]).square().sum(dim=1))
-        distance[taken] = -1.0  # Of equal poses the others remain, in order.
-    return planes.take(torch.isin(planes.image, image[taken]))
-
-
-def _rotation_grid(number: int) -> Tensor:
-    """Return rotations spread evenly: a super-Fibonacci spiral (Alexa 2022), shape (K, 3, 3)."""
-    # The constants of the paper: the square root of 2 and the real root of p^4 = p + 4.
-    phi, psi = math.sqrt(2.0), 1.533751168755204288118041
-    s = torch.arange(number, dtype=torch.float64) + 0.5
-    r, big_r = (s / number).sqrt(), (1 - s / number).sqrt()
-    a, b = 2 * math.pi * s / phi, 2 * math.pi * s / psi
-    quaternion = torch.stack([r * a.sin(), r * a.cos(), big_r * b.sin(), big_r * b.cos()], dim=1)
-    return torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
 
 
 def _candidate_rotations(planes: SeenPlanes) -> Tensor:
@@ -408,7 +306,8 @@ def _candidate_rotations(planes: SeenPlanes) -> Tensor:
 
     number, coarse = _GRID
     fine = coarse / 3
-    grid = torch.cat([torch.eye(3).double()[None], _rotation_grid(number)])
+    drawn = Rotation.random(number, random_state=0).as_matrix()
+    grid = torch.cat([torch.eye(3).double()[None], torch.from_numpy(drawn)])
     left = score(grid, coarse)
     left[0] = torch.inf  # The identity is refined in any case.
     # The trace of a rotation by an angle a is 1 + 2 cos a.
@@ -421,7 +320,7 @@ def _candidate_rotations(planes: SeenPlanes) -> Tensor:
         twists = torch.cat([torch.zeros_like(cube), radius * cube], dim=1)
         tried = found[:, None] @ se3.exp(twists)[:, :3, :3]
         scores = score(tried.flatten(0, 1), max(fine, 2 * radius)).unflatten(0, (-1, len(cube)))
-        scores[:, 0] *= 1 + 1e-4
+        scores[:, 0] *= 1 + math.sqrt(torch.finfo(torch.float32).eps)
         found = tried[torch.arange(len(found)), scores.argmax(dim=1)]
         radius /= math.sqrt(2)
     final = score(found, fine)
@@ -450,7 +349,7 @@ def _candidate_translation(planes: SeenPlanes, rotation: Tensor) -> tuple[Tensor
     Returns:
         The translation (3,) in metres, and how many pairs agree, counted by their size.
     """
-    points, normal = planes.in_world(se3.assemble(rotation, torch.zeros_like(rotation[0])))
+    points, normal = planes.in_world(exact(se3.assemble(rotation, torch.zeros_like(rotation[0]))))
     direction = normal  # Of each plane the mean normal of those of its direction (mean shift).
     for _ in range(4):
         near = (direction @ normal.T > math.cos(2 * _TILT)) * planes.support
@@ -480,11 +379,11 @@ def _candidate_translation(planes: SeenPlanes, rotation: Tensor) -> tuple[Tensor
 
 def _followed(planes: SeenPlanes, transform: Tensor, fewest: int) -> Joint:
     """Gather walls under a proposed hand-eye transform (4, 4), and fit everything."""
-    joint = fit_jointly(planes, transform, _gather(planes, transform, fewest))
+    joint = _fit_jointly(planes, transform, _gather(planes, exact(transform), fewest))
     for _ in range(2):
         # Better known poses show further walls, and which walls are one.
-        walls = _gather(_corrected(planes, joint.parameters), joint.tool_from_camera, fewest)
-        again = fit_jointly(planes, joint.tool_from_camera, walls)
+        walls = _gather(planes, joint.parameters, fewest)
+        again = _fit_jointly(planes, joint.tool_from_camera, walls)
         if again.cost() >= joint.cost():
             break
         joint = again
@@ -495,10 +394,10 @@ def _followed(planes: SeenPlanes, transform: Tensor, fewest: int) -> Joint:
     kept = torch.tensor(count) >= fewest
     if bool(kept.all()):
         return joint
-    return fit_jointly(planes, joint.tool_from_camera, joint.walls[kept])
+    return _fit_jointly(planes, joint.tool_from_camera, joint.walls[kept])
 
 
-def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: Tensor) -> Joint:
+def _fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: Tensor) -> Joint:
     """Fit hand-eye, walls and a constant error, planes that lie on no wall counting for little.
 
     Args:
@@ -506,7 +405,7 @@ def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: Tensor) -> 
         tool_from_camera: Where to start, shape (4, 4).
         walls: Where to start, some centimetres off, shape (G, 4).
     """
-    joint = _assigned(planes, _exact(tool_from_camera), walls)
+    joint = _assigned(planes, exact(tool_from_camera), walls)
     for _ in range(6):  # Assignments rarely change after the second time.
         before, chosen = joint.wall, joint.wall >= 0
         if not bool(chosen.any()):
@@ -517,11 +416,6 @@ def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: Tensor) -> 
         if bool((joint.wall == before).all()):
             break
     return joint
-
-
-def _exact(tool_from_camera: Tensor) -> Parameters:
-    """Return a hand-eye transform and a camera without error."""
-    return Parameters(tool_from_camera, torch.zeros_like(_ERROR))
 
 
 def _fit_assigned(
@@ -542,7 +436,7 @@ def _fit_assigned(
     moments = _point_moments(planes)
     found = Walls(walls[:, :3], walls[:, 3], wall, planes.world_from_tool)
     for _ in range(4):
-        points = _corrected(planes, start).in_world(start.tool_from_camera)[0]
+        points = planes.in_world(start)[0]
         off = (points * found.normal_world[wall][:, None]).sum(dim=2) + found.offset[wall][:, None]
         off = off.square().mean(dim=1).sqrt()
         scale = max(sigma_from_mad(float(off.median())), _TYPICAL / 10)
@@ -550,8 +444,8 @@ def _fit_assigned(
         fitted = estimate_walls(weighted, start, found, _held(start, centre), 4)
         if bool((fitted[0].coefficients.abs() > 10 * _ERROR).any()):
             # Held at zero, to micrometres.
-            none = _exact(start.tool_from_camera)
-            fitted = estimate_walls(weighted, none, found, _held(none, centre, 1e8), 4)
+            none = exact(start.tool_from_camera)
+            fitted = estimate_walls(weighted, none, found, _held(none, centre, 10**8), 4)
         start, found = fitted
     return start, torch.cat([found.normal_world, found.offset[:, None]], dim=1)
 
@@ -582,15 +476,8 @@ def _held(start: Parameters, centre: Tensor, stiff: float = 1.0) -> NormalEquati
     """
     sigma = torch.cat([torch.full((6,), PRIOR_SIGMA, dtype=torch.float64), _ERROR / stiff**0.5])
     hessian = torch.diag((_TYPICAL / sigma) ** 2)
-    step = _exact(centre).step_to(start)
+    step = exact(centre).step_to(start)
     return NormalEquations(step @ hessian @ step, hessian @ step, hessian)
-
-
-def _corrected(planes: SeenPlanes, parameters: Parameters) -> SeenPlanes:
-    """Return the planes with the constant and the slope taken off their points' distances."""
-    constant, slope = parameters.coefficients
-    distance = planes.points.norm(dim=2, keepdim=True)
-    return replace(planes, points=planes.points * (1 - slope - constant / distance))
 
 
 def _assigned(planes: SeenPlanes, parameters: Parameters, walls: Tensor) -> Joint:
@@ -602,22 +489,18 @@ def _assigned(planes: SeenPlanes, parameters: Parameters, walls: Tensor) -> Join
     if not len(walls):
         nothing = torch.full((len(planes),), torch.inf, dtype=torch.float64)
         return Joint(parameters, walls, torch.full((len(planes),), -1), nothing)
-    distance = distances(
-        *_corrected(planes, parameters).in_world(parameters.tool_from_camera), walls
-    )
+    distance = distances(*planes.in_world(parameters), walls)
     if planes.label is not None:
         other = torch.arange(len(walls)) != planes.label[:, None]
         distance = torch.where(other, torch.inf, distance)
     deviation, wall = distance.min(dim=1)
     gate = 5 * max(_TYPICAL, float(deviation[deviation.isfinite()].nanmedian().nan_to_num(0.0)))
     wall = torch.where(deviation <= gate, wall, -1)
-    taken: set[tuple[int, int]] = set()
-    for k in deviation.argsort(stable=True).tolist():
-        key = (int(planes.image[k]), int(wall[k]))
-        if key in taken:
-            wall[k] = -1
-        taken.add(key)
-    return Joint(parameters, walls, wall, deviation)
+    order = deviation.argsort(stable=True)
+    pairs = torch.stack([planes.image, wall], dim=1)[order].numpy()
+    nearest = order[np.unique(pairs, axis=0, return_index=True)[1]]
+    alone = torch.full_like(wall, -1).index_copy(0, nearest, wall[nearest])
+    return Joint(parameters, walls, alone, deviation)
 
 
 def undetermined(planes: SeenPlanes, joint: Joint, names: Sequence[str]) -> list[str]:

@@ -1,16 +1,19 @@
-"""The large planes of one depth image, by sequential RANSAC, and the pixels that lie on them.
+"""The large planes of depth images, by sequential RANSAC, and the pixels that lie on them.
 
 On the plane g . x = 1 the inverse distance is linear in the ray, 1 / D = g . ray, so that each fit
 is a linear one. The search looks at a thinned image; all pixels are assigned afterwards.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
 from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.robust import deviation, fit_plane, largest_plane
 from tofcorr.options import Options
 
@@ -66,6 +69,95 @@ class ImagePlane(NamedTuple):
         return -self.normal / self.offset
 
 
+@dataclass(frozen=True)
+class SeenPlanes:
+    """Planes in the frame of the camera that saw them, and the pose it saw them from.
+
+    Attributes:
+        image: The image of each plane, shape (M,).
+        number: Its number among the planes of its image, shape (M,).
+        normal: Unit normals towards the camera, camera frame, shape (M, 3).
+        points: Points that stand for the plane, camera frame, shape (M, P, 3), metres.
+        support: Share of the image's pixels, shape (M,).
+        gradient: The vectors g of the planes g . x = 1, shape (M, 3), per metre.
+        world_from_tool: The pose of each plane's image, shape (M, 4, 4).
+        label: The wall of each plane where it is known, shape (M,), counted from zero; None: not
+            known.
+    """
+
+    image: Tensor
+    number: Tensor
+    normal: Tensor
+    points: Tensor
+    support: Tensor
+    gradient: Tensor
+    world_from_tool: Tensor
+    label: Tensor | None = None
+
+    def __len__(self) -> int:
+        """Return the number of planes."""
+        return len(self.image)
+
+    def take(self, chosen: Tensor) -> "SeenPlanes":
+        """Return some of the planes, by number or by mask."""
+        parts = {name: part for name, part in vars(self).items() if part is not None}
+        return SeenPlanes(**{name: part[chosen] for name, part in parts.items()})
+
+    def may_be_one_wall(self) -> Tensor:
+        """Return which pairs of planes may show one wall, shape (M, M): not two of one image."""
+        pair = self.image[:, None] != self.image
+        return pair if self.label is None else pair & (self.label[:, None] == self.label)
+
+    @property
+    def rotation(self) -> Tensor:
+        """Rotations world_from_tool, shape (M, 3, 3)."""
+        return self.world_from_tool[:, :3, :3]
+
+    def in_world(self, parameters: Parameters) -> tuple[Tensor, Tensor]:
+        """Return points (M, P, 3), metres, the camera's error taken off, and normals in the world.
+
+        Args:
+            parameters: The hand-eye transform; a constant and a slope of the error.
+        """
+        constant, slope = parameters.coefficients
+        distance = self.points.norm(dim=2, keepdim=True)
+        points = self.points * (1 - slope - constant / distance)
+        pose = self.world_from_tool @ parameters.tool_from_camera
+        normal = (pose[:, :3, :3] @ self.normal[:, :, None])[:, :, 0]
+        return points @ pose[:, :3, :3].mT + pose[:, None, :3, 3], normal
+
+
+def seen_planes(
+    planes: Sequence[Sequence[ImagePlane]],
+    world_from_tool: Tensor,
+    pixels: int,
+    labels: Tensor | None = None,
+) -> SeenPlanes:
+    """Put the planes of all images together, sorted by what was measured, not by images' numbers.
+
+    Args:
+        planes: The planes of each image.
+        world_from_tool: The images' poses, shape (N, 4, 4).
+        pixels: Pixels of an image.
+        labels: The wall that each image shows, shape (N,); None: not known.
+    """
+    every = [(i, k, plane) for i, own in enumerate(planes) for k, plane in enumerate(own)]
+    pose = world_from_tool.flatten(1).tolist()
+    every.sort(key=lambda one: (pose[one[0]], one[2].offset, one[2].normal.tolist()))
+    image = torch.tensor([i for i, _, _ in every], dtype=torch.int64)
+    empty = torch.zeros(0, 3, dtype=torch.float64)
+    return SeenPlanes(
+        image=image,
+        number=torch.tensor([k for _, k, _ in every], dtype=torch.int64),
+        normal=torch.stack([plane.normal for *_, plane in every]) if every else empty,
+        points=torch.stack([plane.points for *_, plane in every]) if every else empty[:, None],
+        support=torch.tensor([plane.support / pixels for *_, plane in every]).double(),
+        gradient=torch.stack([plane.gradient for *_, plane in every]) if every else empty,
+        world_from_tool=world_from_tool[image],
+        label=None if labels is None else labels[image],
+    )
+
+
 def planes_of_image(
     distance: Tensor,
     valid: Tensor,
@@ -100,7 +192,7 @@ def planes_of_image(
     ray = rays[start::step, start::step][seen].double()
     measured = distance[start::step, start::step][seen].double()
     generator = torch.Generator().manual_seed(seed)
-    least, tolerance = options.least_share * seen.numel(), options.tolerance_mm * 1e-3
+    least, tolerance = options.least_share * seen.numel(), options.tolerance_mm / 1000
     left = torch.ones(len(measured), dtype=torch.bool)
     gradients: list[Tensor] = []
     while len(gradients) < options.most_planes and int(left.sum()) >= max(least, 3):
