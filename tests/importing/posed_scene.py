@@ -4,6 +4,7 @@ Nothing of the package decides what is recorded: the laws of pinhole, plane and 
 second time.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -194,14 +195,8 @@ class Drive:
     ) -> tuple[np.ndarray, np.ndarray]:
         rays = self._rays()
         world, place = rays @ world_from_camera[:3, :3].T, world_from_camera[:3, 3]
-        nearest, cosine = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape[:2])
-        for normal, offset in self.planes:
-            towards = world @ normal
-            with np.errstate(divide="ignore", invalid="ignore"):
-                met = -(normal @ place + offset) / towards
-            seen = (towards < -1e-3) & (met > 0.05) & (met < FARTHEST) & (met < nearest)
-            nearest[seen], cosine[seen] = met[seen], -towards[seen]
-        returned = np.isfinite(nearest)
+        nearest, cosine, _ = met(self.planes, world, place)
+        returned = nearest < FARTHEST
         depth = np.where(returned, nearest, 1.0)
         # A wall with a pattern: the amplitude is not a function of distance and angle alone.
         met_at = place + depth[..., None] * world
@@ -228,15 +223,45 @@ def _looking_at_walls(generator: np.random.Generator) -> np.ndarray:
     """Draw a camera pose near the middle of the room that looks at walls or floor."""
     place = np.array([0.6, 0.6, 0.9]) + generator.uniform(-0.4, 0.4, 3)
     at = generator.uniform([0.8, -0.6, -0.1], [2.0, 2.2, 1.0])
+    return looking(place, at, generator.uniform(-np.pi, np.pi))
+
+
+def looking(place: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
+    """Return the pose of a camera that looks at a point, rolled by an angle, shape (4, 4)."""
     z = (at - place) / np.linalg.norm(at - place)
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    roll = Rotation.from_rotvec([0, 0, generator.uniform(-np.pi, np.pi)])
-    pose[:3, :3] = pose[:3, :3] @ roll.as_matrix()
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0, 0, roll]).as_matrix()
     pose[:3, 3] = place
     return pose
+
+
+def met(
+    planes: Iterable[tuple[np.ndarray, float]],
+    world: np.ndarray,
+    place: np.ndarray,
+    shown: Callable[[int, np.ndarray], np.ndarray | bool] = lambda number, points: True,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where rays meet the nearest plane (infinite: nowhere), the cosine, and its number.
+
+    Args:
+        planes: n . x + d = 0.
+        world: Unit rays in the world, shape (H, W, 3).
+        place: Of the camera, shape (3,).
+        shown: Tells which points of a plane are there at all.
+    """
+    nearest, cosine = np.full(world.shape[:2], np.inf), np.zeros(world.shape[:2])
+    plane = np.full(world.shape[:2], -1)
+    for k, (normal, offset) in enumerate(planes):
+        towards = world @ np.array(normal)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = -(np.array(normal) @ place + offset) / towards
+            seen = (towards < -1e-3) & (far > 0.05) & (far < nearest)
+            seen &= shown(k, place + far[..., None] * world)
+        nearest[seen], cosine[seen], plane[seen] = far[seen], -towards[seen], k
+    return nearest, cosine, plane
 
 
 def apart(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:

@@ -211,10 +211,7 @@ def decoded(content: bytes) -> np.ndarray | None:
 
 
 def _npy(path: Path) -> np.ndarray:
-    try:
-        return load_numbers(path)
-    except ValueError as error:
-        raise RefusedViewError(f"{path.name}: {error}") from None
+    return load_numbers(path, lambda why: RefusedViewError(f"{path.name}: {why}"))
 
 
 def _exr(path: Path) -> np.ndarray:

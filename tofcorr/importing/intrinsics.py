@@ -302,16 +302,12 @@ def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[
             f"'FILE#{one_line(str(next(iter(cameras))))}'."
         )
     entry = cameras[camera] if camera in cameras else next(iter(cameras.values()))
-    lens = str(entry.get("distortion_model", "none"))
-    for what, model, known in (
-        ("camera", str(entry["camera_model"]), ("pinhole",)),
-        ("distortion", lens, ("radtan", "none")),
-    ):
-        if model not in known:
-            raise CalibrationDataError(
-                f"{source}: Kalibr's {what} model '{one_line(model)}' is not supported; calibrate "
-                "with pinhole-radtan."
-            )
+    models = str(entry["camera_model"]), str(entry.get("distortion_model", "none"))
+    if models not in (("pinhole", "radtan"), ("pinhole", "none")):
+        raise CalibrationDataError(
+            f"{source}: Kalibr's model '{one_line(models[0])}', '{one_line(models[1])}' is not "
+            "supported; calibrate with pinhole-radtan."
+        )
     numbers = _numbers(entry["intrinsics"], source, "Kalibr's 'intrinsics'")
     if len(numbers) != 4:
         raise CalibrationDataError(
@@ -319,8 +315,8 @@ def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[
         )
     size = entry.get("resolution")
     whole = isinstance(size, list) and len(size) == 2
-    named = dict(zip(("width", "height"), size, strict=True)) if whole else {}
-    return named | {"K": _pinhole(*numbers), "distortion": entry.get("distortion_coeffs", [])}
+    found = dict(zip(("width", "height"), size, strict=True)) if whole else {}
+    return found | {"K": _pinhole(*numbers), "distortion": entry.get("distortion_coeffs", [])}
 
 
 def _azure_kinect(

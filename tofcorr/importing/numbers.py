@@ -1,6 +1,7 @@
 """Numbers in files of unknown origin: text, NPY arrays, and values that a parser has read."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -78,12 +79,13 @@ def any_numbers(value: Any) -> np.ndarray:  # noqa: ANN401 - from a file
         return np.zeros(0)
 
 
-def load_numbers(path: Path) -> np.ndarray:
+def load_numbers(path: Path, refused: Callable[[str], Exception]) -> np.ndarray:
     """Load an NPY array of real numbers.
 
-    Raises:
-        ValueError: The file cannot be read, is damaged, or holds something else; the message is one
-            line.
+    Args:
+        path: The file.
+        refused: Makes an error of what is wrong: the file cannot be read, is damaged, or holds
+            something else; a text of one line.
     """
     unreadable = (OSError, EOFError, SyntaxError, TokenError, ArithmeticError, MemoryError)
     try:
@@ -91,7 +93,7 @@ def load_numbers(path: Path) -> np.ndarray:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (*unreadable, ValueError) as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"not a readable NPY array ({first[:150]})") from None
+        raise refused(f"not a readable NPY array ({first[:150]})") from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise ValueError("not an array of numbers")
+        raise refused("not an array of numbers")
     return np.array(array)

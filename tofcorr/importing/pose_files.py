@@ -207,10 +207,8 @@ def _folder_of_matrices(path: Path) -> PoseTrack:
 
 
 def _loaded(path: Path) -> np.ndarray:
-    try:
-        return load_numbers(path).astype(np.float64)
-    except ValueError as error:
-        raise CalibrationDataError(f"{path}: {error}.") from None
+    read = load_numbers(path, lambda why: CalibrationDataError(f"{path}: {why}."))
+    return read.astype(np.float64)
 
 
 def _square(values: np.ndarray) -> np.ndarray:

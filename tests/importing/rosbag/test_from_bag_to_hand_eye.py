@@ -78,23 +78,12 @@ def recorded(request: pytest.FixtureRequest) -> Recorded:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", "ros1"])
-def test_the_hand_eye_of_a_moving_camera_is_found(
-    kind: str, recorded: Recorded, tmp_path: Path
+@pytest.mark.parametrize("how", ["moving", "standing still", "late"])
+def test_the_hand_eye_is_found_wherever_the_camera_is_and_whatever_its_clock(
+    kind: str, how: str, recorded: Recorded, tmp_path: Path
 ) -> None:
-    assert_near(find_hand_eye(recorded, tmp_path, kind))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["mcap", "ros1"])
-def test_the_pose_of_a_camera_that_stands_still_is_found(
-    kind: str, recorded: Recorded, tmp_path: Path
-) -> None:
-    assert_near(find_hand_eye(recorded.with_camera_fixed(), tmp_path, kind, "--eye-to-hand"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["mcap", "ros1"])
-def test_the_same_is_found_where_the_image_clock_is_late(
-    kind: str, recorded: Recorded, tmp_path: Path
-) -> None:
-    assert_near(find_hand_eye(recorded.stamped_late(0.08), tmp_path, kind), late=0.08)
+    late = 0.08 if how == "late" else 0.0
+    still = how == "standing still"
+    drive = recorded.with_camera_fixed() if still else recorded.stamped_late(late)
+    options = ("--eye-to-hand",) if still else ()
+    assert_near(find_hand_eye(drive, tmp_path, kind, *options), late)

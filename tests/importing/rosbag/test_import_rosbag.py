@@ -1,5 +1,6 @@
 """Bags of ROS 1 and ROS 2 become the recording that files of the same drive become."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,19 @@ def few(at_stops: Recorded) -> Recorded:
     return at_stops
 
 
+def written(
+    recorded: Recorded, folder: Path, write: Callable[[bags.Bag, float, np.ndarray], None]
+) -> Path:
+    """Write a bag whose depth images are written in a way of their own."""
+    path = bags.bag_path(folder, "mcap")
+    with bags.writing(path, "mcap") as bag:
+        bag.camera_info(bags.INFO, recorded)
+        bags.write_robot(bag, recorded)
+        for time, depth in zip(recorded.image_times, recorded.depth_mm, strict=True):
+            write(bag, time, depth)
+    return path
+
+
 @pytest.mark.parametrize("kind", bags.KINDS)
 def test_a_bag_of_any_kind_gives_the_recording_of_the_same_drive_in_files(
     kind: str, few: Recorded, from_files: Imported, tmp_path: Path
@@ -47,21 +61,17 @@ def test_a_file_of_a_ros_2_folder_is_read_as_well(few: Recorded, tmp_path: Path)
 def test_depth_is_the_same_however_its_messages_are_coded(
     coding: str, few: Recorded, tmp_path: Path
 ) -> None:
-    path = bags.bag_path(tmp_path, "mcap")
-    with bags.writing(path, "mcap") as bag:
-        bag.camera_info(bags.INFO, few)
-        bags.write_robot(bag, few)
-        for time, depth in zip(few.image_times, few.depth_mm, strict=True):
-            if coding == "png":
-                content = bags.compressed_depth(depth)
-                bag.compressed(bags.DEPTH, time, content, "16UC1; compressedDepth png")
-            elif coding == "floats":
-                content = bags.compressed_depth(depth, floats=True)
-                bag.compressed(bags.DEPTH, time, content, "32FC1; compressedDepth png")
-            elif coding == "big-endian":
-                bag.image(bags.DEPTH, time, depth, "16UC1", big_endian=True)
-            else:
-                bag.image(bags.DEPTH, time, (depth / 1e3).astype(np.float32), "32FC1")
+    def write(bag: bags.Bag, time: float, depth: np.ndarray) -> None:
+        if coding in ("png", "floats"):
+            content = bags.compressed_depth(depth, floats=coding == "floats")
+            kind = "32FC1" if coding == "floats" else "16UC1"
+            bag.compressed(bags.DEPTH, time, content, f"{kind}; compressedDepth png")
+        elif coding == "big-endian":
+            bag.image(bags.DEPTH, time, depth, "16UC1", big_endian=True)
+        else:
+            bag.image(bags.DEPTH, time, (depth / 1e3).astype(np.float32), "32FC1")
+
+    path = written(few, tmp_path, write)
     imported = import_bag(path, tmp_path / "out")
     recording = imported.done
     places = {f"{time:.6f}": k for k, time in enumerate(few.image_times)}
@@ -78,14 +88,12 @@ def test_depth_is_the_same_however_its_messages_are_coded(
 def test_stamps_of_headers_count_and_receipt_is_named_where_there_are_none(
     few: Recorded, tmp_path: Path
 ) -> None:
-    path = bags.bag_path(tmp_path, "mcap")
-    with bags.writing(path, "mcap") as bag:
-        bag.camera_info(bags.INFO, few)
-        bags.write_robot(bag, few)
-        for time, depth in zip(few.image_times, few.depth_mm, strict=True):
-            bag.header = lambda time, frame=bags.CAMERA: type(bag).header(bag, 0.0, frame)
-            bag.image(bags.DEPTH, time, depth, "16UC1")
-            del bag.header
+    def write(bag: bags.Bag, time: float, depth: np.ndarray) -> None:
+        bag.header = lambda time, frame=bags.CAMERA: type(bag).header(bag, 0.0, frame)
+        bag.image(bags.DEPTH, time, depth, "16UC1")
+        del bag.header
+
+    path = written(few, tmp_path, write)
     imported = import_bag(path, tmp_path / "out")
     assert "hold no time stamps" in imported.text
     assert imported.report["views"][0]["timestamp_s"] > 1000
@@ -137,12 +145,10 @@ def test_a_missing_frame_or_transform_is_named(few: Recorded, tmp_path: Path) ->
 def test_previews_are_refused(
     few: Recorded, tmp_path: Path, encoding: str, kind: type, said: str
 ) -> None:
-    path = bags.bag_path(tmp_path, "mcap")
-    with bags.writing(path, "mcap") as bag:
-        bag.camera_info(bags.INFO, few)
-        bags.write_robot(bag, few)
-        for time, depth in zip(few.image_times, few.depth_mm, strict=True):
-            bag.image(bags.DEPTH, time, (depth // 20).astype(kind), encoding)
+    def write(bag: bags.Bag, time: float, depth: np.ndarray) -> None:
+        bag.image(bags.DEPTH, time, (depth // 20).astype(kind), encoding)
+
+    path = written(few, tmp_path, write)
     refused = import_bag(path, tmp_path / "out")
     assert refused.exit_code == 2
     assert said in refused.text

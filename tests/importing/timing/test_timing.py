@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from importing.posed_scene import Drive
+from importing.posed_scene import Drive, Recorded
 from scipy.spatial.transform import Rotation
 
 from tofcorr.errors import CalibrationDataError
@@ -56,10 +56,17 @@ def test_lists_of_other_lengths_without_times_or_names_are_refused() -> None:
         pair(["a", "b"], None, track, tolerance=0.2)
 
 
+def followed(recorded: Recorded) -> tuple[PoseTrack, np.ndarray]:
+    """Return the poses of a drive, and how much each image differs from the one before, metres."""
+    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
+    depth = recorded.depth_mm.astype(float).reshape(len(recorded.depth_mm), -1) / 1e3
+    return track, np.median(np.abs(np.diff(depth, axis=0)), axis=1)
+
+
 def test_stops_are_those_of_the_programme() -> None:
     drive = Drive(stops=8, width=4, height=4, rate=20.0)
     recorded = drive.record()
-    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
+    track, _ = followed(recorded)
     found = find_stops(track, recorded.image_times, margin=0.02)
     assert found.max() == 7
     # An image beside a stop's end may be told to move: its poses are interpolated over 0.1 s.
@@ -72,9 +79,7 @@ def test_stops_are_those_of_the_programme() -> None:
 @pytest.mark.parametrize("late", [-0.4, 0.0, 0.08])
 def test_the_lag_follows_from_what_changes_when(late: float) -> None:
     recorded = Drive(stops=12, width=8, height=8, rate=15.0).record()
-    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
-    depth = recorded.depth_mm.astype(float).reshape(len(recorded.depth_mm), -1) / 1e3
-    change = np.median(np.abs(np.diff(depth, axis=0)), axis=1)
+    track, change = followed(recorded)
     lag = estimate_lag(track, recorded.image_times + late, change)
     assert lag is not None
     # The first estimate is refined once the walls are known; a frame lasts 67 ms.
@@ -84,9 +89,7 @@ def test_the_lag_follows_from_what_changes_when(late: float) -> None:
 @pytest.mark.parametrize("late", [pytest.param(3.0, marks=pytest.mark.slow), -4.6])
 def test_lags_of_seconds_are_proposed_among_those_of_stops_at_equal_times(late: float) -> None:
     recorded = Drive(stops=20, width=8, height=8).record()
-    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
-    depth = recorded.depth_mm.astype(float).reshape(len(recorded.depth_mm), -1) / 1e3
-    change = np.median(np.abs(np.diff(depth, axis=0)), axis=1)
+    track, change = followed(recorded)
     proposed = np.array(far_lags(track, recorded.image_times + late, change))
     assert len(proposed) <= 12
     assert np.abs(proposed - late).min() < 0.15
@@ -94,6 +97,6 @@ def test_lags_of_seconds_are_proposed_among_those_of_stops_at_equal_times(late: 
 
 def test_images_without_any_change_tell_no_lag() -> None:
     recorded = Drive(stops=12, width=8, height=8).record()
-    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
+    track, _ = followed(recorded)
     noise = np.random.default_rng(0).uniform(size=len(recorded.image_times) - 1)
     assert estimate_lag(track, recorded.image_times, noise) is None

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from importing.posed_scene import looking, met
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
@@ -103,21 +104,15 @@ class Room:
         self, pose: np.ndarray, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rays = self.camera.rays
-        world = rays @ pose[:3, :3].T
-        nearest = np.full(rays.shape[:2], np.inf)
-        cosine, plane = np.zeros(rays.shape[:2]), np.full(rays.shape[:2], -1)
-        for k, (normal, offset) in enumerate(self.planes):
-            towards = world @ np.array(normal)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                met = -(np.array(normal) @ pose[:3, 3] + offset) / towards
-            seen = (towards < -1e-3) & (met > 0.05) & (met < nearest)
-            if (normal, offset) == CUPBOARD:
-                seen &= np.abs((pose[:3, 3] + met[..., None] * world)[..., 1]) < 0.6
-            nearest[seen], cosine[seen], plane[seen] = met[seen], -towards[seen], k
+
+        def shown(number: int, points: np.ndarray) -> np.ndarray | bool:
+            return self.planes[number] != CUPBOARD or np.abs(points[..., 1]) < 0.6
+
+        nearest, cosine, plane = met(self.planes, rays @ pose[:3, :3].T, pose[:3, 3], shown)
         while np.mean(plane == -1) < self.clutter:
-            met = _box(rays, generator)
-            seen = met < nearest
-            nearest[seen], cosine[seen], plane[seen] = met[seen], 0.7, -1
+            box = _box(rays, generator)
+            seen = box < nearest
+            nearest[seen], cosine[seen], plane[seen] = box[seen], 0.7, -1
         depth = np.where(np.isfinite(nearest), nearest, np.nan)
         amplitude = 400 * cosine / depth**2 * rays[..., 2] ** 2
         measured = depth + self.error * self._error(depth, amplitude)
@@ -161,19 +156,8 @@ def poses_in_room(
         around = generator.uniform([0.6, -1.2, -0.2], [2.0, 2.2, 1.1])
         if towards is not None:
             around = np.array(towards) + generator.uniform(-0.7, 0.7, 3)
-        poses.append(_looking(place, around, generator.uniform(-np.pi, np.pi)))
+        poses.append(looking(place, around, generator.uniform(-np.pi, np.pi)))
     return np.stack(poses)
-
-
-def _looking(place: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
-    z = (at - place) / np.linalg.norm(at - place)
-    x = np.cross([0.0, 0.0, 1.0], z)
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0, 0, roll]).as_matrix()
-    pose[:3, 3] = place
-    return pose
 
 
 def hand_eye_anywhere(generator: np.random.Generator) -> np.ndarray:
@@ -251,13 +235,6 @@ def looking_straight(number: int, roll: float, generator: np.random.Generator) -
         turn = Rotation.from_rotvec([0, 0, generator.uniform(-1, 1) * roll]).as_matrix()
         pose[:3, :3] = straight @ turn
     return poses
-
-
-def apart(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """Return how far two transforms are apart: millimetres and degrees."""
-    between = np.linalg.inv(first) @ second
-    turn = Rotation.from_matrix(between[:3, :3]).magnitude()
-    return float(1e3 * np.linalg.norm(between[:3, 3])), float(np.degrees(turn))
 
 
 def intrinsics(camera: Camera) -> CameraIntrinsics:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from importing.posed_scene import apart
 from importing.walls.rendered_room import (
     CUPBOARD,
     FLOOR,
@@ -12,7 +13,6 @@ from importing.walls.rendered_room import (
     Camera,
     Room,
     Views,
-    apart,
     found_in,
     hand_eye_anywhere,
     looking_straight,

@@ -1,15 +1,16 @@
 """A recording of walls: what is written, and what every command then makes of it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from importing.posed_scene import apart
 from importing.walls.rendered_room import (
     Camera,
     Room,
     Views,
-    apart,
     hand_eye_anywhere,
     intrinsics,
     poses_in_room,
@@ -18,6 +19,7 @@ from importing.walls.rendered_room import imported as imported_room
 
 import tofcorr
 from tofcorr.data.recording import Recording
+from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 
@@ -167,26 +169,16 @@ def test_known_and_unknown_still_say_what_the_header_does_not(
 
 def _with_planes_of_nonsense(recording: Recording, out: Path, only: str | None = None) -> Recording:
     """Copy a recording, its planes turned by 20 degrees and moved by 200 mm, each another way."""
-    out.mkdir()
-    for path in recording.path.iterdir():
-        if path.name != "frames.csv":
-            (out / path.name).symlink_to(path)
-    lines = (recording.path / "frames.csv").read_text().splitlines()
-    names = lines[0].split(",")
-    place = [names.index(name) for name in ("nx", "ny", "nz", "d", "target")]
     turns = {name: k for k, name in enumerate(np.unique(recording.frames.target))}
-    text = [lines[0]]
-    for line in lines[1:]:
-        cells = line.split(",")
-        target = cells[place[4]]
-        if only in (None, target):
-            normal = np.array([float(cells[k]) for k in place[:3]])
-            axis = np.roll([0.36, -0.18, 0.1], turns[target])
-            normal += axis
-            normal /= np.linalg.norm(normal)
-            for k, value in zip(place[:3], normal, strict=True):
-                cells[k] = repr(float(value))
-            cells[place[3]] = repr(float(cells[place[3]]) + 0.2)
-        text.append(",".join(cells))
-    (out / "frames.csv").write_text("\n".join(text) + "\n")
+    with RecordingWriter.with_header_of(out, recording) as writer:
+        for k in range(recording.num_frames):
+            row = recording.frames.row(k)
+            if only in (None, row.target):
+                normal = row.normal_world + np.roll([0.36, -0.18, 0.1], turns[row.target])
+                normal /= np.linalg.norm(normal)
+                row = replace(row, normal_world=normal, offset=row.offset + 0.2)
+            arrays = {
+                name: np.asarray(getattr(recording, name)[k]) for name in ("amplitude", "mask")
+            }
+            writer.append(recording.depth[k], row=row, **arrays)
     return Recording.open(out)

@@ -5,6 +5,7 @@ Everything that the package `rosbags` raises on a damaged file becomes one sente
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,11 @@ def damage_reported(path: Path) -> Iterator[None]:
         ) from None
 
 
+def seconds(stamp: Any) -> float:  # noqa: ANN401 - of rosbags
+    """Return a time stamp in seconds."""
+    return stamp.sec + stamp.nanosec / 10**9
+
+
 class TopicMessages:
     """Access to the messages of a topic by number, quickest in the order they were recorded.
 
@@ -137,7 +143,7 @@ class TopicMessages:
             for time, message in self._bag.messages(topic):
                 self.frame_id = self.frame_id or str(message.header.frame_id)
                 self._received.append(time)
-                stamps.append(message.header.stamp.sec + message.header.stamp.nanosec / 10**9)
+                stamps.append(seconds(message.header.stamp))
         except BaseException:
             self.close()
             raise
@@ -150,10 +156,11 @@ class TopicMessages:
         self._iterator = None
         self._bag.close()
 
-    def read(self, number: int) -> Any:  # noqa: ANN401 - the type is the topic's
-        """Return one message.
+    def image(self, number: int) -> np.ndarray:
+        """Return a message of type Image or CompressedImage as an array, shape (H, W).
 
         Raises:
+            RefusedViewError: It is damaged, has several channels, or is coded with losses.
             CalibrationDataError: The bag cannot be read any more.
         """
         # To read and drop 20 messages is as quick as a seek on a disk.
@@ -162,21 +169,12 @@ class TopicMessages:
             self._iterator = self._bag.messages(self.topic, start=time)
             # Several messages may have been received in one nanosecond.
             self._next = self._received.index(time)
-        for _, message in self._iterator:
-            self._next += 1
-            if self._next == number + 1:
-                return message
-        raise CalibrationDataError(
-            f"{self._bag.path}: message {number} of {self.topic} is gone. Was the bag changed?"
-        )
-
-    def image(self, number: int) -> np.ndarray:
-        """Return a message of type Image or CompressedImage as an array, shape (H, W).
-
-        Raises:
-            RefusedViewError: It is damaged, has several channels, or is coded with losses.
-        """
-        message = self.read(number)
+        message = next((one for _, one in islice(self._iterator, number - self._next, None)), None)
+        self._next = number + 1
+        if message is None:
+            raise CalibrationDataError(
+                f"{self._bag.path}: message {number} of {self.topic} is gone. Was the bag changed?"
+            )
         if hasattr(message, "encoding"):
             return _plain(message, self.topic)
         return _compressed(str(message.format), bytes(message.data), self.topic)

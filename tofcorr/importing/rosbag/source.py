@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from tofcorr.importing.intrinsics import (
 from tofcorr.importing.pose_files import rigid_transforms
 from tofcorr.importing.pose_track import PoseTrack, nearest
 from tofcorr.importing.robot_images import RobotImages
-from tofcorr.importing.rosbag.bag import Bag, TopicMessages, damage_reported
+from tofcorr.importing.rosbag.bag import Bag, TopicMessages, damage_reported, seconds
 from tofcorr.importing.run import Refused
 
 _SAME_IMAGE = 0.01
@@ -184,13 +184,10 @@ def _camera_info_topic(bag: Bag, depth: str, given: str | None) -> str:
         _check(bag, given, "--camera-info", (_CAMERA_INFO,))
         return given
     found = [topic for topic, kind in bag.types.items() if kind == _CAMERA_INFO]
-    space = depth
-    while "/" in space:
-        space = space.rpartition("/")[0]
-        if f"{space}/camera_info" in found:
-            return f"{space}/camera_info"
-    if len(found) == 1:
-        return found[0]
+    beside = [str(space / "camera_info") for space in PurePosixPath(depth).parents]
+    near = [topic for topic in beside if topic in found]
+    if near or len(found) == 1:
+        return (near or found)[0]
     many = f"several topics hold camera intrinsics: {', '.join(sorted(found))}"
     raise CalibrationDataError(
         f"{bag.path}: {many if found else 'no topic holds camera intrinsics (CameraInfo)'}. "
@@ -217,11 +214,8 @@ def _read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics
             f"{bag.path}: {topic} holds a matrix K of zeros: the driver knows no calibration. Name "
             "a file with --intrinsics."
         )
-    values = {
-        "K": matrix,
-        "distortion": lens,
-        "distortion_model": str(message.distortion_model) or "none",
-    }
+    model = str(message.distortion_model) or "none"
+    values: dict[str, Any] = {"K": matrix, "distortion": lens, "distortion_model": model}
     if message.width and message.height:
         values |= {"width": int(message.width), "height": int(message.height)}
     warnings = []
@@ -239,12 +233,9 @@ def _check(bag: Bag, topic: str, option: str, wanted: tuple[str, ...]) -> None:
     kind = bag.types.get(topic)
     if kind in wanted:
         return
-    names = " or ".join(name.replace("/msg/", "/") for name in wanted)
-    found = "there is no such topic" if kind is None else f"it is {kind.replace('/msg/', '/')}"
-    raise CalibrationDataError(
-        f"{bag.path}: {option} {topic}: expected {names}, {found}. The topics: "
-        f"{bag.listed_topics()}."
-    )
+    found = "there is no such topic" if kind is None else f"it is {kind}"
+    said = f"{option} {topic}: expected {' or '.join(wanted)}, {found}".replace("/msg/", "/")
+    raise CalibrationDataError(f"{bag.path}: {said}. The topics: {bag.listed_topics()}.")
 
 
 def _encoding(bag: Bag, topic: str) -> str:
@@ -292,21 +283,9 @@ def _read_tf(bag: Bag) -> tuple[dict[str, str], dict[str, PoseTrack]]:
 
 def _row(message: Any) -> list[float]:  # noqa: ANN401 - of rosbags
     """Return the time of a transform, its translation, and its quaternion, scalar last."""
-    stamp, move, turn = (
-        message.header.stamp,
-        message.transform.translation,
-        message.transform.rotation,
-    )
-    return [
-        stamp.sec + stamp.nanosec / 10**9,
-        move.x,
-        move.y,
-        move.z,
-        turn.x,
-        turn.y,
-        turn.z,
-        turn.w,
-    ]
+    move, turn = message.transform.translation, message.transform.rotation
+    place = [getattr(move, axis) for axis in "xyz"]
+    return [seconds(message.header.stamp), *place, *(getattr(turn, axis) for axis in "xyzw")]
 
 
 def _base_from_tool(
