@@ -111,12 +111,21 @@ def run(files: list[Path], read: Callable[[Path], object], folder: Path, example
     law()
 
 
-def test_damaged_pose_files_end_in_one_sentence(pose_files: list[Path], tmp_path: Path) -> None:
-    run(pose_files, read_poses, tmp_path, 150)
+MANY = pytest.param(1000, marks=pytest.mark.slow)
 
 
-def test_damaged_bags_end_in_one_sentence(bag_files: list[Path], tmp_path: Path) -> None:
-    run(bag_files, read_bag, tmp_path, 60)
+@pytest.mark.parametrize("examples", [150, MANY])
+def test_damaged_pose_files_end_in_one_sentence(
+    pose_files: list[Path], tmp_path: Path, examples: int
+) -> None:
+    run(pose_files, read_poses, tmp_path, examples)
+
+
+@pytest.mark.parametrize("examples", [60, MANY])
+def test_damaged_bags_end_in_one_sentence(
+    bag_files: list[Path], tmp_path: Path, examples: int
+) -> None:
+    run(bag_files, read_bag, tmp_path, examples)
 
 
 def test_undamaged_bags_and_pose_files_are_read(
@@ -125,11 +134,3 @@ def test_undamaged_bags_and_pose_files_are_read(
     for path in bag_files:
         read_bag(path)
     assert [len(read_poses(path)) for path in pose_files] == [6] * 5
-
-
-@pytest.mark.slow
-def test_two_thousand_damaged_bags_and_pose_files_end_in_one_sentence(
-    bag_files: list[Path], pose_files: list[Path], tmp_path: Path
-) -> None:
-    run(bag_files, read_bag, tmp_path, 1000)
-    run(pose_files, read_poses, tmp_path, 1000)

@@ -161,54 +161,44 @@ def _read_matrices(path: Path) -> PoseTrack:
     called as the file is.
     """
     if path.is_dir():
-        return _folder_of_matrices(path)
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in (".txt", ".npy"))
+        every = [_rows(file, (3, 4, 12, 16)).reshape(1, -1) for file in files]
+        for file, values in zip(files, every, strict=True):
+            if values.size not in (12, 16):
+                raise CalibrationDataError(
+                    f"{file}: expected one pose of 12 or 16 numbers, got {values.size} numbers."
+                )
+        poses, names = [_square(values)[0] for values in every], [file.stem for file in files]
+        return PoseTrack.checked(np.array(poses), str(path), names=names)
+    values = _rows(path, (4, 12, 13, 16, 17))
+    if values.shape[1] == 4:
+        if len(values) % 4:
+            raise CalibrationDataError(
+                f"{path}: expected four lines of four numbers a pose, got {len(values)} lines."
+            )
+        values = values.reshape(-1, 16)
+    stamped = values.shape[1] in (13, 17)
+    times = values[:, 0] if stamped else None
+    return PoseTrack.checked(_square(values[:, int(stamped) :]), str(path), times)
+
+
+def _rows(path: Path, counts: tuple[int, ...]) -> np.ndarray:
+    """Read the numbers of a text or an NPY array, one of some counts a row, shape (R, C)."""
     if path.suffix.lower() == ".npy":
-        values = _loaded(path)
-        if not len(values.shape) or values[:1].size not in (12, 16):
+        values = load_numbers(path, lambda why: CalibrationDataError(f"{path}: {why}."))
+        if not values.size or values.size // len(np.atleast_1d(values)) not in counts:
             raise CalibrationDataError(
                 f"{path}: expected an array of shape (P, 4, 4), (P, 3, 4), (P, 16) or (P, 12), "
                 f"got {values.shape}."
             )
-        return PoseTrack.checked(_square(values.reshape(len(values), -1)), str(path))
-    lines = lines_of(read_text(path))
-    in_blocks = bool(lines) and len(lines[0][1]) == 4
-    rows = [numbers_in(one, path, (4,) if in_blocks else (12, 13, 16, 17)) for one in lines]
-    widths = {len(row) for row in rows} or {12}
+        return values.astype(np.float64).reshape(len(values), -1)
+    rows = [numbers_in(line, path, counts) for line in lines_of(read_text(path))]
+    widths = {len(row) for row in rows} or {16}
     if len(widths) > 1:
         raise CalibrationDataError(
             f"{path}: expected as many numbers in every line, got {min(widths)} and {max(widths)}."
         )
-    if in_blocks and len(rows) % 4:
-        raise CalibrationDataError(
-            f"{path}: expected four lines of four numbers a pose, got {len(rows)} lines."
-        )
-    values, stamped = np.reshape(rows, (-1, 16 if in_blocks else min(widths))), min(widths) % 4
-    times = values[:, 0] if stamped else None
-    return PoseTrack.checked(_square(values[:, stamped:]), str(path), times)
-
-
-def _folder_of_matrices(path: Path) -> PoseTrack:
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in (".txt", ".npy"))
-    if not files:
-        raise CalibrationDataError(f"{path}: expected one .txt or .npy file a pose, found none.")
-    poses = []
-    for file in files:
-        if file.suffix.lower() == ".npy":
-            values = _loaded(file).ravel()
-        else:
-            rows = [numbers_in(one, file, (3, 4, 12, 16)) for one in lines_of(read_text(file))]
-            values = np.concatenate(rows or [[]])
-        if values.size not in (12, 16):
-            raise CalibrationDataError(
-                f"{file}: expected one pose of 12 or 16 numbers, got {values.size} numbers."
-            )
-        poses.append(_square(values.reshape(1, -1))[0])
-    return PoseTrack.checked(np.array(poses), str(path), names=[file.stem for file in files])
-
-
-def _loaded(path: Path) -> np.ndarray:
-    read = load_numbers(path, lambda why: CalibrationDataError(f"{path}: {why}."))
-    return read.astype(np.float64)
+    return np.reshape(rows, (-1, min(widths)))
 
 
 def _square(values: np.ndarray) -> np.ndarray:

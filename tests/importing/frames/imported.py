@@ -76,16 +76,12 @@ def import_written(
 
 def assert_equal_recordings(first: Recording, second: Recording, quantum: float) -> None:
     """Depth equal to its quantum, poses and planes to 1e-6, the rest exactly."""
-    assert first.num_frames == second.num_frames
-    np.testing.assert_allclose(first.depth, second.depth, rtol=0, atol=quantum)
     assert first.amplitude is not None
-    assert second.amplitude is not None
-    np.testing.assert_array_equal(first.amplitude, second.amplitude)
-    assert first.mask is not None
-    assert second.mask is not None
     assert np.mean(np.asarray(first.mask) != np.asarray(second.mask)) < 1e-4
-    frames, others = first.frames, second.frames
-    np.testing.assert_allclose(frames.world_from_tool, others.world_from_tool, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(frames.normal_world, others.normal_world, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(frames.offset, others.offset, rtol=0, atol=1e-5)
-    np.testing.assert_array_equal(frames.target, others.target)
+    for name, far in (("depth", quantum), ("amplitude", 0)):
+        mine, theirs = (np.asarray(getattr(one, name)) for one in (first, second))
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=far)
+    for name, far in (("world_from_tool", 1e-6), ("normal_world", 1e-5), ("offset", 1e-5)):
+        mine, theirs = (getattr(one.frames, name) for one in (first, second))
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=far)
+    np.testing.assert_array_equal(first.frames.target, second.frames.target)

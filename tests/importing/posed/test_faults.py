@@ -99,13 +99,27 @@ def test_an_image_dropped_in_the_middle_of_a_list_is_named(
     assert "lie on the walls with the poses shifted by -1" in refused.text
 
 
-def test_mirrored_images_are_refused_with_both_numbers(at_stops: Recorded, tmp_path: Path) -> None:
-    mirrored = replace(
-        at_stops, depth_mm=at_stops.depth_mm[:, :, ::-1], amplitude=at_stops.amplitude[:, :, ::-1]
-    )
-    refused = in_order(mirrored, tmp_path, at_stops.exact)
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        (
+            lambda images: replace(images, depth_mm=images.depth_mm[:, :, ::-1]),
+            "mm with the columns mirrored",
+        ),
+        pytest.param(
+            lambda images: replace(images, depth_mm=images.amplitude, amplitude=images.depth_mm),
+            "swap --depth and --amplitude",
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["mirrored", "exchanged"],
+)
+def test_wrong_images_are_refused_with_both_numbers(
+    at_stops: Recorded, tmp_path: Path, spoilt: Callable[[Recorded], Recorded], said: str
+) -> None:
+    refused = in_order(spoilt(at_stops), tmp_path, at_stops.exact)
     assert refused.exit_code == 2
-    assert "mm with the columns mirrored" in refused.text
+    assert said in refused.text
 
 
 def test_millimetres_read_as_metres_are_refused_with_the_depth_that_shows_it(
@@ -161,14 +175,6 @@ def test_missing_intrinsics_and_those_of_another_size_are_refused(
     width, height = at_stops.size
     said = f"the intrinsics hold for 640x480 pixels, the images have {width}x{height}"
     assert said in other.text
-
-
-@pytest.mark.slow
-def test_amplitude_and_depth_exchanged_are_refused(at_stops: Recorded, tmp_path: Path) -> None:
-    exchanged = replace(at_stops, depth_mm=at_stops.amplitude, amplitude=at_stops.depth_mm)
-    refused = in_order(exchanged, tmp_path, at_stops.exact)
-    assert refused.exit_code == 2
-    assert "swap --depth and --amplitude" in refused.text
 
 
 @pytest.mark.slow

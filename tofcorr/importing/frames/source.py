@@ -12,7 +12,6 @@ from tofcorr.importing.images import (
     camera_of,
     coded_image,
     files_of_views,
-    matching_files,
     of_size,
     read_array,
     read_grey,
@@ -23,39 +22,6 @@ from tofcorr.importing.intrinsics import GivenIntrinsics
 from tofcorr.importing.numbers import any_numbers, lines_of, read_text
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.robot_images import RobotImages
-from tofcorr.importing.run import Refused
-
-
-def found_images(
-    folder: Path, depth_pattern: str, amplitude_pattern: str | None = None, what: str = "depth"
-) -> tuple[dict[str, dict[str, Path]], np.ndarray | None, Refused]:
-    """Find the images of a folder that patterns name.
-
-    Args:
-        folder: Where the patterns start.
-        depth_pattern: File name with `{view}`, or a glob with `*` and `?`; may name sub-folders.
-        amplitude_pattern: Of the amplitude images; what the wildcard stands for is the same.
-        what: What the files of the first pattern are, for messages.
-
-    Returns:
-        The files by view and kind, in natural order, or in that of the times that the names are;
-        those times, seconds, shape (N,), or None; and the views that lack an image.
-
-    Raises:
-        CalibrationDataError: There is no such folder, a pattern has no wildcard, or nothing
-            matches.
-    """
-    if amplitude_pattern is None:
-        files = matching_files(folder, depth_pattern, what)
-        found, refused = {view: {what: path} for view, path in files.items()}, Refused()
-    else:
-        patterns = {what: depth_pattern, "amplitude": amplitude_pattern}
-        found, refused = files_of_views(folder, patterns)
-    times = times_in_names(list(found))
-    if times is not None:
-        order = np.argsort(times, kind="stable")
-        found, times = {list(found)[k]: list(found.values())[k] for k in order}, times[order]
-    return found, times, refused
 
 
 def open_folder(
@@ -86,18 +52,21 @@ def open_folder(
         CalibrationDataError: Nothing matches, the first image cannot be read, or the intrinsics
             hold for images of another size.
     """
-    found, stamps, refused = found_images(folder, depth_pattern, amplitude_pattern)
+    given = {"depth": depth_pattern, "amplitude": amplitude_pattern}
+    found, refused = files_of_views(folder, {kind: one for kind, one in given.items() if one})
+    names, stamps = list(found), times_in_names(list(found))
     if times is not None:
         listed = _times_of(times)
-        first = next(iter(found.values()))["depth"].name
-        known = {view: listed.get(files["depth"].name, np.nan) for view, files in found.items()}
-        refused |= {v: f"{times} does not list it" for v, time in known.items() if np.isnan(time)}
-        order = sorted(found.keys() - refused.keys(), key=lambda view: known[view])
-        if not order:
+        stamps = np.array([listed.get(found[view]["depth"].name, np.nan) for view in names])
+        unlisted = [names[k] for k in np.flatnonzero(np.isnan(stamps))]
+        refused |= dict.fromkeys(unlisted, f"{times} does not list it")
+        if len(unlisted) == len(names):
+            first = found[names[0]]["depth"].name
             raise CalibrationDataError(f"{times}: lists none of the images, such as '{first}'.")
-        found = {view: found[view] for view in order}
-        stamps = np.array([known[view] for view in order])
-    names, files = list(found), list(found.values())
+    if stamps is not None:
+        order = np.argsort(stamps, kind="stable")[: np.isfinite(stamps).sum()]
+        names, stamps = [names[k] for k in order], stamps[order]
+    files = [found[view] for view in names]
 
     def read(number: int) -> DepthImage:
         image = _coded(files[number], coding, "A preview serves to find a board's corners: name it "

@@ -486,14 +486,12 @@ def _assigned(planes: SeenPlanes, parameters: Parameters, walls: Tensor) -> Join
     Five typical deviations off, but never nearer than 50 mm, a plane is an outlier: by chance one
     in a million is so far.
     """
-    if not len(walls):
-        nothing = torch.full((len(planes),), torch.inf, dtype=torch.float64)
-        return Joint(parameters, walls, torch.full((len(planes),), -1), nothing)
     distance = distances(*planes.in_world(parameters), walls)
     if planes.label is not None:
         other = torch.arange(len(walls)) != planes.label[:, None]
         distance = torch.where(other, torch.inf, distance)
-    deviation, wall = distance.min(dim=1)
+    # No wall is infinitely far.
+    deviation, wall = torch.nn.functional.pad(distance, (0, 1), value=torch.inf).min(dim=1)
     gate = 5 * max(_TYPICAL, float(deviation[deviation.isfinite()].nanmedian().nan_to_num(0.0)))
     wall = torch.where(deviation <= gate, wall, -1)
     order = deviation.argsort(stable=True)
