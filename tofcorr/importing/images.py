@@ -339,7 +339,8 @@ def camera_of(
             )
         return intrinsics.camera((width, height))
     raise CalibrationDataError(
-        f"{origin}: none of {count} depth images can be used; the first: {reasons[0]}."
+        f"{origin}: none of {count} depth images can be used; the first: "
+        f"{next(iter(reasons), 'there are none')}."
     )
 
 

@@ -313,9 +313,10 @@ def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[
         raise CalibrationDataError(
             f"{source}: Kalibr's 'intrinsics' must be fx, fy, cx, cy, got {len(numbers)} numbers."
         )
+    found: dict[str, Any] = {}
     size = entry.get("resolution")
-    whole = isinstance(size, list) and len(size) == 2
-    found = dict(zip(("width", "height"), size, strict=True)) if whole else {}
+    if isinstance(size, list) and len(size) == 2:
+        found = {"width": size[0], "height": size[1]}
     return found | {"K": _pinhole(*numbers), "distortion": entry.get("distortion_coeffs", [])}
 
 

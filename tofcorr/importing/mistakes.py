@@ -108,7 +108,9 @@ def _shifts() -> list[int]:
 
 def _mistakes(*, lists: bool, amplitudes: bool) -> dict[str, dict[str, Callable[..., np.ndarray]]]:
     """Return what undoes each mistake, in `poses` or in the `depth` of an image, by its advice."""
-    found = {said: {"poses": IN_POSES[name].undo} for name, said in _OF_POSES.items()}
+    found: dict[str, dict[str, Callable[..., np.ndarray]]] = {
+        said: {"poses": IN_POSES[name].undo} for name, said in _OF_POSES.items()
+    }
     for shift in _shifts() if lists else ():
         said = f"the poses shifted by {shift:+d}: was an image or a pose dropped?"
         found[said] = {"poses": partial(np.roll, shift=shift, axis=0)}
@@ -142,7 +144,7 @@ def _misfit(
     try:
         return walls_of_planes(
             [planes(k) for k in used.images[few].tolist()],
-            [images.source.names[k] for k in used.images[few]],
+            [images.source.names[k] for k in used.images[few].tolist()],
             images.rays[..., 0].numel(),
             poses(used.world_from_tool)[few],
             options,

@@ -136,7 +136,7 @@ class PosedImport:
         source, options = self._source, self._options.walls
         numbers = sieve.progress(chosen.images.tolist(), "finding walls")
         planes = [self._images.planes(k) for k in numbers]
-        names = [source.names[k] for k in chosen.images]
+        names = [source.names[k] for k in chosen.images.tolist()]
         targets = None if source.targets is None else source.targets[chosen.images]
 
         def explain(given: FoundWalls | None) -> list[str]:
@@ -215,7 +215,7 @@ class PosedImport:
         times = [None] * len(self._source.names) if self._times is None else self._times.tolist()
         return [
             {
-                "view": self._source.names[chosen.images[image]],
+                "view": self._source.names[int(chosen.images[image])],
                 "wall": found.names[wall],
                 "stop": int(chosen.stop[image]),
                 "timestamp_s": times[chosen.images[image]],

@@ -79,7 +79,7 @@ class Sieve:
         if not results:
             raise CalibrationDataError(
                 f"{self._source}: none of {len(self.refused)} views can be imported; the first: "
-                f"{next(iter(self.refused.values()))}."
+                f"{next(iter(self.refused.values()), 'there are none')}."
             )
         return results
 

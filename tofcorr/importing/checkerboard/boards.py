@@ -167,7 +167,7 @@ class CharucoBoard(FlatBoard):
             corners, numbers, _, _ = detector.detectBoard(rendering)
             if numbers is not None and len(numbers) > most:
                 most, best[:] = len(numbers), np.nan
-                best[np.ravel(numbers)] = _unscaled(corners, scale)
+                best[np.ravel(numbers).astype(int)] = _unscaled(corners, scale)
             if most == len(best):
                 break
         return best if most >= _FEWEST_CORNERS else None
@@ -201,7 +201,7 @@ class AprilGrid(FlatBoard):
         found = np.full((self.columns * self.rows, 4, 2), np.nan)
         for rendering, scale in _renderings(image):
             corners, numbers, _ = detector.detectMarkers(rendering)
-            tags = () if numbers is None else np.ravel(numbers).tolist()
+            tags = () if numbers is None else np.ravel(numbers).astype(int).tolist()
             for four, number in zip(corners, tags, strict=True):
                 if number < len(found) and np.isnan(found[number]).any():
                     found[number] = _unscaled(four, scale)

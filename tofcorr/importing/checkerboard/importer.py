@@ -220,7 +220,8 @@ def _prepared(
                 offset=offset,
                 target=board.kind,
             )
-            yield row, *read(view.name), view.pose.area(board, rays, options.margin_squares)
+            depth, amplitude = read(view.name)
+            yield row, depth, amplitude, view.pose.area(board, rays, options.margin_squares)
 
     return PreparedImport(
         views=[_reported(view, board, images.views[view.name], folder) for view in views],

@@ -204,7 +204,8 @@ def calibrate(
             "calibrate the camera. Record more, at several tilts, or give the intrinsics."
         )
     chosen = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
-    for _ in range(6):
+    most = 5
+    while True:
         camera, about, errors = _solve(corner_sets, chosen, board, size)
         # Five standard deviations of a coordinate: the median length of an error is 1.18.
         deviation = float(np.nanmedian(np.concatenate(errors))) / np.sqrt(2 * np.log(2))
@@ -214,9 +215,9 @@ def calibrate(
             error <= max(limit, np.nanquantile(error, _SMALLEST_SHARE_OF_CORNERS))
             for error in errors
         ]
-        if all(np.array_equal(a, b) for a, b in zip(inliers, chosen, strict=True)):
+        if most == 0 or all(map(np.array_equal, inliers, chosen)):
             break
-        chosen = inliers
+        chosen, most = inliers, most - 1
     keep = [
         i
         for i, error in enumerate(errors)

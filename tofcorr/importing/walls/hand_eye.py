@@ -306,7 +306,7 @@ def _candidate_rotations(planes: SeenPlanes) -> Tensor:
 
     number, coarse = _GRID
     fine = coarse / 3
-    drawn = Rotation.random(number, random_state=0).as_matrix()
+    drawn = Rotation.from_quat(np.random.default_rng(0).normal(size=(number, 4))).as_matrix()
     grid = torch.cat([torch.eye(3).double()[None], torch.from_numpy(drawn)])
     left = score(grid, coarse)
     left[0] = torch.inf  # The identity is refined in any case.
