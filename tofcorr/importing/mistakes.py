@@ -144,7 +144,7 @@ def _misfit(
     try:
         return walls_of_planes(
             [planes(k) for k in used.images[few].tolist()],
-            [images.source.names[k] for k in used.images[few].tolist()],
+            [images.source.names[int(k)] for k in used.images[few]],
             images.rays[..., 0].numel(),
             poses(used.world_from_tool)[few],
             options,

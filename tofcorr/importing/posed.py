@@ -136,7 +136,7 @@ class PosedImport:
         source, options = self._source, self._options.walls
         numbers = sieve.progress(chosen.images.tolist(), "finding walls")
         planes = [self._images.planes(k) for k in numbers]
-        names = [source.names[k] for k in chosen.images.tolist()]
+        names = [source.names[int(k)] for k in chosen.images]
         targets = None if source.targets is None else source.targets[chosen.images]
 
         def explain(given: FoundWalls | None) -> list[str]:
