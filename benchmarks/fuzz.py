@@ -32,6 +32,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -181,45 +182,31 @@ def _tensor(values: torch.Tensor) -> st.SearchStrategy[Any]:
     """Values of another shape, size, kind or order, or none."""
     values = values.to_dense()
     cut = values[..., :0] if values.dim() else values.reshape(1)
-    shapes = [
-        values.reshape(1, *values.shape),
-        torch.cat([values.reshape(-1)] * 2),
-        cut,
-    ]
-    kinds = [torch.float32, torch.int64, torch.bool, torch.complex128]
-    scaled = [values.double() * factor for factor in (*FACTORS, 1e30, 1e-300)]
     order = values.flatten()[torch.randperm(values.numel())].reshape(values.shape)
-    others = [torch.full_like(values, 77), order, values.tolist(), values.float().to_sparse()]
-    return st.sampled_from([*shapes, *scaled, *others, *(values.to(kind) for kind in kinds)])
+    shapes = [values[None], torch.cat([values.reshape(-1)] * 2), cut, order, values.tolist()]
+    scaled = [values.double() * factor for factor in (*FACTORS, 1e30, 1e-300)]
+    kinds = [torch.float32, torch.int64, torch.bool, torch.complex128]
+    others = [torch.full_like(values, 77), values.float().to_sparse(), *map(values.to, kinds)]
+    return st.sampled_from([*shapes, *scaled, *others])
 
 
-def attempts(target: Target, folder: Path) -> Callable[[Callable[[Path, bool], None]], Any]:
-    """Return a decorator: a test of Hypothesis that is given a mutated file of a target."""
-
-    @st.composite
-    def inputs(draw: st.DrawFn) -> tuple[bytes, bool]:
-        if target.load is None or draw(st.booleans()):
-            return draw(edited(target.content)), True
-        try:
-            return target.dump(draw(changed(target.load(target.content)))), False
-        except (TypeError, ValueError, OverflowError, AttributeError):  # the format cannot say it
-            hypothesis.reject()
-
-    def decorated(look: Callable[[Path, bool], None]) -> Any:  # noqa: ANN401 - Hypothesis's
-        @hypothesis.given(inputs())
-        def test(drawn: tuple[bytes, bool]) -> None:
-            path = folder / target.name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(drawn[0])
-            look(path, drawn[1])
-
-        return test
-
-    return decorated
+@st.composite
+def mutated(draw: st.DrawFn, target: Target) -> tuple[bytes, bool]:
+    """A mutated file of a target, and whether its bytes were changed."""
+    if target.load is None or draw(st.booleans()):
+        return draw(edited(target.content)), True
+    try:
+        return target.dump(draw(changed(target.load(target.content)))), False
+    except (TypeError, ValueError, OverflowError, AttributeError):  # the format cannot say it
+        hypothesis.reject()
 
 
-def outcome(target: Target, path: Path, *, by_bytes: bool) -> tuple[str, str]:
+def outcome(target: Target, folder: Path, drawn: tuple[bytes, bool]) -> tuple[str, str]:
     """Read one input; say what came of it, and where."""
+    content, by_bytes = drawn
+    path = folder / target.name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
 
     def stop(*_: object) -> None:
         raise TimeoutError
@@ -264,9 +251,9 @@ def run_all(valid: Path, number: int, seed: int, count: int) -> tuple[Counter[st
             phases=[hypothesis.Phase.generate],
             suppress_health_check=list[Any](hypothesis.HealthCheck),
         )
-        @attempts(target, Path(name) / "inputs")
-        def test(path: Path, by_bytes: bool) -> None:
-            kind, where = outcome(target, path, by_bytes=by_bytes)
+        @hypothesis.given(mutated(target))
+        def test(drawn: tuple[bytes, bool]) -> None:
+            kind, where = outcome(target, Path(name) / "inputs", drawn)
             outcomes[kind] += 1
             if kind not in ("refused", "accepted"):
                 failures.append(f"{target.name}: {kind}: {where}")
@@ -355,16 +342,11 @@ def _lut(content: bytes) -> dict[str, Any]:
 
 
 def _save_lut(values: Any, file: Any) -> None:  # noqa: ANN401 - any value
-    def array(one: Any) -> np.ndarray:  # noqa: ANN401 - any value
-        one = (
-            one.to_dense().numpy()
-            if isinstance(one, torch.Tensor)
-            else json.dumps(one, default=str)
-        )
-        return np.array(one)
-
     held = values if isinstance(values, dict) else {"metadata": values}
-    arrays: dict[str, Any] = {str(name): array(one) for name, one in held.items()}
+    arrays: dict[str, Any] = {}
+    for name, one in held.items():
+        is_tensor = isinstance(one, torch.Tensor)
+        arrays[str(name)] = np.array(one.to_dense() if is_tensor else json.dumps(one, default=str))
     np.savez(file, **arrays)
 
 
@@ -413,13 +395,11 @@ def _within(folder: Path, use: Callable[[Path], Any]) -> Callable[[Path], Any]:
 
 def _header(path: Path, found: Recording, _: bool) -> None:
     camera, said = found.camera, stated(path)
-    own = {"width": camera.width, "height": camera.height, "K": camera.matrix}
-    values = {
-        "camera": own | {"distortion": camera.distortion},
-        "depth_kind": found.depth_kind,
-        "modulation_frequency_hz": found.modulation_frequency,
-        "saturation_amplitude": found.saturation_amplitude,
-        "planes": found.planes,
+    names = ("depth_kind", "saturation_amplitude", "planes")
+    values = {name: getattr(found, name) for name in names}
+    values["modulation_frequency_hz"] = found.modulation_frequency
+    values["camera"] = {"K": camera.matrix} | {
+        name: getattr(camera, name) for name in ("width", "height", "distortion")
     }
     require_equal(values, said, path.name)
 
@@ -508,18 +488,22 @@ def _read_lut(path: Path) -> list[Any]:
 
 def archives(made: Path) -> list[Target]:
     """The binary files that tofcorr writes itself: bytes, records, and values saved again."""
-    readers: dict[Path, tuple[Callable[[Path], list[Any]], Any, Any]] = {
-        made / "run" / "state.pt": (_state, _tensors, torch.save),
-        made / "module.pt": (
-            lambda path: _called(tofcorr.DepthCorrection.load(path)),
-            _tensors,
-            torch.save,
-        ),
-        made / "run" / "corrector.ts": (lambda path: _called(load_corrector(path)[0]), None, None),
-        made / "corrector.npz": (_read_lut, _lut, _save_lut),
+
+    def module(path: Path) -> list[Any]:
+        return _called(tofcorr.DepthCorrection.load(path))
+
+    def scripted(path: Path) -> list[Any]:
+        return _called(load_corrector(path)[0])
+
+    readers: dict[str, tuple[Callable[[Path], list[Any]], Any, Any]] = {
+        "run/state.pt": (_state, _tensors, torch.save),
+        "module.pt": (module, _tensors, torch.save),
+        "run/corrector.ts": (scripted, None, None),
+        "corrector.npz": (_read_lut, _lut, _save_lut),
     }
     found = []
-    for path, (read, load, save) in readers.items():
+    for name, (read, load, save) in readers.items():
+        path = made / name
         wanted, content = read(path), path.read_bytes()
 
         def same(path: Path, found: list[Any], by_bytes: bool, wanted: Any = wanted) -> None:  # noqa: ANN401
@@ -539,7 +523,8 @@ def archives(made: Path) -> list[Target]:
 def configurations(made: Path) -> list[Target]:
     """Configurations, sensors, and a simulator that runs."""
 
-    def said(path: Path, found: Options, _: bool) -> None:
+    def said(path: Path, found: Any, _: bool) -> None:  # noqa: ANN401 - options, or a sensor
+        found = found.sensor if isinstance(found, tofcorr.SensorModel) else found
         require_equal(found.to_mapping(), stated(path), path.name)
 
     def sensed(path: Path) -> tofcorr.SensorModel:
@@ -551,50 +536,36 @@ def configurations(made: Path) -> list[Target]:
     def simulated(path: Path) -> object:
         options = load_options(SimulatorOptions, path)
         robot, camera = options.robot, options.camera
-        frames = (
-            sum(shot.poses for shot in options.shots) + robot.repeat_poses * robot.repeat_frames
-        )
+        frames = sum(shot.poses for shot in options.shots)
+        frames += robot.repeat_poses * robot.repeat_frames
         if frames > 60 or camera.width * camera.height > 1000:  # only read, not run
             return options
         shutil.rmtree(path.with_name("simulated"), ignore_errors=True)
         return simulate(options, path.with_name("simulated"))
 
-    classes: dict[str, type[Options]] = {
-        "train": TrainingOptions,
-        "evaluate": EvaluationOptions,
-        "select": SelectionOptions,
-        "diagnose": DiagnosisOptions,
-        "simulate": SimulatorOptions,
-    }
+    classes: list[type[Options]] = [
+        *(TrainingOptions, EvaluationOptions, SelectionOptions, DiagnosisOptions, SimulatorOptions)
+    ]
 
     def by_words(path: Path) -> object:
         words = path.read_text("utf-8", "replace").split("\n")
         return resolve_options(TrainingOptions, "ea", tuple(words))
 
-    found = [
-        Target("set.txt", b"folds=2\nmodel.terms.0.degree=3\nsolver.kind=lbfgs", by_words, share=4)
-    ]
-    for kind, cls in classes.items():
-        for name in shipped_names(kind)[:4]:
+    yaml_ = (yaml.safe_load, _to_yaml)
+    words = b"folds=2\nmodel.terms.0.degree=3\nsolver.kind=lbfgs"
+    found = [Target("set.txt", words, by_words, share=4)]
+    for cls in classes:
+        for name in shipped_names(cls.config_folder)[:4]:
             # All keys with their defaults, so that those that no file names are changed too.
             content = _to_yaml(resolve_options(cls, name).to_mapping())
-
-            def read(path: Path, cls: type[Options] = cls) -> Options:
-                return load_options(cls, path)
-
-            found.append(
-                Target(f"{kind}_{name}.yaml", content, read, yaml.safe_load, _to_yaml, said, 2)
-            )
+            file = f"{cls.config_folder}_{name}.yaml"
+            found.append(Target(file, content, partial(load_options, cls), *yaml_, said, 2))
     sensor = yaml.safe_load((made / "sensor.yaml").read_text(encoding="utf-8"))
     sensor["camera"] |= {"width": 12, "height": 10}
 
-    def sensor_said(path: Path, found: tofcorr.SensorModel, _: bool) -> None:
-        require_equal(found.sensor.to_mapping(), stated(path), path.name)
-
-    yaml_ = (yaml.safe_load, _to_yaml)
     return [
         *found,
-        Target("sensor.yaml", _to_yaml(sensor), sensed, *yaml_, sensor_said, 5),
+        Target("sensor.yaml", _to_yaml(sensor), sensed, *yaml_, said, 5),
         Target("simulator.yaml", _to_yaml(tiny.simulator(1)), simulated, *yaml_, share=0.4),
     ]
 
@@ -625,7 +596,13 @@ def imports(folder: Path, rng: np.random.Generator) -> list[Target]:
     head = "timestamp_s,tx,ty,tz,qx,qy,qz,qw\n"
     k, distortion = [[365.5, 0.0, 255.5], [0.0, 366.5, 205.0], [0.0, 0.0, 1.0]], [0.09, -0.27, 0, 0]
     flat = np.ravel(k).tolist()
-    opencv = f"rows: 3, cols: 3, dt: d, data: {flat}"
+    opencv = "%YAML:1.0\n---\nimage_width: 512\nimage_height: 424\ncameraMatrix: !!opencv-matrix "
+    opencv += f"{{rows: 3, cols: 3, dt: d, data: {flat}}}\n"
+    ros: dict[str, Any] = {"image_width": 512, "image_height": 424}
+    ros["camera_matrix"] = {"rows": 3, "cols": 3, "data": flat}
+    ros["distortion_coefficients"] = {"rows": 1, "cols": 4, "data": distortion}
+    ros["distortion_model"] = "plumb_bob"
+    readings = [f"{0.5 + n / 100},{n},{n + 1},{n + 2},400" for n in range(8)]
     one = {"cam_K": flat, "depth_scale": 0.1, "cam_t_w2c": [1.0, 2.0, 3.0]}
     one["cam_R_w2c"] = np.eye(3).ravel().tolist()
     depth = rng.integers(400, 4000, (10, 12)).astype(np.uint16)
@@ -636,26 +613,12 @@ def imports(folder: Path, rng: np.random.Generator) -> list[Target]:
         "samples.yaml": (read_poses, [{"effector_wrt_world": x.ravel().tolist()} for x in poses]),
         "own.yaml": (lens, {"width": 512, "height": 424, "K": k, "distortion": distortion}),
         "numbers.json": (lens, {"width": 512, "height": 424, "camera_matrix": k}),
-        "ros.yaml": (
-            lens,
-            {
-                "image_width": 512,
-                "image_height": 424,
-                "camera_matrix": {"rows": 3, "cols": 3, "data": flat},
-                "distortion_model": "plumb_bob",
-                "distortion_coefficients": {"rows": 1, "cols": 4, "data": distortion},
-            },
-        ),
-        "opencv.yaml": (
-            lens,
-            "%YAML:1.0\n---\nimage_width: 512\nimage_height: 424\n"
-            f"cameraMatrix: !!opencv-matrix {{{opencv}}}\n",
-        ),
+        "ros.yaml": (lens, ros),
+        "opencv.yaml": (lens, opencv),
         "scene_camera.json": (read_scene_camera, {str(n): one for n in range(3)}),
         "measurements.csv": (
             lambda path: read_distances(path, (2, 2), None),
-            "time,a,b,c,d\n"
-            + "\n".join(f"{0.5 + n / 100},{n},{n + 1},{n + 2},400" for n in range(8)),
+            "\n".join(["time,a,b,c,d", *readings]),
         ),
     }
     dumps = {".yaml": (yaml.safe_load, _to_yaml), ".json": (json.loads, _to_json)}

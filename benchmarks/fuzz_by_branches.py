@@ -12,9 +12,10 @@ from pathlib import Path
 
 import atheris  # type: ignore[import-not-found]
 import click
+import hypothesis
 
 with atheris.instrument_imports(include=["tofcorr"]):  # type: ignore[attr-defined]
-    from benchmarks.fuzz import all_targets, attempts, outcome
+    from benchmarks.fuzz import all_targets, mutated, outcome
 
 
 @click.command()
@@ -27,9 +28,9 @@ def main(name: str, count: int, seed: int) -> None:
         place = Path(folder)
         target = next(one for one in all_targets(place / "valid", seed) if one.name == name)
 
-        @attempts(target, place / "inputs")
-        def test(path: Path, by_bytes: bool) -> None:
-            kind, where = outcome(target, path, by_bytes=by_bytes)
+        @hypothesis.given(mutated(target))
+        def test(drawn: tuple[bytes, bool]) -> None:
+            kind, where = outcome(target, place / "inputs", drawn)
             if kind not in ("refused", "accepted"):
                 raise AssertionError(f"{name}: {kind}: {where}")
 
