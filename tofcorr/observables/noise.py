@@ -115,9 +115,9 @@ def noise_of(observed: Observed, source: Source | None = None) -> NoiseMeasureme
         # Single pixels between edges have no difference; the curve covers them too. It has a least
         # noise where differences, less those of the pattern, leave none.
         at = table.amplitude if curve.needs_amplitude else table.distance
-        lit = table[np.isfinite(at) & (at > 0) & (table.missing < table.frames)]
-        squares = curve.sigma(lit.distance, lit.amplitude) ** 2
-        everywhere = float(squares.mean()) if len(lit) else 0.0
+        lit = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
+        squares = curve.sigma(table.distance[lit], table.amplitude[lit]) ** 2
+        everywhere = float(squares.mean()) if lit.any() else 0.0
         more = (everywhere / temporal) ** 0.5 if temporal > 0 else 1.0
         temporal, interval = everywhere, (interval[0] * more, interval[1] * more)
     pattern, scene = _fixed(observed)

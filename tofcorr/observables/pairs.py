@@ -85,7 +85,7 @@ def permutation_p(real: np.ndarray, sim: np.ndarray, random: Random) -> float | 
     weights = np.repeat([1 / len(real), -1 / len(sim)], [len(real), len(sim)])
     both = np.concatenate([real, sim])
     drawn = random.permuted(np.tile(weights, (_DRAWS, 1)), axis=1) @ both
-    return _share_beyond(drawn, weights @ both)
+    return _share_beyond(drawn, float(weights @ both))
 
 
 def _share_beyond(drawn: np.ndarray, observed: float) -> float:
@@ -307,10 +307,9 @@ def matched(real: Observed, sim: Observed, amplitudes: Pair | None) -> Matched:
         rows, columns = (np.arange(len(table)) for table in tables)
         names = [sorted(set(each.recording.frames.target.tolist())) for each in (real, sim)]
         groups, size = _strata(tables, names, _relative_brightness(tables, amplitudes))
-    chosen = tables[0][rows], tables[1][columns]
     return Matched(
-        real=chosen[0],
-        sim=chosen[1],
+        real=tables[0][rows].view(np.recarray),
+        sim=tables[1][columns].view(np.recarray),
         rows=rows,
         columns=columns,
         groups=groups,

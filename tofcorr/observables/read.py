@@ -495,7 +495,7 @@ def _rows(
         "missing": images.missing[chosen].sum(0),
         "saturated": images.saturated[chosen].sum(0),
     }
-    return np.rec.fromarrays(list(columns.values()), names=list(columns))
+    return np.rec.fromarrays(list(columns.values()), names=",".join(columns))  # pyright: ignore[reportArgumentType]
 
 
 def _of_nearest(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:

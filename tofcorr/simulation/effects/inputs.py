@@ -284,8 +284,11 @@ def facts_from_state(state: FrameState) -> FrameFacts:
 
 def joined(facts: Sequence[FrameFacts]) -> FrameFacts:
     """Return the facts of successive frames as those of all of them."""
-    known = {each.name: [getattr(one, each.name) for one in facts] for each in fields(FrameFacts)}
-    return FrameFacts(**{name: None if v[0] is None else torch.cat(v) for name, v in known.items()})
+    known: dict[str, Any] = {}
+    for name in (each.name for each in fields(FrameFacts)):
+        values = [getattr(one, name) for one in facts]
+        known[name] = None if values[0] is None else torch.cat(values)
+    return FrameFacts(**known)
 
 
 # What an effect can need to know before it can be tested, and whether it is known.

@@ -61,9 +61,10 @@ class MapEffect(CatalogueEffect):
             ConfigError: A key is unknown, a value is not a number, or there are too few or many.
         """
         fields: dict[str, Any] = {"seed": (int, 1)}
-        for key, (rms, kind) in cls.tables.items():
-            fields |= {rms: (FiniteNumber, 0.0), key: (kind | None, None)}
-        entry = create_model("Entry", __base__=cls.shape_type, **fields).from_mapping(values, where)
+        for key, (rms, listed) in cls.tables.items():
+            fields |= {rms: (FiniteNumber, 0.0), key: (listed | None, None)}
+        kind: Any = create_model("Entry", __base__=cls.shape_type, **fields)
+        entry = kind.from_mapping(values, where)
         shape = cls.shape_type(**{key: getattr(entry, key) for key in cls.shape_type.model_fields})
         parts = []
         for k, (key, (rms, _)) in enumerate(cls.tables.items()):

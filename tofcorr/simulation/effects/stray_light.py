@@ -1,5 +1,6 @@
 """Light scattered inside the lens."""
 
+from collections.abc import Callable
 from functools import cache, partial
 from typing import ClassVar
 
@@ -74,7 +75,8 @@ def _scattered(
     signal: Tensor, camera: CameraIntrinsics, shape: StrayLightShape, chosen: tuple[int, ...] = ()
 ) -> Tensor:
     """Return the light that some coefficients add to phasor images, shape (B, H, W, K); (): all."""
-    ways = [partial(blur, signal, sigma * camera.width) for sigma in shape.sigma_of_width]
+    ways: list[Callable[[], Tensor]] = []
+    ways += [partial(blur, signal, sigma * camera.width) for sigma in shape.sigma_of_width]
     ways.append(lambda: signal.mean((1, 2), keepdim=True).expand_as(signal))
     out_of_focus = cache(partial(blur, signal, shape.ghost_sigma_of_width * camera.width))
     ways += [lambda size=size: ghost(out_of_focus(), camera, size) for size in shape.ghost_sizes]

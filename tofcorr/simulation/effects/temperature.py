@@ -146,8 +146,9 @@ class RoomTemperatureEffect(FrameEffect):
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the mean temperature as reference, and the times after the longest pauses."""
         room, times = inputs.facts.room_temperature, inputs.facts.timestamp.sort().values
-        mean = {} if room is None else {"reference_c": float(room.mean())}
-        shape = RoomTemperatureShape(**mean)
+        shape = RoomTemperatureShape()
+        if room is not None:
+            shape = shape.model_copy(update={"reference_c": float(room.mean())})
         pauses = times.diff()
         longest = pauses.argsort(descending=True)[:_MOST_PAUSES].sort().values
         after = [times[i + 1] for i in longest if pauses[i] > min(shape.lags_s)]
