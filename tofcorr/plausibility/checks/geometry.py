@@ -6,6 +6,7 @@ shows how many pass.
 
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,8 +20,10 @@ from tofcorr.plausibility.alignment import walls_of
 from tofcorr.plausibility.finding import Finding, doubtful, impossible, in_words, note
 from tofcorr.plausibility.linear import Estimate, length_scale, places_on_wall
 from tofcorr.plausibility.look import Look
-from tofcorr.plausibility.mistakes import WRONG_PLANES, Explanation, best_explanations
 from tofcorr.plausibility.mounting import remounting
+
+if TYPE_CHECKING:
+    from tofcorr.plausibility.mistakes import Explanation
 
 FAR_OFF = 0.1
 """Distance along the ray from its plane from which a pixel is garbage or wrapped, metres. Chosen:
@@ -336,6 +339,8 @@ def agreement(
     if excess < tried and not odd:
         yield from _scale(look)
         return
+    from tofcorr.plausibility.mistakes import best_explanations  # Of use to few recordings.
+
     named = best_explanations(look)
     if named:
         yield _explained(look, named)
@@ -365,13 +370,15 @@ def _excess(look: Look) -> float:
 
 
 def _explained(
-    look: Look, named: list[Explanation], of_planes: float = 0.06, turned_deg: float = 15.0
+    look: Look, named: "list[Explanation]", of_planes: float = 0.06, turned_deg: float = 15.0
 ) -> Finding:
     """Return what says which mistake it is.
 
     Where only the planes are wrong, a fit is meaningless from `of_planes` metres or `turned_deg`
     on: planes a few degrees off are what `diagnose` finds as target_registration.
     """
+    from tofcorr.plausibility.mistakes import WRONG_PLANES
+
     (cause, advice, found, frees), given = named[0], look.given
     # A mirrored image and a mirrored world look alike; say both.
     others = [more for more, other, _, freed in named if other != advice and not freed]
