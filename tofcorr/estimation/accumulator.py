@@ -230,7 +230,7 @@ class MomentAccumulator:
         step = max(1, self._block // (count * width))
 
         valid = None if whole else batch.valid
-        images = batch.radial_distance, batch.amplitude, valid, weights
+        others = batch.amplitude, valid, weights
         # Each block is written over the last: it is in the cache.
         memory = torch.empty(
             len(self.formed) * count * step * width, dtype=torch.float64, device=self._device
@@ -239,11 +239,12 @@ class MomentAccumulator:
         def blocks() -> Iterator[Float[Tensor, "F B h W"]]:
             for row in range(0, height, step):
                 at = frames, slice(row, row + step)
-                yield self._products(*(one if one is None else one[at] for one in images), memory)
+                rest = (one if one is None else one[at] for one in others)
+                yield self._products(batch.radial_distance[at], *rest, memory=memory)
 
         reduced = self._reduction.reduced(blocks())
-        functions, others = reduced.tensor_split([count * len(self._kept)])
-        sums = self._reduction.sums(functions), self._reduction.sums(others, 10)
+        functions, products = reduced.tensor_split([count * len(self._kept)])
+        sums = self._reduction.sums(functions), self._reduction.sums(products, 10)
         by_frame = [part.unflatten(0, (-1, count)).transpose(0, 1).flatten(1) for part in sums]
         return self._with_distance(torch.cat(by_frame, dim=1)[:, self._gather])
 
@@ -253,6 +254,7 @@ class MomentAccumulator:
         amplitude: Float[Tensor, "B h W"] | None,
         valid: Bool[Tensor, "B h W"] | None,
         weights: Float[Tensor, "B h W"] | None,
+        *,
         memory: Float[Tensor, "M"],
     ) -> Float[Tensor, "F B h W"]:
         """Return w f_a f_b of the products formed; zero where not valid.

@@ -298,7 +298,8 @@ def _repeat_differences(
         if change.numel():
             mean = (amplitude[k] + amplitude[k + 1])[both] / 2
             found.append(torch.stack([change - change.median(), mean]))
-    return torch.cat(found, dim=1).unbind()
+    differences, amplitudes = torch.cat(found, dim=1)
+    return differences, amplitudes
 
 
 def without_outliers(
