@@ -358,15 +358,14 @@ def reduced(sums: GroupSums, noise: Tensor, random_precision: Tensor) -> tuple[T
     Returns:
         Normal equations of each group in the shared unknowns: precision (G, P, P), right (G, P).
     """
-    own, cross, shared, right = _parts(sums)
-    within = _with_prior(own[:, :, :-1], noise, random_precision)
+    within, cross = _of_effects(sums, noise, random_precision)
     # Turns and shifts have other units than shapes: scaled, nothing is lost to rounding.
     scale = within.diagonal(dim1=1, dim2=2).rsqrt()[:, :, None]
-    right_sides = torch.cat([cross, own[:, :, -1:]], dim=2)
-    solved = scale * torch.linalg.solve(within * scale * scale.transpose(1, 2), scale * right_sides)
-    products = shared - cross.transpose(1, 2) @ solved[:, :, :-1]
-    rest = right - (cross.transpose(1, 2) @ solved[:, :, -1:])[:, :, 0]
-    return products / noise[:, None, None], rest / noise[:, None]
+    solved = scale * torch.linalg.solve(within * scale * scale.mT, scale * cross)
+    others = [*range(sums.unknowns), -1]
+    left = sums.products[:, others][:, :, others] - cross.mT @ solved
+    left = left / noise[:, None, None]
+    return left[:, :-1, :-1], left[:, :-1, -1]
 
 
 def estimate(sums: GroupSums, prior_precision: Tensor, start: Variances, of: Classes) -> Estimate:
@@ -418,13 +417,11 @@ def random_effects(sums: GroupSums, found: Estimate) -> tuple[Tensor, Tensor]:
     Returns:
         Two tensors of shape (G, R).
     """
-    noise = found.variances.noise
-    own, cross, _, _ = _parts(sums)
-    precision = 1 / found.variances.random
-    within = _with_prior(own[:, :, :-1], torch.full_like(sums.size, noise), precision)
+    noise, precision = found.variances.noise, 1 / found.variances.random
+    within, cross = _of_effects(sums, torch.full_like(sums.size, noise), precision)
     spread = torch.linalg.inv(within)
-    effects = (spread @ (own[:, :, -1] - cross @ found.mean)[:, :, None])[:, :, 0]
-    lever = spread @ cross
+    lever, right = (spread @ cross).tensor_split([sums.unknowns], dim=2)
+    effects = right[:, :, 0] - lever @ found.mean
     uncertainty = noise * spread.diagonal(dim1=1, dim2=2)
     return effects, uncertainty + (lever @ found.covariance * lever).sum(dim=2)
 
@@ -462,21 +459,14 @@ def _by_class(squares: Tensor, known: Tensor, of: Tensor, believed: Tensor) -> T
     return variance
 
 
-def _parts(sums: GroupSums) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return products of the effects (with themselves and y), with X, of X, and of X and y."""
+def _of_effects(sums: GroupSums, noise: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the products of the effects with themselves, with their prior, and with X and y."""
     first, last = sums.unknowns, sums.unknowns + sums.random
-    products = sums.products
-    return (
-        products[:, first:last, first:],
-        products[:, first:last, :first],
-        products[:, :first, :first],
-        products[:, :first, -1],
-    )
-
-
-def _with_prior(own: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
+    rows = sums.products[:, first:last]
+    own = rows[:, :, first:last]
     ridge = ROUNDING * own.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None]
-    return own + (noise[:, None] * precision + ridge).diag_embed()
+    within = own + (noise[:, None] * precision + ridge).diag_embed()
+    return within, torch.cat([rows[:, :, :first], rows[:, :, last:]], dim=2)
 
 
 @contextmanager
