@@ -8,8 +8,8 @@ from diagnosed_recordings import PLAIN
 
 from benchmarks.degraded_gap import degraded_gap
 from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.words import FINDINGS
 from tofcorr.sensor.model import SensorModel
 from tofcorr.simulation.simulator import simulate
 
@@ -29,10 +29,10 @@ def test_a_diagnosis_degrades_ideal_frames_of_poses_held_out(
     assert found.poses == time_diagnosis.evidence.study.observations.num_units
     # Same poses, pixels and floor; ten folds against single poses.
     assert found.gap**2 + gap.floor**2 == pytest.approx(gap.after**2 + gap.floor**2, rel=0.02)
-    assert found.interval[0] <= found.gap <= found.interval[1]
+    assert found.gap.interval[0] <= found.gap <= found.gap.interval[1]
     block = json.loads(json.dumps(time_diagnosis.to_mapping()["degraded"]))
     assert block["gap_mm"] == pytest.approx(1e3 * found.gap, abs=1e-3)
-    assert "Ideal frames, degraded" in FINDINGS["stages"](time_diagnosis)[0]
+    assert "Ideal frames, degraded" in render(time_diagnosis)
 
 
 @pytest.mark.slow

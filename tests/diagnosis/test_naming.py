@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import diagnosed_recordings
@@ -11,9 +12,25 @@ import torch
 from diagnosis.comparisons import effect_test, model_of
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, least_p_value
-from tofcorr.diagnosis.findings.gap import OpenSet, judge_remainder, measure_gap, resampled
-from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects, refined, simplest
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectComparison,
+    compare_effects,
+    least_p_value,
+)
+from tofcorr.diagnosis.findings.gap import (
+    OpenSet,
+    judge_remainder,
+    measure_gap,
+    name_in_two,
+    resampled,
+)
+from tofcorr.diagnosis.findings.naming import (
+    NamedEffects,
+    name_effects,
+    next_effect,
+    refined,
+    simplest,
+)
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.base_fit import SimulatorError
@@ -109,8 +126,9 @@ def test_of_causes_that_close_the_same_the_simplest_significant_one_is_named() -
 
 
 def test_a_refined_base_term_is_named_once_it_closes_much(time_study: Study) -> None:
-    model = model_of(time_study, refined_terms=("integration_time", "distance"))
-    found = refined(model, time_study.fit.floor**2)
+    last = compare_effects(time_study, (), flips=False, maps=False)
+    model = model_of(time_study, last, refined_terms=("integration_time", "distance"))
+    found = refined(model)
     assert (found.names, found.refined_terms) == (("integration_time",), ("distance",))
 
 
@@ -201,7 +219,7 @@ def test_a_refined_base_term_is_not_named_without_being_significant(
 ) -> None:
     monkeypatch.setattr(EffectComparison, "family_p_value", lambda *_: 0.5)
     model = model_of(time_study, refined_terms=("integration_time",))
-    found = refined(model, time_study.fit.floor**2)
+    found = refined(model)
     assert (found.names, found.refined_terms) == ((), ("integration_time",))
 
 
@@ -211,7 +229,7 @@ def test_an_effect_that_leads_back_to_an_earlier_model_is_not_tried_again(
     """Two effects once dropped one another in turn, until the steps were spent."""
     steps: list[set[str]] = []
 
-    def dropping_the_other(model: NamedEffects, _: float) -> NamedEffects:
+    def dropping_the_other(model: NamedEffects) -> NamedEffects:
         steps.append(set(model.names))
         first, *_ = model.order
         left = tuple(name for name in model.names if name != first)
@@ -236,4 +254,78 @@ def test_an_effect_is_swapped_for_a_better_one_only_if_that_is_significant(
     monkeypatch.setattr(EffectComparison, "family_p_value", lambda *_: p_value)
     monkeypatch.setattr("tofcorr.diagnosis.findings.naming.least_closed", lambda *_, **__: -1e9)
     model = model_of(time_study).naming("lens")
-    assert refined(model, time_study.fit.floor**2).names == (expected,)
+    assert refined(model).names == (expected,)
+
+
+GAP = 4e-6  # Two millimetres, squared.
+
+
+def _comparison(study: Study, closes: float, p_value: float) -> EffectComparison:
+    """An effect that closes a share of the gap, among others that reach more by chance."""
+    square = GAP * study.sums.count
+    noise = study.fit.floor**2 * study.sums.count
+    draws = torch.linspace(0.0, 1.0, 99, dtype=torch.float64)
+    lens = effect_test("lens", closes * square, gain=1.0 - p_value, null=draws)
+    # It often gains more by chance than the lens does, in units of its own spread.
+    often = draws.flip(0) ** 40 + draws**40
+    motion = effect_test("motion", 0 * square, gain=-1.0, null=often)
+    tests = {"lens": lens, "motion": motion}
+    return EffectComparison(chosen=(), squares=noise + square, tests=tests, probes={})
+
+
+@pytest.mark.parametrize(
+    ("closes", "p_value", "certain", "named"),
+    [
+        (0.9, 0.02, False, False),
+        (0.9, 0.02, True, True),
+        (0.4, 0.02, True, False),  # Less than half of the gap.
+        (0.9, 0.20, True, False),  # Not even significant by itself.
+    ],
+)
+def test_a_certain_gap_is_named_by_what_is_significant_alone_and_explains_most_of_it(
+    closes: float, p_value: float, certain: bool, named: bool, nothing_study: Study
+) -> None:
+    compared = _comparison(nothing_study, closes, p_value)
+    assert compared.naming_p_value("lens") > 0.05
+    found = next_effect(model_of(nothing_study, compared, certain=certain))
+    assert (found is not None) == named
+
+
+def test_a_second_effect_is_not_named_on_less_evidence(nothing_study: Study) -> None:
+    compared = _comparison(nothing_study, 0.9, 0.02)
+    model = model_of(nothing_study, compared, names=("warm_up",), certain=True)
+    assert next_effect(model) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "likeliest", "unknown", "again"),
+    [
+        ((), ("lens",), True, True),
+        ((), ("lens",), False, False),  # Nothing says that there is a gap.
+        ((), (), True, False),  # No effect would be named.
+        (("motion",), ("lens",), True, False),
+    ],
+)
+def test_effects_are_named_again_only_where_none_is_and_a_gap_is_certain(
+    names: tuple[str, ...],
+    likeliest: tuple[str, ...],
+    unknown: bool,
+    again: bool,
+    nothing_study: Study,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[bool] = []
+
+    def named(_: Study, *, certain: bool = False) -> SimpleNamespace:
+        asked.append(certain)
+        return SimpleNamespace(names=names, likeliest=likeliest)
+
+    replaced = {
+        "name_effects": named,
+        "measure_gap": lambda *_: None,
+        "judge_remainder": lambda *_: SimpleNamespace(unknown=unknown),
+    }
+    for name, function in replaced.items():
+        monkeypatch.setattr(f"tofcorr.diagnosis.findings.gap.{name}", function)
+    name_in_two(nothing_study, torch.ones(1, nothing_study.observations.num_units).double())
+    assert asked == ([False, True] if again else [False])

@@ -8,16 +8,19 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
+from matplotlib.text import Text
 
 from tofcorr.diagnosis.findings.shares import Share
-from tofcorr.diagnosis.findings.where import Estimated
+from tofcorr.diagnosis.findings.where import Estimated, Stage
+from tofcorr.diagnosis.report.figures import stage_bars
 from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.words import (
-    FINDINGS,
+    along,
     cause_words,
     effect_words,
     interval_words,
@@ -158,7 +161,6 @@ def test_every_picture_of_every_kind_of_report_has_words(time_diagnosis: Diagnos
     for result in (with_simulator(time_diagnosis), without_effects(time_diagnosis), time_diagnosis):
         figures = result.all_figures()
         assert ("where_as_given" in figures) == (result.stages[0].gap is not None)
-        assert FINDINGS.keys() - figures.keys() <= {"where_as_given"}
         shown = html.unescape(render(result))
         for name in figures:
             figure = shown[shown.index(f'<figure id="{name}">') :].split("</figure>")[0]
@@ -186,12 +188,10 @@ def test_the_first_strip_is_the_one_that_the_text_beside_it_names(
     bins = [replace(one, p_value=0.003) for one in times if not one.trend]
     one = Estimated(1.0)
     line = replace(times[0], covariate="distance_m", trend=True, bias=one, p_value=0.003)
-    given, _, last = time_diagnosis.stages
-    shown = replace(where, regions=(line, *bins))
-    result = replace(time_diagnosis, stages=(given, shown, last))
-    told = FINDINGS["where"](result)[0]
-    ends = [1e3 * pick(one.bias for one in bins) for pick in (min, max)]
-    assert f"integration time: it goes from {ends[0]:.1f} to {ends[1]:.1f} mm." in told
+    covariate, ends, _, significant = along(replace(where, regions=(line, *bins)))
+    low, high = (1e3 * pick(one.bias for one in bins) for pick in (min, max))
+    assert significant
+    assert (covariate, ends) == ("integration time", f"from {low:.1f} to {high:.1f} mm")
 
 
 def test_the_verdict_comes_first_and_the_causes_next(
@@ -260,3 +260,17 @@ def test_every_fitted_value_stands_on_the_page_as_in_the_sensor_file(
         assert one.interval is not None
         assert one.interval[0] <= one.value <= one.interval[1]
         assert f">{name}</td>" in page
+
+
+@pytest.mark.parametrize("floor", [1e-4, 1e-3, 2.9e-3, 3.6e-3, 0.1])
+def test_every_word_stands_inside_the_figure_however_large_the_noise_is(floor: float) -> None:
+    """The label of a noise beyond the axis was cut at the edge of the picture."""
+    stage = Stage(name="recalibrated", gap=Estimated(2.1e-3, interval=(1.4e-3, 2.8e-3)))
+    gap, stages = SimpleNamespace(floor=floor), (Stage(name="as_given"), stage)
+    known = {"stages": stages, "effects": (), "refined_terms": (), "gap_steps": ()}
+    figure = stage_bars(cast("Any", SimpleNamespace(gap=gap, degraded=None, **known)))
+    figure.draw_without_rendering()
+    for text in figure.findobj(lambda one: isinstance(one, Text) and one.get_text() != ""):
+        extent = text.get_window_extent()
+        assert extent.x0 >= figure.bbox.x0 - 1, text
+        assert extent.x1 <= figure.bbox.x1 + 1, text

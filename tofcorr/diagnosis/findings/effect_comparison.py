@@ -15,7 +15,7 @@ Neither is said of an effect that fits worse than such an error explains (`fits_
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -94,7 +94,7 @@ class EffectTest:
         fitted without the few poses that determine it. Median and standard deviation include the
         observed gain.
         """
-        return float(self._scores[-1])
+        return float(self.scores[-1])
 
     @property
     def spread(self) -> float:
@@ -107,37 +107,33 @@ class EffectTest:
 
         The two tests share the level (Bonferroni, weighted).
         """
-        p_value = share_of(self.null, self.gain)
-        if self.null_closed is None:
-            return p_value
-        closed = self.closed_scores()
-        return either(p_value, share_of(closed[:-1], closed[-1]))
-
-    def null_scores(self, least: float = -math.inf) -> Tensor:
-        """Return the scores of the draws, shape (B,); none where less is closed, m^2."""
-        scores = self._scores[:-1]
-        if self.null_closed is None:
-            return scores
-        return torch.where(self.null_closed >= least, scores, -math.inf)
-
-    def closed_scores(self, least: float = -math.inf) -> Tensor:
-        """Return the scores of what each draw closes, then of what is closed, shape (B + 1,).
-
-        None where less is closed, m^2, nor where it was not drawn.
-        """
-        if self.null_closed is None:
-            return torch.full((len(self.null) + 1,), -math.inf, dtype=torch.float64)
-        closed = torch.cat([self.null_closed, self.closed.sum()[None]])
-        middle, spread = _middle_and_spread(closed)
-        scores = (closed - middle) / spread.clamp(min=self.least_spread_closed)
-        return torch.where(closed >= least, scores, -math.inf)
+        p_value, closed = share_of(self.null, self.gain), self.closed_scores
+        return p_value if closed is None else either(p_value, share_of(closed[:-1], closed[-1]))
 
     @cached_property
-    def _scores(self) -> Tensor:
-        """Scores of the draws, then that of the gain, shape (B + 1,); many rules ask for them."""
-        gains = torch.cat([self.null, self.null.new_tensor([self.gain])])
-        middle, spread = _middle_and_spread(gains)
-        return (gains - middle) / spread.clamp(min=self.least_spread)
+    def scores(self) -> Tensor:
+        """Scores of the draws, then that of the gain, shape (B + 1,)."""
+        return _scores(self.null, self.null.new_tensor(self.gain), self.least_spread)
+
+    @cached_property
+    def closed_scores(self) -> Tensor | None:
+        """Scores of what each draw closes, then of what is closed, (B + 1,); None: not drawn."""
+        if self.null_closed is None:
+            return None
+        return _scores(self.null_closed, self.closed.sum(), self.least_spread_closed)
+
+    def among(self, scores: Tensor, least: float) -> Tensor:
+        """Return the scores of draws, shape (B,); -inf where less than this is closed, m^2."""
+        if self.null_closed is None:
+            return scores[:-1]
+        return torch.where(self.null_closed >= least, scores[:-1], -math.inf)
+
+
+def _scores(draws: Tensor, value: Tensor, least_spread: float) -> Tensor:
+    """Return draws, then a value, above their median in units of their spread, shape (B + 1,)."""
+    values = torch.cat([draws, value[None]])
+    middle, spread = _middle_and_spread(values)
+    return (values - middle) / spread.clamp(min=least_spread)
 
 
 def _middle_and_spread(values: Tensor, high: float = 0.95) -> tuple[Tensor, Tensor]:
@@ -161,11 +157,6 @@ def either(by_gain: float, by_closed: float, share: float = 0.8) -> float:
 def share_of(best: Tensor, score: float | Tensor) -> float:
     """Return the share of draws, (B,), that reach a score; the data count as one of them."""
     return float((1 + (best >= score).sum()) / (len(best) + 1))
-
-
-def _best(scores: Iterable[Tensor]) -> Tensor:
-    """Return the highest score of every draw, shape (B,)."""
-    return torch.stack(list(scores)).amax(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +183,8 @@ class EffectComparison:
         A probe is compared with the best of all effects and probes.
         """
         family = self.tests | self.probes if name in self.probes else self.tests
-        return share_of(_best(one.null_scores() for one in family.values()), family[name].score)
+        best = torch.stack([one.scores[:-1] for one in family.values()]).amax(0)
+        return share_of(best, family[name].score)
 
     def naming_p_value(self, name: str) -> float:
         """Return the probability that chance would name an effect with at least this score.
@@ -201,19 +193,20 @@ class EffectComparison:
         does not close enough itself is compared with all. It must be significant alone as well.
         The score of what is closed is compared in the same way, and the two tests share the level.
         """
-        test, tests = self.tests[name], self.tests.values()
+        test = self.tests[name]
         if test.total < self.least:
             return self.family_p_value(name)
         p_value = share_of(self._best_named(), test.score)
-        drawn = [one for one in tests if one.null_closed is not None]
-        if drawn:
-            best = _best(one.closed_scores(self.least)[:-1] for one in drawn)
-            p_value = either(p_value, share_of(best, test.closed_scores()[-1]))
+        drawn = [(one, one.closed_scores) for one in self.tests.values()]
+        closed = [one.among(own, self.least) for one, own in drawn if own is not None]
+        if closed:
+            own = -math.inf if test.closed_scores is None else float(test.closed_scores[-1])
+            p_value = either(p_value, share_of(torch.stack(closed).amax(0), own))
         return max(p_value, test.p_value)
 
     def _best_named(self) -> Tensor:
         """Return the highest score of every draw among effects that close enough, shape (B,)."""
-        return _best(test.null_scores(self.least) for test in self.tests.values())
+        return torch.stack([t.among(t.scores, self.least) for t in self.tests.values()]).amax(0)
 
     def ordered(self) -> list[EffectTest]:
         """Return the tests of effects in descending order of what they close."""

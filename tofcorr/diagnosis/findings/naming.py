@@ -59,8 +59,8 @@ class NamedEffects:
         likeliest: At most three effects that would close most of what remains, but are not
             significant among so many; the likeliest first.
         tested: Whether there were enough poses for a test.
-        certain: Whether the first effect is named because tests of the whole found a gap; among so
-            many effects it is not significant.
+        certain: Whether other tests have found that something is missing, so that a first effect
+            is named which is not significant among so many.
     """
 
     study: Study
@@ -87,6 +87,12 @@ class NamedEffects:
     def adds_something(self) -> bool:
         """Whether a simulator with the findings differs from one without."""
         return bool(self.names or self.refined_terms)
+
+    @property
+    def gap(self) -> float:
+        """Squared gap of the base model, m^2."""
+        square = float(self.first.squares.sum() / self.study.sums.count.sum())
+        return square - self.study.fit.floor**2
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -130,13 +136,12 @@ def name_effects(study: Study, *, certain: bool = False, most_steps: int = 12) -
     """
     tests, final, first = study.options.tests, study, compare_effects(study, ())
     tested = study.sums.num_units >= tests.least_images
-    model = NamedEffects(study=study, first=first, last=first, tested=tested)
+    model = NamedEffects(study=study, first=first, last=first, tested=tested, certain=certain)
     compared, seen = [first], [_members(model)]
-    gap = float(first.squares.sum() / study.sums.count.sum()) - study.fit.floor**2
     for _ in range(most_steps if tested else 0):
         if len(model.names) >= tests.most_effects:
             break
-        name, larger = _with_next(model, gap, certain=certain)
+        name, larger = _with_next(model)
         if name is None:
             break
         if _members(larger) in seen:
@@ -152,7 +157,7 @@ def name_effects(study: Study, *, certain: bool = False, most_steps: int = 12) -
         study=final,
         sets=final_sets(model, compared),
         likeliest=likeliest(study, model.last),
-        certain=certain and bool(model.names),
+        certain=certain and model.names != (),
     )
 
 
@@ -160,21 +165,13 @@ def _members(model: NamedEffects) -> tuple[set[str], ...]:
     return set(model.names), set(model.refined_terms), set(model.probes)
 
 
-def _with_next(
-    model: NamedEffects, gap: float, *, certain: bool
-) -> tuple[str | None, NamedEffects]:
-    """Return the effect or probe to add, and the model with it; None: there is none to add.
-
-    Args:
-        model: The model so far.
-        gap: Squared gap of the base model, m^2.
-        certain: Whether other tests have found that something is missing.
-    """
-    name, study = probe_to_add(model, gap), model.study
+def _with_next(model: NamedEffects) -> tuple[str | None, NamedEffects]:
+    """Return the effect or probe to add, and the model with it; None: there is none to add."""
+    name, study = probe_to_add(model), model.study
     if name is not None:
         larger = replace(model, probes={**model.probes, name: model.last.family_p_value(name)})
     else:
-        found = next_effect(model, gap, certain=certain)
+        found = next_effect(model)
         if found is None:
             return None, model
         name, report = found
@@ -192,22 +189,17 @@ def _with_next(
                 study=without_map(study, fitted.values, {name, *effect.contains}),
             )
     larger = _reestimated(larger)
-    return name, refined(larger, gap) if len(larger.with_probes) > 1 else larger
+    return name, refined(larger) if len(larger.with_probes) > 1 else larger
 
 
 def _reestimated(model: NamedEffects) -> NamedEffects:
     return replace(model, study=with_poses_reestimated(model.study, model.with_probes))
 
 
-def probe_to_add(model: NamedEffects, gap: float) -> str | None:
-    """Return a probe that explains what no effect of the catalogue explains; None: there is none.
-
-    Args:
-        model: The model so far.
-        gap: Squared gap of the base model, m^2.
-    """
+def probe_to_add(model: NamedEffects) -> str | None:
+    """Return a probe that explains what no effect explains; None: there is none."""
     tests, comparison = model.study.options.tests, model.last
-    least = max((tests.unknown_mm / 1000) ** 2, tests.material_share * gap)
+    least = max((tests.unknown_mm / 1000) ** 2, tests.material_share * model.gap)
     best = max((test.total for test in comparison.tests.values()), default=0.0)
     for test in sorted(comparison.probes.values(), key=lambda test: -test.total):
         if test.total <= max(best, 0.0) or test.name in model.rejected:
@@ -225,15 +217,11 @@ def probe_to_add(model: NamedEffects, gap: float) -> str | None:
     return None
 
 
-def next_effect(
-    model: NamedEffects, gap: float, *, certain: bool = False, least_of_rest: float = 0.1
-) -> tuple[str, bool] | None:
+def next_effect(model: NamedEffects, *, least_of_rest: float = 0.1) -> tuple[str, bool] | None:
     """Return the effect to add, and whether under its name, not as a base term; None: stop.
 
     Args:
         model: The model so far.
-        gap: Squared gap of the base model, m^2.
-        certain: Whether other tests have found that something is missing.
         least_of_rest: An effect below the same score is named if it closes at least this share, in
             squares, of what then stays unexplained. Chosen: a cause that is not in the catalogue
             resembles some effect a little.
@@ -244,21 +232,19 @@ def next_effect(
         if test.total <= 0:
             return None
         rest = least_of_rest * (unexplained - test.total)
-        if test.total <= rest and test.score < _CLEAR_SCORE:
-            continue
-        if test.name in model.rejected.union(model.names):
+        little = test.total <= rest and test.score < _CLEAR_SCORE
+        if little or test.name in model.rejected.union(model.names):
             continue
         significant = comparison.naming_p_value(test.name) <= tests.level
-        if not significant and not (certain and _explains_gap(model, test, gap)):
+        if not significant and not _explains_gap(model, test):
             continue
-        if test.total > _closed_by_probes(model, test.name):
-            found = _to_add(model, test, gap)
-            if found is not None:
-                return found
+        found = _to_add(model, test)
+        if found is not None and test.total > _closed_by_probes(model, test.name):
+            return found
     return None
 
 
-def _to_add(model: NamedEffects, test: EffectTest, gap: float) -> tuple[str, bool] | None:
+def _to_add(model: NamedEffects, test: EffectTest) -> tuple[str, bool] | None:
     """Return the effect to add where one is significant: it, or another of its cause set."""
     tests, comparison = model.study.options.tests, model.last
     closed = closed_square(model.study, test)
@@ -270,21 +256,21 @@ def _to_add(model: NamedEffects, test: EffectTest, gap: float) -> tuple[str, boo
         small = closed < (tests.form_tolerance_mm / 1000) ** 2
         if finer and small and comparison.tests[name].p_value <= tests.level:
             return name, False
-    if closed < least_closed(model, gap, test.name, further=bool(model.names)):
+    if closed < least_closed(model, test.name):
         return None
     return (absent or [simplest(comparison, members, tests.level)])[0], True
 
 
-def _explains_gap(model: NamedEffects, test: EffectTest, gap: float) -> bool:
+def _explains_gap(model: NamedEffects, test: EffectTest) -> bool:
     """Return whether a first effect may be named where the gap as a whole is significant.
 
     The correction for the number of effects guards against a name where nothing is missing. Where
     that is excluded, an effect must be significant by itself, and close most of a gap that matters.
     """
-    options = model.study.options
-    least = max(0.5 * gap, (options.target_gap_mm / 1000) ** 2)
-    large = closed_square(model.study, test) >= least
-    return not model.names and large and test.p_value <= options.tests.level
+    options, closed = model.study.options, closed_square(model.study, test)
+    large = closed >= max(0.5 * model.gap, (options.target_gap_mm / 1000) ** 2)
+    first = model.certain and not model.names
+    return first and large and test.p_value <= options.tests.level
 
 
 def _closed_by_probes(model: NamedEffects, name: str) -> float:
@@ -303,9 +289,7 @@ def _closed_by_probes(model: NamedEffects, name: str) -> float:
     return float((left - all_left).sum())
 
 
-def least_closed(
-    model: NamedEffects, gap: float, name: str, *, further: bool, share_of_form: float = 0.25
-) -> float:
+def least_closed(model: NamedEffects, name: str, *, share_of_form: float = 0.25) -> float:
     """Return what an effect must close to be reported, m^2.
 
     The first one must close a share of the gap. Beside others, a size in millimetres is enough;
@@ -318,36 +302,32 @@ def least_closed(
 
     Args:
         model: The model so far.
-        gap: Squared gap of the base model, m^2.
         name: The effect.
-        further: Whether another effect is named already.
         share_of_form: An effect that varies like a named one closes more than this share of that
             one's form error, in millimetres, or is not reported. Chosen: what a form misses is
             rarely of the shape of a single other effect.
     """
     tests = model.study.options.tests
     size, share = model.study.material_mm, tests.material_share
-    if further:
-        alike = (n for n in model.names if n != name and vary_alike(name, n))
-        errors = (CATALOGUE[other].form_error for other in alike)
+    others = [other for other in model.names if other != name]
+    if others:
+        errors = (CATALOGUE[other].form_error for other in others if vary_alike(name, other))
         size, share = tests.further_mm, (share_of_form * max(errors, default=0.0)) ** 2
     if model.refined_terms:
         size = tests.form_tolerance_mm
-    return max((size / 1000) ** 2, share * gap)
+    return max((size / 1000) ** 2, share * model.gap)
 
 
-def _absent_terms(
-    model: NamedEffects, best: EffectTest, *, nearly_as_much: float = 0.6
-) -> list[str]:
+def _absent_terms(model: NamedEffects, best: EffectTest, *, as_much: float = 0.6) -> list[str]:
     """Return error terms that the base model lacks and that close nearly as much as the best.
 
     Args:
         model: The model so far.
         best: The best effect.
-        nearly_as_much: Such a term is named first if it closes this share of what the best effect
+        as_much: Such a term is named first if it closes this share of what the best effect
             closes. Chosen: every camera has these errors.
     """
-    tests, least = model.last.tests, nearly_as_much * best.total
+    tests, least = model.last.tests, as_much * best.total
     known = [name for name in absent_forms(model.study) if name in tests.keys() - model.rejected]
     level = model.study.options.tests.level
     large = [name for name in known if tests[name].total >= least]
@@ -390,35 +370,31 @@ def likeliest(study: Study, last: EffectComparison, *, most: int = 3) -> tuple[s
     return tuple(test.name for test in large if test.p_value <= level)[:most]
 
 
-def refined(model: NamedEffects, gap: float, *, swap_share: float = 0.05) -> NamedEffects:
+def refined(model: NamedEffects, *, swap_share: float = 0.05) -> NamedEffects:
     """Swap named effects for better ones; drop small ones; report refined terms grown large.
 
     Args:
         model: The model.
-        gap: Squared gap of the base model, m^2.
         swap_share: An effect is swapped for another that closes more by at least this share of the
             other's. Chosen, so that noise swaps nothing.
     """
     before = model
-    for name in [n for n in model.names if n in model.study.candidates.effects]:
+    for name in [*before.names, *before.refined_terms]:
+        if name not in model.study.candidates.effects:
+            continue
         comparison = compare_effects(model.study, model.without(name), flips=False, maps=False)
         own, best = comparison.tests[name], comparison.ordered()[0]
+        small = closed_square(model.study, own) < least_closed(model, name)
+        if name in before.refined_terms:
+            if not small and _significant(model, name, instead_of=name):
+                model = model.naming(name)
+            continue
         better = best.name != name and own.total < (1 - swap_share) * best.total
         if better and _significant(model, best.name, instead_of=name):
             model = model.naming(best.name, instead_of=name)
-        elif _too_small(model, own, gap, further=len(model.names) > 1):
+        elif small:
             model = replace(model, names=tuple(n for n in model.names if n != name))
-    for name in model.refined_terms:
-        comparison = compare_effects(model.study, model.without(name), flips=False, maps=False)
-        small = _too_small(model, comparison.tests[name], gap, further=bool(model.names))
-        if not small and _significant(model, name, instead_of=name):
-            model = model.naming(name)
     return _reestimated(model) if model is not before else model
-
-
-def _too_small(model: NamedEffects, test: EffectTest, gap: float, *, further: bool) -> bool:
-    closed = closed_square(model.study, test)
-    return closed < least_closed(model, gap, test.name, further=further)
 
 
 def _significant(model: NamedEffects, name: str, *, instead_of: str) -> bool:

@@ -8,6 +8,7 @@ looks like noise.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -18,23 +19,15 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry.rays import multiples_in_words, range_of_wrapped
 
-# A group of pixels is crowded if its share of outliers exceeds that of all pixels this many times,
-# and by so many pixels: above ten, chance alone does not triple a count. Chosen.
-_CROWDED, _BY_CHANCE = 3.0, 10
-# Tiles along each side of the image, groups of a covariate with equally many pixels, and the most
-# frames that are listed. Chosen.
-_GROUPS = 8
-# Brightest over darkest pixel of a 3 x 3 neighbourhood that holds an edge of the target. Chosen:
-# neighbours of one reflectivity differ by a few per cent and by noise.
-_EDGE_RATIO = 1.5
-# A warning is given from this share of outliers on. Normal noise makes 1 in 16 000 pixels one; 1 %
-# of pixels that are off by 0.1 m hold an error of 10 mm RMS. Chosen.
-_WORTH_A_WARNING = 0.01
-
 
 @dataclass(frozen=True, kw_only=True)
 class Outliers:
     """Pixels that the fit does not fully use.
+
+    Class attributes:
+        worth_a_warning: A warning is given from this share of outliers on. Normal noise makes 1 in
+            16 000 pixels one; 1 % of pixels that are off by 0.1 m hold an error of 10 mm RMS.
+            Chosen.
 
     Attributes:
         deleted: Share of the pixels that get no weight.
@@ -47,6 +40,8 @@ class Outliers:
         wrapped_by: The unambiguous range, metres, if most deleted pixels are off by multiples of
             it; None: they are not, or it is unknown.
     """
+
+    worth_a_warning: ClassVar[float] = 0.01
 
     deleted: float
     reduced: float
@@ -62,23 +57,21 @@ class Outliers:
 
         Fewer are worth one too where they hold more of the squared error than the noise does.
         """
-        many = self.deleted + self.reduced >= _WORTH_A_WARNING
+        many = self.deleted + self.reduced >= self.worth_a_warning
         if not (many or self.deleted * self.size**2 > self.noise**2):
             return ""
-        parts, reason = [], ""
+        said, reason = [], ""
         if self.wrapped_by is not None:
-            range_ = multiples_in_words(self.wrapped_by)
-            reason = f"(most by {range_}: they show a target beyond it) "
+            multiples = multiples_in_words(self.wrapped_by)
+            reason = f"(most by {multiples}: they show a target beyond it) "
         if self.deleted:
-            parts.append(
-                f"{_percent(self.deleted)} of the pixels are off by {1e3 * self.size:.0f} mm RMS "
-                f"{reason}and are left out as outliers"
-            )
+            off = f"off by {1e3 * self.size:.0f} mm RMS {reason}and are left out as outliers"
+            said.append(f"{_percent(self.deleted)} of the pixels are {off}")
         if self.reduced:
             whose = "" if self.deleted else " of the pixels"
-            parts.append(f"{_percent(self.reduced)}{whose} count less, as outliers")
+            said.append(f"{_percent(self.reduced)}{whose} count less, as outliers")
         return (
-            f"{'; '.join(parts)}. They lie {self.place}. "
+            f"{'; '.join(said)}. They lie {self.place}. "
             "Gap and effects describe the other pixels: mask these, or find out what they show."
         )
 
@@ -95,20 +88,18 @@ def outliers_of(study: Study, *, tiles: tuple[int, int] = (6, 8)) -> Outliers:
         tiles: Rows and columns of the map of outliers. Chosen: as in the map of the bias.
     """
     odd, deleted = study.fit.trust < 1, study.fit.trust == 0
-    errors, wrapped_by = study.fit.residual[deleted], None
-    if len(errors):
-        frequency = study.observations.recording.modulation_frequency
-        wrapped_by = range_of_wrapped(errors.numpy(), frequency)
-    tile, (rows, columns) = _tiles(study.observations, *tiles), tiles
-    held = torch.bincount(tile, odd.double(), rows * columns)
+    errors, (rows, columns) = study.fit.residual[deleted], tiles
+    tile = _tiles(study.observations, rows, columns)
+    held, all_held = (torch.bincount(tile, x, rows * columns) for x in (odd.double(), None))
+    frequency = study.observations.recording.modulation_frequency
     return Outliers(
         deleted=float(deleted.double().mean()),
         reduced=float((odd & ~deleted).double().mean()),
         size=float(errors.square().mean().sqrt()) if len(errors) else 0.0,
         noise=study.fit.floor,
-        tiles=(held / torch.bincount(tile, minlength=len(held))).reshape(tiles).numpy(),
+        tiles=(held / all_held).reshape(tiles).numpy(),
         place=place_of(study, odd),
-        wrapped_by=wrapped_by,
+        wrapped_by=range_of_wrapped(errors.numpy(), frequency) if len(errors) else None,
     )
 
 
@@ -123,46 +114,57 @@ def place_of(study: Study, chosen: Tensor, *, most_of_them: float = 0.5) -> str:
     """
     if not bool(chosen.any()):
         return "nowhere"
-    found = [
-        (float(there[chosen].double().mean()), float(there.double().mean()), words)
-        for words, there in _places(study, chosen)
-    ]
-    held = [place for place in found if place[0] >= most_of_them]
-    if not held:
+    found = []
+    for words, there in _places(study, chosen):
+        held = float(there[chosen].double().mean())
+        if held >= most_of_them:
+            found.append((held - float(there.double().mean()), held, words))
+    if not found:
         return "all over the images"
-    share, _, words = max(held, key=lambda place: place[0] - place[1])
-    return f"mostly {words} ({100 * share:.0f} % of them)"
+    _, held, words = max(found)
+    return f"mostly {words} ({100 * held:.0f} % of them)"
 
 
-def _places(study: Study, chosen: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """Yield a clause and the pixels, (M,), for each kind of place that is crowded."""
-    observations = study.observations
-    edges = {"at the rim of the target's mask": (observations.on_target, 1.0)}
-    if observations.amplitude_images is not None:
-        edges["at edges between dark and bright"] = observations.amplitude_images, _EDGE_RATIO
-    for words, (images, ratio) in edges.items():
-        there = _at_edges(observations, images, ratio)
-        if _is_crowded(there, chosen):
-            yield words, there
-    width = observations.recording.camera.width
+def _places(
+    study: Study, chosen: Tensor, *, groups: int = 8, edge_ratio: float = 1.5
+) -> Iterator[tuple[str, Tensor]]:
+    """Yield a clause and the pixels, (M,), for each kind of place that is crowded.
+
+    Args:
+        study: The recording.
+        chosen: Which pixels, shape (M,), bool.
+        groups: Tiles along each side of the image, groups of a covariate with equally many pixels,
+            and the most frames that are listed. Chosen.
+        edge_ratio: Brightest over darkest pixel of a 3 x 3 neighbourhood that holds an edge of the
+            target. Chosen: neighbours of one reflectivity differ by a few per cent and by noise.
+    """
+    observations, width = study.observations, study.observations.recording.camera.width
     row, column = observations.pixel // width, observations.pixel % width
-    members = chosen & _crowded(_tiles(observations, _GROUPS, _GROUPS), chosen)
+    found = {"at the rim of the target's mask": _at_edges(observations, observations.on_target, 1)}
+    if observations.amplitude_images is not None:
+        at_edges = _at_edges(observations, observations.amplitude_images, edge_ratio)
+        found["at edges between dark and bright"] = at_edges
+    members = chosen & _crowded(_tiles(observations, groups, groups), chosen)
     if bool(members.any()):
         ends = [(int(x[members].min()), int(x[members].max())) for x in (row, column)]
-        (top, bottom), (left, right) = ends
-        there = (row >= top) & (row <= bottom) & (column >= left) & (column <= right)
-        if _is_crowded(there, chosen):
-            yield f"in rows {top} to {bottom} and columns {left} to {right}", there
+        words = "in rows {} to {} and columns {} to {}".format(*ends[0], *ends[1])
+        inside = [
+            (x >= low) & (x <= high) for x, (low, high) in zip((row, column), ends, strict=True)
+        ]
+        found[words] = inside[0] & inside[1]
+    for words, there in found.items():
+        if bool(_crowded(there.long(), chosen)[there].any()):
+            yield words, there
     there = _crowded(observations.frame, chosen)
     numbers = observations.frame[there].unique().tolist()
     if numbers:
-        words = f"in frame{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers[:_GROUPS]))}"
-        more = len(numbers) - _GROUPS
+        words = f"in frame{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers[:groups]))}"
+        more = len(numbers) - groups
         yield words + f" and {more} more" * (more > 0), there
     values = {"at distances from {:.2f} to {:.2f} m": study.inputs.radial_distance}
     if observations.amplitude is not None:
         values["at amplitudes from {:.0f} to {:.0f}"] = observations.amplitude
-    inner = torch.linspace(0, 1, _GROUPS + 1, dtype=torch.float64)[1:-1]
+    inner = torch.linspace(0, 1, groups + 1, dtype=torch.float64)[1:-1]
     for words, own in values.items():
         levels = torch.quantile(own[:: len(own) // 100_000 + 1], inner)
         there = _crowded(torch.bucketize(own, levels), chosen)
@@ -192,16 +194,17 @@ def _at_edges(observations: Observations, images: Tensor, ratio: float) -> Tenso
     return torch.cat(found)
 
 
-def _is_crowded(there: Tensor, chosen: Tensor) -> bool:
-    return float(chosen[there].double().sum()) > _CROWDED * float(
-        chosen.double().mean() * there.sum()
-    )
+def _crowded(group: Tensor, chosen: Tensor, *, times: float = 3.0, by_chance: int = 10) -> Tensor:
+    """Return which pixels lie in groups with many chosen ones, shape (M,).
 
-
-def _crowded(group: Tensor, chosen: Tensor) -> Tensor:
-    """Return which pixels lie in groups with many chosen ones, shape (M,)."""
+    Args:
+        group: Of each pixel, shape (M,), int64.
+        chosen: Which pixels, shape (M,), bool.
+        times: By how much the share of chosen ones exceeds that among all pixels. Chosen.
+        by_chance: And by so many pixels: above ten, chance alone does not triple a count.
+    """
     expected = torch.bincount(group) * chosen.double().mean()
-    return (torch.bincount(group, chosen.double()) > _CROWDED * expected + _BY_CHANCE)[group]
+    return (torch.bincount(group, chosen.double()) > times * expected + by_chance)[group]
 
 
 def mask_warning(observations: Observations, *, least_share: float = 0.02) -> str:
@@ -224,13 +227,12 @@ def mask_warning(observations: Observations, *, least_share: float = 0.02) -> st
     alone = float((poses * (poses - 1)).sum() / poses.sum().clamp(min=1)) < 1
     if not alone and share >= least_share:
         return ""
-    found = f"The mask leaves {100 * share:.1f} % of the measured pixels"
-    if alone:
-        found += (
-            ", and a typical one of these in one pose alone: a pattern of the sensor cannot be "
-            "distinguished from noise"
-        )
+    typical = (
+        ", and a typical one of these in one pose alone: a pattern of the sensor cannot be "
+        "distinguished from noise"
+    )
     return (
-        f"{found}. A mask made from the depth, as by RANSAC, leaves out the pixels with large "
+        f"The mask leaves {100 * share:.1f} % of the measured pixels{typical * alone}. "
+        "A mask made from the depth, as by RANSAC, leaves out the pixels with large "
         "errors: widen its threshold."
     )

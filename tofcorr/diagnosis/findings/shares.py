@@ -270,10 +270,6 @@ class Parts:
             mean = coefficients @ products[-1, :-2]
             mean[owner.index(True)] -= mean.sum()
             coefficients[:, self.constant] -= mean
-        else:
-            # The base model is refitted to each part: what it absorbs is no part of what it leaves.
-            base, parts = self.base, coefficients[:, : len(normal)]
-            parts[:, base] = -torch.linalg.solve(normal[base][:, base], normal[base] @ parts.T).T
         return Refitted(products, coefficients)
 
     @cached_property
@@ -283,11 +279,6 @@ class Parts:
         for row, cause in zip(owned, self.causes, strict=True):
             row[list(cause.members)] = 1.0
         return owned
-
-    @cached_property
-    def base(self) -> list[int]:
-        """Numbers of the fitted columns that belong to no cause."""
-        return (self.owned.sum(0) == 0).nonzero()[:, 0].tolist()
 
 
 class Refitted(NamedTuple):
@@ -458,7 +449,8 @@ def _left(parts: Parts, products: Tensor, causes: list[Share]) -> Tensor:
         products: As in `Parts`, of each resample, shape (B, Q + 1, Q + 1).
         causes: The effects.
     """
-    fitted = [*parts.base, *chain.from_iterable(cause.members for cause in causes)]
+    base = (parts.owned.sum(0) == 0).nonzero()[:, 0].tolist()
+    fitted = [*base, *chain.from_iterable(cause.members for cause in causes)]
     # The residual less what the effects add with a coefficient of one.
     rest = torch.zeros(products.shape[-1], dtype=torch.float64)
     rest[-2] = 1.0

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from tofcorr.diagnosis.findings.absorption import absorption_table
-from tofcorr.diagnosis.findings.where import Interval, Region, Stage
+from tofcorr.diagnosis.findings.where import Estimated, Interval, Region, Stage
 from tofcorr.diagnosis.report.words import (
     SHARE_ENDS,
     SIGNIFICANT,
@@ -66,26 +66,24 @@ Bar = tuple[str, float, Interval, str, str]
 def stage_bars(result: "DiagnosisResult") -> Figure:
     """Draw the gap at each stage and after each named effect in turn, and the noise of a pixel."""
 
-    def bar(name: str, size: float, interval: Interval, colour: str) -> Bar:
-        ends = 1e3 * interval[0], 1e3 * interval[1]
+    def bar(name: str, size: Estimated, colour: str) -> Bar:
+        ends = 1e3 * size.interval[0], 1e3 * size.interval[1]
         return name, 1e3 * size, ends, colour, f"{1e3 * size:.1f} mm"
 
     bars = [
-        bar(STAGE_WORDS[one.name], one.gap, one.gap.interval, STAGE_COLOURS[one.name])
+        bar(STAGE_WORDS[one.name], one.gap, STAGE_COLOURS[one.name])
         for one in stages_shown(result)
         if one.gap is not None
     ]
     steps = [
-        bar(f"+ {effect_words(result.evidence.study, name)}", size, size.interval, BLUE)
+        bar(f"+ {effect_words(result.evidence.study, name)}", size, BLUE)
         for name, size in result.gap_steps
     ]
     bars[-1:-1] = steps[:-1]
     if steps:  # Its bar is that of the stage. Three lines would touch the next bar's.
         bars[-1] = (f"{steps[-1][0].split(' (')[0]}:\n{bars[-1][0]}", *bars[-1][1:])
     if result.degraded is not None:
-        bars.append(
-            bar("degraded frames", result.degraded.gap, result.degraded.interval, _LIGHT_BLUE)
-        )
+        bars.append(bar("degraded frames", result.degraded.gap, _LIGHT_BLUE))
     figure, axes = _bars(bars, "gap, mm (root mean square, noise taken off)")
     floor, end = 1e3 * result.gap.floor, axes.get_xlim()[1]
     if floor < end:  # Beyond, its label would be cut; a card tells it.
@@ -138,10 +136,6 @@ def _bars(bars: Sequence[Bar], label: str) -> tuple[Figure, Axes]:
     axes.set_yticks(places, names, fontsize=9)
     axes.set_xlabel(label)
     return figure, axes
-
-
-def _fitted(result: "DiagnosisResult") -> list[Stage]:
-    return [stage for stage in stages_shown(result) if stage.name != "as_given"]
 
 
 def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figure:
@@ -203,7 +197,7 @@ def image_maps(result: "DiagnosisResult") -> Figure:
 def pose_series(result: "DiagnosisResult") -> Figure:
     """Draw the mean residual of each pose in the order of the recording."""
     figure, (axes,) = panels(2)
-    for stage in _fitted(result):
+    for stage in stages_shown(result, fitted=True):
         colour, label = STAGE_COLOURS[stage.name], STAGE_WORDS[stage.name]
         axes.plot(1e3 * stage.offsets, ".-", linewidth=1, color=colour, label=label)
     line_across(axes)
@@ -279,7 +273,7 @@ def paired_poses(result: "DiagnosisResult") -> Figure:
 
 FIGURES: dict[str, Callable[["DiagnosisResult"], Figure]] = {
     "where_as_given": lambda r: covariate_strips(stages_shown(r)[:1], least_p(r), most=4),
-    "where": lambda r: covariate_strips(_fitted(r), least_p(r), most=6),
+    "where": lambda r: covariate_strips(stages_shown(r, fitted=True), least_p(r), most=6),
     "which": effect_forest,
     "aliases": absorption_map,
     "map": image_maps,

@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 def content_of(result: "DiagnosisResult") -> dict[str, Any]:
     """Return the content of `diagnosis.json`."""
     gap, remainder, named = result.gap, result.remainder, result.evidence.named
-    outliers, transfer, degraded = result.outliers, result.transfer, result.degraded
+    outliers, transfer, closure = result.outliers, result.transfer, result.closure
+    degraded = result.degraded
     untested = {"closes_mm": None, "closed_fraction": None, "p_value": None, "aliases": []}
     lengths = "before", "after", "floor", "between_images", "fixed_pattern", "within_images"
+    lists = "effects", "likeliest", "causes", "remarks", "warnings"
     trainings = "trained_on_sim", "trained_on_sim_with_effects", "trained_on_real"
     return {
         "format": "tofcorr-diagnosis",
@@ -41,8 +43,7 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
         ],
         "gap_mm": {
             **{name: _mm(getattr(gap, name)) for name in lengths},
-            "before_ci": _mm(gap.before.interval),
-            "after_ci": _mm(gap.after.interval),
+            **{f"{name}_ci": _mm(getattr(gap, name).interval) for name in ("before", "after")},
             "closed_fraction": round(gap.closed, 4),
             "closed_ci": _rounded(gap.closed.interval),
             "floor_is_upper_bound": not gap.floor_from_repeats,
@@ -50,14 +51,12 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
         "parameter_gap_mm": {"as_given": _mm(gap.as_given), "refitted": _mm(gap.before)},
         "detected": result.detected,
         "p_value": round(result.p_value, 5),
-        "effects": list(result.effects),
         "cause_sets": [list(members) for members in result.cause_sets],
         # What members close over what the first one closes.
         "cause_sets_close": [
             {name: round(share, 3) for name, share in own.items() if math.isfinite(share)}
             for own in named.sets.values()
         ],
-        "likeliest": list(result.likeliest),
         "unknown": remainder.unknown,
         "unknown_p_value": round(remainder.p_value, 5),
         "outliers": {
@@ -67,12 +66,10 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
             "map": [_rounded(row) for row in outliers.tiles.tolist()],
             "where": outliers.place,
         },
-        "ranking": [
-            *(_ranked(result.evidence.study, named, test) for test in result.ranking),
-            *(
-                {"effect": name, **untested, "available": False, "missing": missing}
-                for name, missing in result.missing.items()
-            ),
+        "ranking": [_ranked(result.evidence.study, named, test) for test in result.ranking]
+        + [
+            {"effect": name, **untested, "available": False, "missing": missing}
+            for name, missing in result.missing.items()
         ],
         "where": _regions(result.stages[1], 60),  # More than anyone reads.
         "transfer_mm": transfer
@@ -83,22 +80,16 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
         },
         "fitted": [
             {name: getattr(one, name) for name in ("cause", "kind", "name", "unit")}
-            | {
-                "value": _finite(one.value),
-                "ci": one.interval and [_finite(end) for end in one.interval],
-            }
+            | {"value": _finite(one.value), "ci": one.interval and [*map(_finite, one.interval)]}
             for one in result.fitted
         ],
-        "closure_mm": result.closure
-        and {
-            "without_effects": _mm(result.closure.without_effects),
-            "with_effects": _mm(result.closure.with_effects),
-            "frames": result.closure.frames,
-        },
+        "closure_mm": closure
+        and {name: _mm(getattr(closure, name)) for name in ("without_effects", "with_effects")}
+        | {"frames": closure.frames},
         "degraded": degraded
         and {
             "gap_mm": _mm(degraded.gap),
-            "ci": _mm(degraded.interval),
+            "ci": _mm(degraded.gap.interval),
             "poses": degraded.poses,
             "left_out": list(degraded.left_out),
         },
@@ -108,7 +99,7 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
         "minimum_detectable_mm": {name: _mm(size) for name, size in result.detectable.items()},
         "next_recording": list(result.advice),
         "verdict": result.verdict,
-        **{name: list(getattr(result, name)) for name in ("causes", "remarks", "warnings")},
+        **{name: list(getattr(result, name)) for name in lists},
         "unknown_score": round(remainder.score, 4),
         "remaining_share": round(remainder.remaining_share, 4),
         "fingerprint": list(remainder.fingerprint),

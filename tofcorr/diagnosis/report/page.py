@@ -11,15 +11,22 @@ from typing import Any
 import numpy as np
 import torch
 
+from tofcorr.diagnosis.findings.effect_comparison import closed_gap
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.words import (
-    FINDINGS,
+    SMALL,
     STAGE_WORDS,
+    along,
     biases_of,
+    cause_words,
     effect_words,
     least_p,
+    mm,
     p_words,
     percent,
+    pose_errors,
+    share_words,
+    sized,
     stages_shown,
 )
 from tofcorr.diagnosis.rerun.sensor import sensor_of
@@ -67,83 +74,46 @@ def render(result: DiagnosisResult) -> str:
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    study, named = result.evidence.study, result.evidence.named
     environment.filters |= {
         "mm": _mm,
+        "metres": mm,
         "known": known,
         "known_interval": known_interval,
+        "sized": sized,
         "percent": lambda share: "–" if share is None else percent(share),
+        "share": share_words,
+        "small": lambda share: abs(share) < SMALL,
+        "negative": lambda share: share < 0 and percent(share) != "0 %",
         "p": lambda p: "–" if p is None else p_words(p, least_p(result)).removeprefix("= "),
-        "effect": partial(effect_words, result.evidence.study),
+        "effect": partial(effect_words, study),
+        "cause": partial(cause_words, study),
+        "along": along,
         "p_of_draws": lambda p: p_words(p, LEAST_P),
         "with_digits": _with_digits,
     }
-    folder = files("tofcorr.diagnosis.report")
+    folder, tests = files("tofcorr.diagnosis.report"), named.first.tests
     template, style = (
         folder.joinpath(f"report.{n}").read_text("utf-8") for n in ("html.j2", "css")
     )
     return environment.from_string(template).render(
         style=Markup(style),
         **result.to_mapping(),
-        components=_components(result),
+        result=result,
+        study=study,
+        options=result.options,
+        gap=result.gap,
+        recording=study.observations.recording,
+        shown=stages_shown(result),
+        pose_errors=pose_errors(result),
+        closed={n: closed_gap(study, named.first, test)[1] for n, test in tests.items()},
         catalogue=CATALOGUE,
-        pictures={
-            name: (Markup(svg_of(figure)), *FINDINGS.get(name, lambda _: ("", ""))(result))
-            for name, figure in result.all_figures().items()
-        },
+        pictures={name: Markup(svg_of(own)) for name, own in result.all_figures().items()},
         stage_words=STAGE_WORDS,
-        provenance=_provenance(result),
-        level=result.options.tests.level,
-        tested=result.tested,
-        hand_eye_free=result.evidence.study.fit.model.hand_eye_free,
+        versions=f"tofcorr {__version__}, torch {torch.__version__}, NumPy {np.__version__}",
+        hand_eye_free=study.fit.model.hand_eye_free,
         saturated_missing=result.observables.real_dropouts.saturated_missing,
     )
-
-
-def _components(result: DiagnosisResult) -> list[tuple[str, float, float]]:
-    """Return the components of the gap in words, in mm, and as shares of its square."""
-    gap = result.gap
-    components = {
-        "between images (whole images shifted or tilted)": gap.between_images,
-        "the same in every image (fixed pattern)": gap.fixed_pattern,
-        "within images, or different between frames of a pose": gap.within_images,
-    }
-    total = max(gap.before**2, 1e-18)
-    return [(words, 1e3 * size, size**2 / total) for words, size in components.items()]
-
-
-def _provenance(result: DiagnosisResult) -> list[tuple[str, str]]:
-    study, options = result.evidence.study, result.options
-    observations, sums = study.observations, study.sums
-    recording = observations.recording
-    floor = (
-        "differences between pixels three apart in one image: an upper bound, because it "
-        "contains every effect that such pixels do not share"
-    )
-    if study.fit.noise.repeats:
-        floor = f"{study.fit.noise.repeats} frames taken without moving"
-    terms = [f"{term.group} ({len(term.symbols)})" for term in study.fit.model.terms]
-    if study.pattern is not None:
-        terms.append("fixed pattern")
-    spread = ", ".join(f"{1e3 * sd:.2f}" for sd in sums.pose_sd)
-    return [
-        ("recording", recording.path.name),
-        (
-            "frames, poses, pixels used",
-            f"{observations.num_frames}, {observations.num_units}, {len(observations.measured)}",
-        ),
-        ("camera", f"{recording.camera.width} x {recording.camera.height} pixels"),
-        ("base model", ", ".join(terms) or "a constant alone"),
-        ("hand-eye transform", "estimated" if study.fit.model.hand_eye_free else "fixed"),
-        ("noise floor from", floor),
-        ("standard deviation of poses: offset, two tilts at the image's edge", f"{spread} mm"),
-        ("variance of the scores over that of independent noise", f"{sums.dispersion:.2f}"),
-        (
-            "folds, sign flips, bootstraps",
-            f"{options.tests.folds}, {options.tests.flips}, {options.bootstraps}",
-        ),
-        ("seed", str(options.seed)),
-        ("versions", f"tofcorr {__version__}, torch {torch.__version__}, NumPy {np.__version__}"),
-    ]
 
 
 def _mm(value: float | None) -> str:

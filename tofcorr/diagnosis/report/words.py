@@ -1,14 +1,13 @@
 """What the report says in words: names, numbers, the verdict, causes, remarks, and figures."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.diagnosis.findings.absorption import absorbed_share
-from tofcorr.diagnosis.findings.effect_comparison import closed_gap
 from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
@@ -34,8 +33,7 @@ SHARE_ENDS = (-1.0, 2.0)
 SIGNIFICANT = 0.05
 """p-value below which a text speaks of a bias. 5 % by convention."""
 # Shares below this are not worth a word (no unit). Chosen: they look as if nothing were there.
-_SMALL = 0.05
-_STATIC = "is the same in every image"
+SMALL = 0.05
 _LABELS = {
     "distance_m": "distance, m",
     "row": "row, px",
@@ -71,9 +69,9 @@ def mm(metres: float) -> str:
     return f"{metres * 1e3:z.1f}"
 
 
-def sized(size: float, interval: Interval) -> str:
+def sized(size: Estimated) -> str:
     """Return a length in metres as millimetres with its interval, in the digits that are known."""
-    in_mm = 1e3 * interval[0], 1e3 * interval[1]
+    in_mm = 1e3 * size.interval[0], 1e3 * size.interval[1]
     return f"{known(1e3 * size, in_mm)} mm [{', '.join(known_interval(in_mm))}]"
 
 
@@ -82,10 +80,15 @@ def least_p(result: "DiagnosisResult") -> float:
     return 1 / (result.options.tests.flips + 1)
 
 
-def stages_shown(result: "DiagnosisResult") -> list[Stage]:
-    """Return the stages that differ: no first one without simulator, no last without effects."""
+def stages_shown(result: "DiagnosisResult", *, fitted: bool = False) -> list[Stage]:
+    """Return the stages that differ: no first one without simulator, no last without effects.
+
+    Args:
+        result: What was found.
+        fitted: Whether only those from recalibration on are wanted.
+    """
     stages = result.stages if result.effects or result.refined_terms else result.stages[:2]
-    return [stage for stage in stages if stage.gap is not None]
+    return [stage for stage in stages[fitted:] if stage.gap is not None]
 
 
 def pose_errors(result: "DiagnosisResult") -> tuple[np.ndarray, np.ndarray]:
@@ -145,7 +148,7 @@ def write_verdict(
         start = "No simulator was given, so one was fitted to the recording; it"
     bound = "" if gap.floor_from_repeats else " (an upper bound)"
     size = (
-        f"{start} differs from the recording by {sized(gap.whole, gap.whole.interval)}, in excess "
+        f"{start} differs from the recording by {sized(gap.whole)}, in excess "
         f"of a noise of {mm(gap.floor)} mm{bound}."
     )
     shares = {one.cause: one.share for one in causes if abs(one.share) >= 1 / 100}
@@ -196,9 +199,9 @@ def _something_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     fewer = f" (or only {fewer}, of another form)" if fewer else ""
     start, advice = "With ", "add"
     if gap.as_given is not None:
-        before = sized(gap.before, gap.before.interval).split(" [")[0]
+        before = sized(gap.before).split(" [")[0]
         start, advice = f"Recalibration leaves {before}; with ", "calibrate it and add"
-    sentence = f"{start}{many}{fewer} added, {sized(gap.after, gap.after.interval)} remain"
+    sentence = f"{start}{many}{fewer} added, {sized(gap.after)} remain"
     if remainder.unknown:
         sentence += ", which none of the effects tested explains."
     else:
@@ -215,7 +218,7 @@ def _something_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
 def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     given, start = gap.as_given is not None, "No effect is named"
     if given:
-        start = f"Recalibration leaves {sized(gap.after, gap.after.interval)}"
+        start = f"Recalibration leaves {sized(gap.after)}"
     if remainder.unknown:  # Without a simulator that is said already.
         explained = f", and none of the effects tested explains that{_nearest(named)}."
         return start + explained if given else ""
@@ -242,7 +245,7 @@ def list_causes(study: Study, named: NamedEffects, causes: Sequence[Share]) -> t
 def _cause_line(study: Study, named: NamedEffects, one: Share) -> str:
     share = f"{share_words(one.share)} {interval_words(one.share.interval)}"
     line = f"{cause_words(study, one)}: {share} of the squared gap"
-    if one.of_constant is not None and one.of_constant > _SMALL:
+    if one.of_constant is not None and one.of_constant > SMALL:
         line += f" ({percent(one.of_constant)} by a constant offset, which any cause may have)"
     if one.kind == "effect":
         return f"{line}; {effect_line(named, one.cause)}."
@@ -266,7 +269,7 @@ def effect_line(named: NamedEffects, name: str) -> str:
         if member in named.names:
             forms += [] if member == name else [effect_words(study, member)]
             continue
-        closes = f" (closes {percent(share)} of what this one closes)" if share >= _SMALL else ""
+        closes = f" (closes {percent(share)} of what this one closes)" if share >= SMALL else ""
         rivals.append(effect_words(study, member) + closes)
     if rivals:
         words += f", which these data cannot distinguish from {', '.join(rivals)}"
@@ -366,18 +369,17 @@ def _largest_component(gap: Gap, named: NamedEffects) -> str:
         return ""
     size, words = max(
         (gap.between_images, "shifts or tilts whole images"),
-        (gap.fixed_pattern, _STATIC),
+        (gap.fixed_pattern, "is the same in every image"),
         (
             gap.within_images,
             "varies within images, from image to image, or between the frames of a pose",
         ),
     )
-    share = size**2 / gap.before**2
-    sentence = f"After recalibration {percent(share)} of the squared gap {words}"
+    share, table = size**2 / gap.before**2, ""
     # Its cause need not be known to be corrected.
-    if words == _STATIC and not named.maps and share > 0.5:
-        sentence += ": whatever its cause, a table of one offset for each pixel corrects it"
-    return f"{sentence}."
+    if size == gap.fixed_pattern and not named.maps and share > 0.5:
+        table = ": whatever its cause, a table of one offset for each pixel corrects it"
+    return f"After recalibration {percent(share)} of the squared gap {words}{table}."
 
 
 def moving_waves(study: Study) -> str:
@@ -405,13 +407,12 @@ def _closed(gap: Gap) -> str:
 
 
 def _nothing_found(detectable: Mapping[str, float | None]) -> str:
-    sizes = {name: size for name, size in detectable.items() if size is not None}
+    sizes = sorted((size, name) for name, size in detectable.items() if size is not None)
     if not sizes:
         return "No effect was found."
-    weakest = max(sizes, key=lambda name: sizes[name])
     return (
         "No effect was found. The smallest effects that would have been detected are between "
-        f"{mm(min(sizes.values()))} and {mm(sizes[weakest])} mm ({weakest})."
+        f"{mm(sizes[0][0])} and {mm(sizes[-1][0])} mm ({sizes[-1][1]})."
     )
 
 
@@ -435,103 +436,17 @@ def axis_label(covariate: str) -> str:
     return _LABELS.get(covariate, covariate)
 
 
-def _along(covariate: str, regions: Sequence[Region], colon: str = "") -> str:
-    """Return how the bias goes along a covariate; by its trend without a bin."""
-    biases, name = biases_of(regions), axis_label(covariate).split(",")[0]
-    if not biases:
-        return f"{name}: it goes by {mm(regions[0].bias)} mm" if colon else ""
-    return f"{name}{colon} it goes from {mm(min(biases))} to {mm(max(biases))} mm"
+def along(stage: Stage) -> tuple[str, str, str, bool]:
+    """Return how the bias of a stage goes along the covariate where it is clearest.
 
-
-Finding = tuple[str, str]
-"""What a figure shows in this diagnosis: a sentence or two, and what its bars or dots are."""
-
-
-def _stages(result: "DiagnosisResult") -> Finding:
-    sizes = ", ".join(
-        f"{STAGE_WORDS[one.name]} {sized(one.gap, one.gap.interval)}"
-        for one in stages_shown(result)
-        if one.gap is not None
-    )
-    finding = f"The simulator differs from the recording by: {sizes}."
-    if result.stages[0].gap is None:
-        finding = f"No simulator was given; one was fitted. It differs by: {sizes}."
-    if result.degraded is not None:
-        degraded = sized(result.degraded.gap, result.degraded.interval)
-        finding += f" Ideal frames, degraded: {degraded}."
-    return finding, sizes
-
-
-def _attribution(result: "DiagnosisResult") -> Finding:
-    study, first = result.evidence.study, result.evidence.named.first
-    bars = [f"{cause_words(study, one)} {share_words(one.share)}" for one in result.shares]
-    causes = [one for one in result.shares if one.kind != "unexplained"]
-    finding = "No cause was found."
-    if any(one.share for one in causes):
-        largest = max(causes, key=lambda one: one.share)
-        words = cause_words(study, largest)
-        finding = f"The largest cause is {words} with {share_words(largest.share)}."
-    if any(one.share < 0 and percent(one.share) != "0 %" for one in causes):
-        finding += " A cause with a negative share cancels part of another."
-    effects = [one for one in causes if one.kind == "effect" and one.cause in first.tests]
-    if any(abs(one.share) < _SMALL for one in effects) and result.stages[0].gap is not None:
-        closed = {one.cause: closed_gap(study, first, first.tests[one.cause])[1] for one in effects}
-        each = [f"{effect_words(study, n)} {share_words(share)}" for n, share in closed.items()]
-        finding += (
-            " Effects are named for what recalibration leaves; of the square of that gap they "
-            f"close, each alone: {', '.join(each)}."
-        )
-    return finding, ", ".join(bars)
-
-
-def _where_as_given(result: "DiagnosisResult") -> Finding:
-    stage = result.stages[0]
-    finding = f"As given, the mean residual is {mm(float(stage.offsets.mean()))} mm."
-    along = _along(*most_biased(stage.by_covariate())[0])
-    return f"{finding} Along {along}." if along else finding, ""
-
-
-def _where(result: "DiagnosisResult") -> Finding:
-    strips = most_biased(result.where.by_covariate())
-    if not strips or min(region.p_value for region in strips[0][1]) > SIGNIFICANT:
-        return "After recalibration, the bias depends on no covariate at the 5 % level.", ""
-    return f"After recalibration, the bias is clearest along {_along(*strips[0], ':')}.", ""
-
-
-def _map(result: "DiagnosisResult") -> Finding:
-    found = [
-        f"{STAGE_WORDS[one.name]} {int((one.tile_p_values <= SIGNIFICANT).sum())}"
-        for one in stages_shown(result)
-    ]
-    tiles = int(np.isfinite(result.where.tiles).sum())
-    sentence = f"Tiles that differ from zero, of {tiles} with data: {', '.join(found)}."
-    return sentence, str(len(found))
-
-
-def _series(result: "DiagnosisResult") -> Finding:
-    spread = [
-        f"{STAGE_WORDS[one.name]} {mm(float(one.offsets.std()))} mm"
-        for one in stages_shown(result)
-        if one.name != "as_given"
-    ]
-    return f"Standard deviation of the poses' means: {', '.join(spread)}.", ""
-
-
-def _poses(result: "DiagnosisResult") -> Finding:
-    if not result.effects:
-        return "No effect is named, so all poses lie on the line.", ""
-    before, after = pose_errors(result)
-    better = int((after < before).sum())
-    return f"The effects bring {better} of {len(before)} held-out poses nearer.", ""
-
-
-FINDINGS: dict[str, Callable[["DiagnosisResult"], Finding]] = {
-    "stages": _stages,
-    "attribution": _attribution,
-    "where_as_given": _where_as_given,
-    "where": _where,
-    "map": _map,
-    "series": _series,
-    "poses": _poses,
-}
-"""What figures show that `diagnosis.json` does not say; the page's template words the others."""
+    Returns:
+        The covariate; from where to where its bins go, empty without a bin; by how much its trend;
+        and whether that is significant.
+    """
+    strips = most_biased(stage.by_covariate())
+    if not strips:
+        return "", "", "", False
+    covariate, regions = strips[0]
+    biases, significant = biases_of(regions), min(one.p_value for one in regions) <= SIGNIFICANT
+    bins = f"from {mm(min(biases))} to {mm(max(biases))} mm" if biases else ""
+    return axis_label(covariate).split(",")[0], bins, f"by {mm(regions[0].bias)} mm", significant

@@ -14,7 +14,7 @@ from torch import Tensor
 from tofcorr.data.recording import Recording, RigidTransform
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE
-from tofcorr.diagnosis.findings.where import Interval, interval_of
+from tofcorr.diagnosis.findings.where import Estimated, Interval, interval_of
 from tofcorr.diagnosis.rerun.checks import excess_gaps, fitted_to
 from tofcorr.diagnosis.rerun.simulator import (
     NO_PATTERNS,
@@ -196,14 +196,13 @@ class DegradedStage:
     """Ideal frames through the sensor that was found, against real frames of other poses.
 
     Attributes:
-        gap: Root mean square in excess of the noise, metres.
-        interval: Its 95 % interval, with poses as the unit; the fit is not repeated.
+        gap: Root mean square in excess of the noise, metres; its interval has poses as the unit,
+            and the fit is not repeated.
         poses: How many poses were compared.
         left_out: Effects of the sensor that no depth image can show, and why, a sentence each.
     """
 
-    gap: float
-    interval: Interval
+    gap: Estimated
     poses: int
     left_out: tuple[str, ...]
 
@@ -258,9 +257,7 @@ def degraded_stage(
         expected[pixels] = images[place, observations.pixel[pixels]]
     left = observations.measured - expected
     gap, *draws = excess_gaps(observations, left, study.fit.share, floor, resamples).tolist()
-    return DegradedStage(
-        gap=gap, interval=interval_of(draws, gap), poses=len(chosen), left_out=left_out
-    )
+    return DegradedStage(gap=Estimated(gap, draws), poses=len(chosen), left_out=left_out)
 
 
 @dataclass(frozen=True)
