@@ -86,11 +86,15 @@ def coherence_inside(study: Study, inside: Tensor, between: float) -> Coherence:
             error = float(np.hypot(error, known.error[form] * noise))
         found.append((mean, error, form))
     within, error, form = max(found)
+    # What is the same in every image, from products between poses.
+    pixel, share = study.observations.pixel.unique(return_inverse=True)[1], study.fit.share
+    sums = _per_cell(study.unit_of_pixel, pixel, share * inside, share)
+    products, pairs = ((own.sum(0) ** 2 - (own**2).sum(0)).sum() for own in sums)
     return Coherence(
         within=within,
         within_error=error,
         between=between,
-        fixed=_fixed_square(study, inside),
+        fixed=float(products / pairs.clamp(min=TINY)),
         form=form,
         noise_share=known.share[form],
     )
@@ -126,22 +130,12 @@ def without_pose(study: Study, residual: Tensor, *, ridge: float = 1e-3) -> tupl
     """
     inner, score = study.pose_equations(residual)
     inner = inner + ridge * torch.eye(3, dtype=torch.float64)
-    own = torch.linalg.solve(inner, score)
-    covariance = torch.linalg.inv(inner)
-    surface = study.pose_surface(own)
-    pose = study.system.pose
-    noise = ((pose[:, None, :] @ covariance[study.unit_of_pixel])[:, 0] * pose).sum(1)
-    share = study.fit.share
+    surface = study.pose_surface(torch.linalg.solve(inner, score))
+    covariance = torch.linalg.inv(inner)[study.unit_of_pixel]
+    pose, share = study.system.pose, study.fit.share
+    noise = ((pose[:, None, :] @ covariance)[:, 0] * pose).sum(1)
     between = float((share * (surface**2 - noise)).sum() / share.sum())
     return residual - surface, between
-
-
-def _fixed_square(study: Study, residual: Tensor) -> float:
-    """Return the mean square of what is the same in every image, from products between poses."""
-    pixel, share = study.observations.pixel.unique(return_inverse=True)[1], study.fit.share
-    sums = _per_cell(study.unit_of_pixel, pixel, share * residual, share)
-    products, pairs = ((own.sum(0) ** 2 - (own**2).sum(0)).sum() for own in sums)
-    return float(products / pairs.clamp(min=TINY))
 
 
 class Structure(NamedTuple):
@@ -318,47 +312,41 @@ class NoiseFloor(NamedTuple):
 def noise_floor(named: NamedEffects, *, sure: float = 0.01) -> NoiseFloor:
     """Return what the final model leaves and no pixels share, near the known floor.
 
+    Without repeats a filter is looked for once more in what the final model leaves: the structure
+    that it explains looked like a filter, or hid one.
+
     Args:
         named: The final model.
         sure: Waves with at most this p-value are no noise. The usual convention.
     """
-    left = named.study.system.residual_of(named.columns)
-    study, (least, most) = _known_noise(named, left)
-    own_of_images, between = without_pose(study, left)
-    share, structure = study.fit.share, coherence_inside(study, own_of_images, between)
-    alike, inside = structure.noise_share, float((share * left**2).sum() / share.sum())
-    inside -= max(between, 0.0)
-    # Of the noise s^2, pixels share alike s^2; `within` lacks the same share of the known noise.
-    shared = structure.within + alike * study.fit.floor**2
-    square = (inside - shared) / (1 - alike)
-    square = inside - max(shared - alike * max(square, 0.0), structure.fixed, 0.0)
-    by_poses = shared_by_poses(study, own_of_images)
-    most_noise = inside - by_poses.square
-    own = float(np.clip(np.sqrt(max(min(square, most_noise), 0.0)), least, most))
-    # That of the known floor (two standard errors to either limit), though `own` scatters less:
-    # structure that only single pixels show counts as noise.
-    error, hidden = float(np.hypot((most**2 - least**2) / 4, by_poses.error)), 0.0
-    waves = unlike_waves(named.study, named.columns)
-    if waves.p_value <= sure:
-        # What poses share may be these waves: the larger of both is structure, not their sum. What
-        # made the waves may have made others, which count as noise.
-        most_noise, hidden = min(most_noise, inside - waves.square), waves.square
-    return NoiseFloor(min(own, max(most_noise, 0.0) ** 0.5), error, hidden)
-
-
-def _known_noise(named: NamedEffects, left: Tensor) -> tuple[Study, tuple[float, float]]:
-    """Return the study, and the least and largest noise of a pixel, metres.
-
-    Without repeats a filter is looked for once more in what the final model leaves: the structure
-    that it explains looked like a filter, or hid one.
-    """
     study, fit = named.study, named.study.fit
-    least, most = fit.noise.least, fit.noise.most
+    left, limits = study.system.residual_of(named.columns), (fit.noise.least, fit.noise.most)
     if named.columns and not fit.shared.from_repeats:
         found = shared_noise(study.observations, left, fit.sigma, fit.trust)
         if study.observations.is_sample:  # Whole images said more of it.
             found = replace(found, level=fit.shared.level)
         study = replace(study, fit=replace(fit, shared=found))
         _, assumed, _ = fit.noise.limits(fit.shared.level)
-        least, _, most = (limit / assumed for limit in fit.noise.limits(found.level))
-    return study, ((1 - FLOOR_ERROR) * least * fit.floor, (1 + FLOOR_ERROR) * most * fit.floor)
+        least, _, most = fit.noise.limits(found.level)
+        limits = least / assumed, most / assumed
+    least = (1 - FLOOR_ERROR) * limits[0] * fit.floor
+    most = (1 + FLOOR_ERROR) * limits[1] * fit.floor
+    own_of_images, between = without_pose(study, left)
+    structure = coherence_inside(study, own_of_images, between)
+    by_poses, alike = shared_by_poses(study, own_of_images), structure.noise_share
+    inside = float((fit.share * left**2).sum() / fit.share.sum()) - max(between, 0.0)
+    # Of the noise s^2, pixels share alike s^2; `within` lacks the same share of the known noise.
+    shared = structure.within + alike * fit.floor**2
+    square = (inside - shared) / (1 - alike)
+    square = inside - max(shared - alike * max(square, 0.0), structure.fixed, 0.0)
+    most_noise, hidden = inside - by_poses.square, 0.0
+    own = float(np.clip(np.sqrt(max(min(square, most_noise), 0.0)), least, most))
+    waves = unlike_waves(named.study, named.columns)
+    if waves.p_value <= sure:
+        # What poses share may be these waves: the larger of both is structure, not their sum. What
+        # made the waves may have made others, which count as noise.
+        most_noise, hidden = min(most_noise, inside - waves.square), waves.square
+    # That of the known floor (two standard errors to either limit), though `own` scatters less:
+    # structure that only single pixels show counts as noise.
+    error = float(np.hypot((most**2 - least**2) / 4, by_poses.error))
+    return NoiseFloor(min(own, max(most_noise, 0.0) ** 0.5), error, hidden)

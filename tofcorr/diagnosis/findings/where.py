@@ -7,10 +7,10 @@ along each covariate. This is done for the gap in three stages: the simulator as
 recalibrated, and with the effects named.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -177,8 +177,14 @@ def _edges(values: np.ndarray, *, bins: int = 8, few: int = 1000) -> np.ndarray:
     return np.concatenate([levels[:1], (levels[:-1] + levels[1:]) / 2, levels[-1:]])
 
 
-class Flips:
-    """Sums of residuals, observed and when whole poses flip their sign.
+def flipped(
+    study: Study,
+    residual: Tensor,
+    chosen: Sequence[str] | None = None,
+    *,
+    most_pixels: int = 20_000,
+) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """Return what gives sums of residuals, observed and when whole poses flip their sign.
 
     Flipped residuals of a fit are no residuals: a fit would take part of them away, as it did of
     the observed ones. Compared with them as they are, biases that the model absorbs hide those that
@@ -188,44 +194,32 @@ class Flips:
         study: The recording.
         residual: Shape (M,), metres.
         chosen: Effects of the model that was fitted; None: the residual is of no fit.
-
-    Class attributes:
         most_pixels: Pixels that tell how much of a sum a fit takes, at most, evenly spread. Chosen:
             a sum over a tenth of them is known to 2 %.
+
+    Returns:
+        Takes weighted residuals of every bin and pose, shape (bins, U), the bin of each pixel,
+        (M,), and what each residual was multiplied by, (M,). Returns sums over the bins, observed
+        and of every flip, shape (bins, 1 + B).
     """
+    # The first column is the observed residual.
+    signs = torch.cat([torch.ones_like(study.signs[:1]), study.signs]).T
+    if chosen is None:
+        return lambda sums, place, along: sums @ signs
+    columns, ols = study.system.of(chosen), study.sums.ols
+    weighted = (ols.scale * study.fit.share * residual)[:, None]
+    scores = [study.observations.products(own, weighted)[..., 0] for own in columns]
+    theta = torch.linalg.solve(ols.normal(chosen), torch.cat(scores, dim=1).T @ signs)
+    step = max(1, len(residual) // most_pixels)
+    some = slice(None, None, step)
+    taken = step * study.weight[some, None] * torch.cat([own[some] for own in columns], dim=1)
 
-    most_pixels: ClassVar[int] = 20_000
+    def sums_of(sums: Tensor, place: Tensor, along: Tensor) -> Tensor:
+        across = torch.zeros(len(sums), taken.shape[1], dtype=torch.float64)
+        across.index_add_(0, place[some], taken * along[some, None])
+        return sums @ signs - across @ theta
 
-    def __init__(self, study: Study, residual: Tensor, chosen: Sequence[str] | None = None) -> None:
-        # The first column is the observed residual.
-        self._signs = torch.cat([torch.ones_like(study.signs[:1]), study.signs]).T
-        self._step = max(1, len(residual) // self.most_pixels)
-        self._theta = None
-        if chosen is None:
-            return
-        columns, ols = study.system.of(chosen), study.sums.ols
-        weighted = (ols.scale * study.fit.share * residual)[:, None]
-        scores = [study.observations.products(own, weighted)[..., 0] for own in columns]
-        right = torch.cat(scores, dim=1).T @ self._signs
-        self._theta = torch.linalg.solve(ols.normal(chosen), right)
-        weight = self._step * study.weight[:: self._step, None]
-        self._weighted = weight * torch.cat([own[:: self._step] for own in columns], dim=1)
-
-    def of(self, sums: Tensor, place: Tensor, along: Tensor) -> Tensor:
-        """Return sums over bins, observed and of every flip, shape (bins, 1 + B).
-
-        Args:
-            sums: Weighted residuals of every bin and pose, shape (bins, U).
-            place: Bin of each pixel, shape (M,), int64.
-            along: What the residual of each pixel was multiplied by, shape (M,).
-        """
-        total = sums @ self._signs
-        if self._theta is None:
-            return total
-        some = slice(None, None, self._step)
-        across = torch.zeros(len(sums), self._weighted.shape[1], dtype=torch.float64)
-        across.index_add_(0, place[some], self._weighted * along[some, None])
-        return total - across @ self._theta
+    return sums_of
 
 
 def find_where(
@@ -248,7 +242,7 @@ def find_where(
     fitted = None if residual is not None else chosen
     if residual is None:
         residual = left_out_residual(study, chosen, study.sums.ols)
-    flips = Flips(study, residual, fitted)
+    flips = flipped(study, residual, fitted)
     weight, unit, units = study.weight, study.unit_of_pixel, study.sums.num_units
     places, regions = list[tuple[Tensor, int, Tensor]](), list[tuple[str, float, float, bool]]()
     one_bin, ones = torch.zeros_like(unit), torch.ones_like(weight)
@@ -271,7 +265,7 @@ def find_where(
     for place, bins, along in places:
         own = per_pose(weight * residual * along, place, bins)
         counts = per_pose(weight * along**2, place, bins)
-        parts.append((own, flips.of(own, place, along), counts))
+        parts.append((own, flips(own, place, along), counts))
     sums, total, counts = (torch.cat(own) for own in zip(*parts, strict=True))
     offsets = sums[-1] / counts[-1].clamp(min=TINY)
     return _assembled(name, sums[:-1], total[:-1], counts[:-1], regions, offsets)

@@ -79,24 +79,20 @@ def _other_conditions(study: Study, known: dict[str, Tensor]) -> list[Change]:
     if is_clock(facts.timestamp):
         seconds = torch.arange(len(known["timestamp"])).double()
         later = 1.02 * float(facts.timestamp.max()) + 60.0
-        changes += [
-            ("in the first minute after power-on", "timestamp", 1.0 + seconds),
-            ("after all others", "timestamp", later + seconds),
-        ]
-    strong = 0.0
-    if facts.ambient is not None:
-        strong = 2.0 * float(facts.ambient.nan_to_num(0.0).max()) + 100.0
-    for words, name, factor, more in (
+        changes.append(("in the first minute after power-on", "timestamp", 1.0 + seconds))
+        changes.append(("after all others", "timestamp", later + seconds))
+    ambient = torch.zeros(1) if facts.ambient is None else facts.ambient.nan_to_num(0.0)
+    strong = 2.0 * float(ambient.max()) + 100.0
+    rows = (
         ("with half the integration time", "integration_time", 0.5, 0.0),
         ("with twice the integration time", "integration_time", 2.0, 0.0),
         ("with the room 4 degrees warmer", "room_temperature", 1.0, 4.0),
         ("with the room 4 degrees colder", "room_temperature", 1.0, -4.0),
         ("with a lamp on", "ambient", 1.0, strong),
         ("in the dark", "ambient", 0.0, 0.0),
-    ):
-        if name in known:
-            changes.append((words, name, factor * known[name] + more))
-    return changes
+    )
+    known_rows = (row for row in rows if row[1] in known)
+    return changes + [(words, name, a * known[name] + b) for words, name, a, b in known_rows]
 
 
 def _other_poses(study: Study, sources: Tensor, *, tilt: float = 0.35) -> list[Change]:

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from tofcorr.diagnosis.findings.absorption import absorption_table
-from tofcorr.diagnosis.findings.where import Estimated, Interval, Region, Stage
+from tofcorr.diagnosis.findings.where import Estimated, Interval, Stage
 from tofcorr.diagnosis.report.words import (
     SHARE_ENDS,
     SIGNIFICANT,
@@ -59,32 +59,25 @@ def svg_of(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-Bar = tuple[str, float, Interval, str, str]
-"""Name, length, interval, colour, and the text at the right."""
+Bar = tuple[str, Estimated, str]
+"""Name, length with its interval, and colour."""
 
 
 def stage_bars(result: "DiagnosisResult") -> Figure:
     """Draw the gap at each stage and after each named effect in turn, and the noise of a pixel."""
-
-    def bar(name: str, size: Estimated, colour: str) -> Bar:
-        ends = 1e3 * size.interval[0], 1e3 * size.interval[1]
-        return name, 1e3 * size, ends, colour, f"{1e3 * size:.1f} mm"
-
-    bars = [
-        bar(STAGE_WORDS[one.name], one.gap, STAGE_COLOURS[one.name])
+    bars: list[Bar] = [
+        (STAGE_WORDS[one.name], one.gap, STAGE_COLOURS[one.name])
         for one in stages_shown(result)
         if one.gap is not None
     ]
-    steps = [
-        bar(f"+ {effect_words(result.evidence.study, name)}", size, BLUE)
-        for name, size in result.gap_steps
-    ]
+    study = result.evidence.study
+    steps = [(f"+ {effect_words(study, name)}", size, BLUE) for name, size in result.gap_steps]
     bars[-1:-1] = steps[:-1]
     if steps:  # Its bar is that of the stage. Three lines would touch the next bar's.
         bars[-1] = (f"{steps[-1][0].split(' (')[0]}:\n{bars[-1][0]}", *bars[-1][1:])
     if result.degraded is not None:
-        bars.append(bar("degraded frames", result.degraded.gap, _LIGHT_BLUE))
-    figure, axes = _bars(bars, "gap, mm (root mean square, noise taken off)")
+        bars.append(("degraded frames", result.degraded.gap, _LIGHT_BLUE))
+    figure, axes = _bars(bars, 1e3, "gap, mm (root mean square, noise taken off)", _in_mm)
     floor, end = 1e3 * result.gap.floor, axes.get_xlim()[1]
     if floor < end:  # Beyond, its label would be cut; a card tells it.
         axes.axvline(floor, color="black", linestyle=":", linewidth=1, zorder=0)
@@ -103,32 +96,42 @@ def stage_bars(result: "DiagnosisResult") -> Figure:
 def attribution_bars(result: "DiagnosisResult") -> Figure:
     """Draw the share of each cause in the squared gap, the largest first, the unexplained last."""
     shares = sorted(result.shares, key=lambda one: (one.kind == "unexplained", -one.share))
-    bars = [
-        (
-            cause_words(result.evidence.study, one),
-            100 * one.share,
-            tuple(100 * np.clip(one.share.interval, *SHARE_ENDS)),
-            _KIND_COLOURS[one.kind],
-            share_words(one.share),
-        )
-        for one in shares
-    ]
-    figure, axes = _bars(bars, "share of the squared gap, %")
+    study = result.evidence.study
+    bars = [(cause_words(study, one), one.share, _KIND_COLOURS[one.kind]) for one in shares]
+    figure, axes = _bars(bars, 100, "share of the squared gap, %", share_words, SHARE_ENDS)
     line_across(axes, vertical=True)
     return figure
 
 
-def _bars(bars: Sequence[Bar], label: str) -> tuple[Figure, Axes]:
-    """Draw bars from top to bottom, their texts in a column at the right."""
+def _in_mm(size: float) -> str:
+    return f"{1e3 * size:.1f} mm"
+
+
+def _bars(
+    bars: Sequence[Bar],
+    scale: float,
+    label: str,
+    words: Callable[[float], str],
+    limits: Interval = (-math.inf, math.inf),
+) -> tuple[Figure, Axes]:
+    """Draw bars from top to bottom, their lengths in words in a column at the right.
+
+    Args:
+        bars: What is drawn.
+        scale: What lengths are multiplied by.
+        label: Of the axis.
+        words: Says a length.
+        limits: Where intervals are cut off.
+    """
     figure, (axes,) = panels(1 + len(bars) / 3)
-    places = np.arange(len(bars))[::-1]
-    axes.barh(places, [bar[1] for bar in bars], color=[bar[3] for bar in bars])
-    ends = [0.0]
-    for place, (_, value, interval, _, text) in zip(places, bars, strict=True):
-        ends += [value, *interval]
+    places, ends = np.arange(len(bars))[::-1], [0.0]
+    for place, (_, size, colour) in zip(places, bars, strict=True):
+        interval = scale * np.clip(size.interval, *limits)
+        ends += [scale * size, *interval]
+        axes.barh(place, scale * size, color=colour)
         axes.plot(interval, [place, place], color="black", marker="|")
         where = ("axes fraction", "data")
-        axes.annotate(f"  {text}", (1, place), xycoords=where, va="center", fontsize=9)
+        axes.annotate(f"  {words(size)}", (1, place), xycoords=where, va="center", fontsize=9)
     margin = (max(ends) - min(ends)) / 30
     axes.set_xlim(min(ends) - margin if min(ends) < 0 else 0.0, max(ends) + (margin or 1.0))
     # A long label is broken before what stands in brackets.
@@ -155,7 +158,12 @@ def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figu
     for axes, (name, regions) in zip(found, groups, strict=False):
         for stage, of_stage in zip(stages, by_stage, strict=True):
             bins = [region for region in of_stage.get(name, []) if not region.trend]
-            _strip(axes, bins, STAGE_COLOURS[stage.name], band=stage is stages[0])
+            middle = [(region.low + region.high) / 2 for region in bins]
+            colour = STAGE_COLOURS[stage.name]
+            axes.plot(middle, [1e3 * one.bias for one in bins], "o-", color=colour, markersize=3)
+            if stage is stages[0]:
+                low, high = ([1e3 * one.bias.interval[side] for one in bins] for side in (0, 1))
+                axes.fill_between(middle, low, high, color=colour, alpha=FAINT, linewidth=0)
         line_across(axes)
         axes.set_xlabel(axis_label(name))
         best = min(region.p_value for region in regions)
@@ -164,14 +172,6 @@ def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figu
         axes.locator_params(nbins=5)
     figure.supylabel("bias, mm", fontsize=9)
     return figure
-
-
-def _strip(axes: Axes, regions: Sequence[Region], colour: str, *, band: bool) -> None:
-    middle = [(region.low + region.high) / 2 for region in regions]
-    axes.plot(middle, [1e3 * r.bias for r in regions], "o-", color=colour, markersize=3)
-    if band:
-        low, high = ([1e3 * one.bias.interval[side] for one in regions] for side in (0, 1))
-        axes.fill_between(middle, low, high, color=colour, alpha=FAINT, linewidth=0)
 
 
 def image_maps(result: "DiagnosisResult") -> Figure:
