@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from diagnosis.comparisons import effect_test
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
@@ -12,14 +13,13 @@ DRAWS = 999
 def _test(name: str, gain: float, closed: float, null_closed: Tensor) -> EffectTest:
     generator = torch.Generator().manual_seed(sum(map(ord, name)))
     null = torch.randn(DRAWS, generator=generator, dtype=torch.float64)
-    return EffectTest(
-        name=name,
-        closed=torch.tensor([closed], dtype=torch.float64),
-        gain=gain,
-        null=null,
-        size=1,
-        null_closed=null_closed,
-    )
+    total = torch.tensor([closed], dtype=torch.float64)
+    return effect_test(name, total, gain=gain, null=null, null_closed=null_closed)
+
+
+def _beside(tests: dict[str, EffectTest], least: float = 0.5) -> EffectComparison:
+    one = torch.ones(1).double()
+    return EffectComparison(chosen=(), squares=one, tests=tests, probes={}, least=least)
 
 
 def _comparison(closed: float, share: float) -> EffectComparison:
@@ -29,9 +29,7 @@ def _comparison(closed: float, share: float) -> EffectComparison:
     for number in range(10):
         enough = torch.rand(DRAWS, generator=generator, dtype=torch.float64) < share
         tests[f"effect {number}"] = _test(f"effect {number}", 2.0, closed, enough.double())
-    return EffectComparison(
-        chosen=(), squares=torch.ones(1).double(), tests=tests, probes={}, least=0.5
-    )
+    return _beside(tests)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.2])
@@ -67,9 +65,7 @@ def test_an_effect_that_gains_nothing_is_significant_by_what_it_closes() -> None
         f"effect {i}": _test(f"effect {i}", 0.0, 9.0 if i == 0 else 0.6, drawn[i])
         for i in range(10)
     }
-    compared = EffectComparison(
-        chosen=(), squares=torch.ones(1).double(), tests=tests, probes={}, least=0.5
-    )
+    compared = _beside(tests)
     fifth = 1 / (DRAWS + 1) / 0.2  # No draw reaches it, and a fifth of the level is its share.
     assert compared.tests["effect 0"].p_value == pytest.approx(fifth)
     assert compared.naming_p_value("effect 0") == pytest.approx(fifth)
@@ -85,19 +81,16 @@ def test_chance_names_an_effect_as_often_as_the_level_says() -> None:
         other = torch.randn(effects, DRAWS + 1, generator=generator, dtype=torch.float64)
         closed = gains + trial % 3 * other
         tests = {
-            f"effect {i}": EffectTest(
-                name=f"effect {i}",
-                closed=closed[i, :1],
+            f"effect {i}": effect_test(
+                f"effect {i}",
+                closed[i, :1],
                 gain=float(gains[i, 0]),
                 null=gains[i, 1:],
-                size=1,
                 null_closed=closed[i, 1:],
             )
             for i in range(effects)
         }
-        compared = EffectComparison(
-            chosen=(), squares=torch.ones(1).double(), tests=tests, probes={}, least=0.0
-        )
+        compared = _beside(tests, 0.0)
         named += min(compared.naming_p_value(name) for name in tests) <= 0.05
     # Three standard errors of that many trials above the level.
     assert named / trials <= 0.05 + 3 * (0.05 * 0.95 / trials) ** 0.5

@@ -1,8 +1,8 @@
 """What a diagnosis writes."""
 
 import json
+import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import diagnosed_recordings
@@ -59,27 +59,10 @@ def test_the_findings_have_the_keys_agreed_and_name_the_cause(report: Path) -> N
     assert names == set(found["minimum_detectable_mm"]) | {"motion", "timestamp_offset"}
 
 
-class _Outside(HTMLParser):
-    """Collects whatever a page would fetch."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fetched: list[str] = []
-        self.open: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for key, value in attrs:
-            inside = (value or "").startswith(("#", "data:"))
-            outside = key in ("src", "href", "xlink:href") and not inside
-            if outside or tag in ("script", "link", "iframe"):
-                self.fetched.append(f"{tag} {key}={value}")
-
-
 def test_the_page_needs_nothing_else(report: Path) -> None:
     page = (report / "report.html").read_text()
-    outside = _Outside()
-    outside.feed(page)
-    assert outside.fetched == []
+    assert not re.findall(r"<(?:script|link|iframe)\b", page)
+    assert not re.findall(r'\b(?:src|href)="(?!#|data:)[^"]*', page)
     assert "integration_time" in page
     assert page.count("<svg") >= 7
 

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -67,18 +68,19 @@ def test_parts_that_cancel_share_what_is_explained_held_out() -> None:
     assert 0 < float(shares[1]) < 0.2
 
 
-def _of_one_pose(
+def _of_poses(
     causes: list[Share], columns: Tensor, residual: Tensor, prior: Tensor, *maps: Tensor
 ) -> Parts:
-    """Return parts of columns (size, columns) and maps (size,), and their fit to a residual."""
-    ones = torch.ones_like(residual)
-    everything = torch.stack([*columns.T, *maps, residual, ones], 1)
+    """Return parts of columns (U, M, columns) and maps (U, M), and their fit to a residual."""
+    beside = torch.stack([*maps, residual, torch.ones_like(residual)], 2)
+    everything = torch.cat([columns, beside], 2)
+    fitted = columns.mT @ columns, (columns.mT @ residual[:, :, None])[..., 0], prior
     return Parts(
         causes=tuple(causes),
-        products=(everything.T @ everything)[None],
-        noise=torch.zeros(1).double(),
-        start=torch.zeros(columns.shape[1]).double(),
-        fitted=((columns.T @ columns)[None], (columns.T @ residual)[None], prior),
+        products=everything.mT @ everything,
+        noise=torch.zeros(len(columns)).double(),
+        start=torch.zeros(columns.shape[2]).double(),
+        fitted=fitted,
         prior=prior,
         constant=0,
         least={},
@@ -99,7 +101,8 @@ def _beside_base(
     fixed = range(ends[-1], ends[-1] + len(maps))
     causes += [Share(cause="fixed_pattern", kind="effect", fixed=place) for place in fixed]
     none = torch.zeros(columns.shape[1], columns.shape[1], dtype=torch.float64)
-    return _of_one_pose(causes, columns, residual, none, *maps), residual
+    one = [part[None] for part in (columns, residual, *maps)]
+    return _of_poses(causes, *one[:2], none, *one[2:]), residual
 
 
 def _random(generator: torch.Generator, *shape: int) -> Tensor:
@@ -165,7 +168,7 @@ def _of_simulator(effects: list[Tensor], prior: float, residual: Tensor) -> Part
     names = [f"effect {k}" for k in range(1, columns.shape[1])]
     causes = [Share(cause=n, kind="effect", members=(k,)) for k, n in enumerate(names, start=1)]
     own = Share(cause="distance", kind="parameter", members=(0,))
-    return _of_one_pose([own, *causes], columns, residual, precision)
+    return _of_poses([own, *causes], columns[None], residual[None], precision)
 
 
 def test_effects_that_are_one_share_as_their_prior_has_it_and_the_interval_says_so() -> None:
@@ -236,20 +239,10 @@ def _columns(seed: int) -> tuple[Tensor, Tensor]:
 
 def _parts(columns: Tensor, residual: Tensor, least: float) -> Parts:
     """Return the parts of a residual (U, M); `least`, m^2, is what a change must close."""
-    beside = torch.stack([residual, torch.ones_like(residual)], dim=2)
-    everything = torch.cat([columns, beside], dim=2)
-    products = everything.transpose(1, 2) @ everything
-    counts = products[:, -1, -1]
-    return Parts(
-        causes=_CAUSES,
-        products=products,
-        noise=torch.zeros_like(counts),
-        start=torch.zeros(columns.shape[2], dtype=torch.float64),
-        fitted=(products[:, :-2, :-2], products[:, :-2, -2], 1e-9 * torch.eye(4).double()),
-        prior=1e-9 * torch.eye(4).double(),
-        constant=0,
-        least=dict.fromkeys(("hand_eye", "distance"), least * counts),
-    )
+    precision = 1e-9 * torch.eye(4).double()
+    parts = _of_poses(list(_CAUSES), columns, residual, precision)
+    counts = parts.products[:, -1, -1]
+    return replace(parts, least=dict.fromkeys(("hand_eye", "distance"), least * counts))
 
 
 def _shares(parts: Parts, *, sparse: bool = True) -> dict[str, float]:
