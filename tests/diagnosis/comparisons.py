@@ -5,6 +5,7 @@ from typing import Any
 import torch
 
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
+from tofcorr.diagnosis.findings.gap import resampled
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.study import Study
 
@@ -21,6 +22,12 @@ def effect_test(name: str, closed: torch.Tensor, **changes: Any) -> EffectTest:
     null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
     known = {"gain": float(closed.sum()), "null": null, "size": 5} | changes
     return EffectTest(name=name, closed=closed, **known)
+
+
+def resamples_of(study: Study, seed: int = 1) -> torch.Tensor:
+    """Draw how often each resample of a study holds each pose."""
+    generator = torch.Generator().manual_seed(seed)
+    return resampled(study.sums.num_units, study.options.bootstraps, generator)
 
 
 def model_of(study: Study, last: EffectComparison | None = None, **changes: Any) -> NamedEffects:

@@ -7,6 +7,7 @@ import pytest
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.report.result import DiagnosisResult
@@ -38,6 +39,11 @@ def nothing_study(nothing_missing: Recording) -> Study:
 @pytest.fixture(scope="session")
 def time_study(time_missing: Recording) -> Study:
     return prepare(time_missing, OPTIONS, None).study
+
+
+@pytest.fixture(scope="session")
+def nothing_named(nothing_study: Study) -> NamedEffects:
+    return name_effects(nothing_study)
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosis.comparisons import resamples_of
 
 from tofcorr.diagnosis.findings.gap import (
     Gap,
@@ -15,17 +16,9 @@ from tofcorr.diagnosis.findings.gap import (
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.structure import noise_floor
 from tofcorr.diagnosis.findings.where import interval_of
+from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.study import Study
-
-
-def _resamples(study: Study) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(1)
-    return resampled(study.sums.num_units, study.options.bootstraps, generator)
-
-
-def _measured(study: Study) -> Gap:
-    return measure_gap(study, name_effects(study), _resamples(study))
 
 
 @pytest.fixture(scope="module")
@@ -59,20 +52,20 @@ def test_a_noise_known_to_a_per_cent_or_two_does_not_change_the_gap(
         for factor in (1.0, 0.98, 1.01):
             known = factor * noise
             monkeypatch.setattr(BaseFit, "floor", property(lambda _, known=known: known))
-            gaps.append(_measured(study))
+            gaps.append(measure_gap(study, name_effects(study), resamples_of(study)))
         for gap in gaps[1:]:
             assert gap.before == pytest.approx(gaps[0].before, rel=1e-6)
             assert gap.after == pytest.approx(gaps[0].after, rel=1e-6)
 
 
 @pytest.fixture(scope="module")
-def time_named(time_study: Study) -> NamedEffects:
-    return name_effects(time_study)
+def time_named(time_diagnosis: DiagnosisResult) -> NamedEffects:
+    return time_diagnosis.evidence.named
 
 
 @pytest.fixture(scope="module")
-def time_gap(time_study: Study, time_named: NamedEffects) -> Gap:
-    return measure_gap(time_study, time_named, _resamples(time_study))
+def time_gap(time_diagnosis: DiagnosisResult) -> Gap:
+    return time_diagnosis.gap
 
 
 def test_a_floor_is_no_larger_than_what_is_left_inside_images(
@@ -102,7 +95,7 @@ def test_no_gap_is_larger_than_what_is_left_with_the_noise(
     """However little is known of the floor: it is not below zero."""
     known = noise_floor(time_named)
     sure, unsure = (
-        squared_gaps(time_study, time_named, floor, _resamples(time_study))
+        squared_gaps(time_study, time_named, floor, resamples_of(time_study))
         for floor in (
             known._replace(error=0.0, structure=0.0),
             known._replace(error=9 * known.size**2, structure=9 * known.size**2),

@@ -9,7 +9,7 @@ import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
-from diagnosis.comparisons import effect_test, model_of
+from diagnosis.comparisons import effect_test, model_of, resamples_of
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.effect_comparison import (
@@ -22,7 +22,6 @@ from tofcorr.diagnosis.findings.gap import (
     judge_remainder,
     measure_gap,
     name_in_two,
-    resampled,
 )
 from tofcorr.diagnosis.findings.naming import (
     NamedEffects,
@@ -74,9 +73,7 @@ def test_an_error_carried_from_other_poses_hides_what_a_form_error_may_be(
 
 
 def _judged(study: Study, named: NamedEffects) -> OpenSet:
-    generator = torch.Generator().manual_seed(1)
-    resamples = resampled(study.sums.num_units, study.options.bootstraps, generator)
-    return judge_remainder(study, named, measure_gap(study, named, resamples))
+    return judge_remainder(study, named, measure_gap(study, named, resamples_of(study)))
 
 
 @pytest.mark.parametrize(
@@ -104,10 +101,11 @@ def test_two_effects_are_both_named(tmp_path: Path) -> None:
     assert len(named.names) == 2
 
 
-def test_nothing_is_named_where_nothing_is_missing(nothing_study: Study) -> None:
-    named = name_effects(nothing_study)
-    assert named.names == named.with_probes == ()
-    assert not _judged(nothing_study, named).unknown
+def test_nothing_is_named_where_nothing_is_missing(
+    nothing_study: Study, nothing_named: NamedEffects
+) -> None:
+    assert nothing_named.names == nothing_named.with_probes == ()
+    assert not _judged(nothing_study, nothing_named).unknown
 
 
 def test_of_causes_that_close_the_same_the_simplest_significant_one_is_named() -> None:

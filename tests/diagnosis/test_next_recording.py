@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.next.advice import make_candidates, next_recording
 from tofcorr.diagnosis.sums.study import Study
 
@@ -25,7 +25,7 @@ def test_time_is_varied_only_where_the_stamps_are_of_a_clock(nothing_study: Stud
 
 
 def test_without_anything_to_vary_the_advice_is_how_to_observe_the_effect(
-    nothing_study: Study,
+    nothing_study: Study, nothing_named: NamedEffects
 ) -> None:
     number = torch.arange(nothing_study.observations.num_frames).double()
     study = without_conditions(nothing_study, number)
@@ -34,6 +34,6 @@ def test_without_anything_to_vary_the_advice_is_how_to_observe_the_effect(
     still = replace(recording, frames=replace(recording.frames, world_from_tool=poses))
     study = replace(study, observations=replace(study.observations, recording=still))
     assert make_candidates(study, ["distance"]) is None
-    advice = next_recording(study, name_effects(nothing_study))
+    advice = next_recording(study, nothing_named)
     assert any(one.startswith("To observe ") for one in advice)
     assert not any("more frames" in one for one in advice)

@@ -6,25 +6,21 @@ import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosis.comparisons import resamples_of
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.gap import resampled
-from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
 from tofcorr.diagnosis.rerun.checks import fitted_to, measure_transfer, noisy_frames, observables_of
 from tofcorr.diagnosis.sums.study import Study
 
 
 def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetre(
-    nothing_study: Study,
+    nothing_study: Study, nothing_named: NamedEffects
 ) -> None:
-    named = name_effects(nothing_study)
+    named = nothing_named
     generator = torch.Generator().manual_seed(1)
-    resamples = resampled(
-        nothing_study.sums.num_units,
-        nothing_study.options.bootstraps,
-        torch.Generator().manual_seed(2),
-    )
+    resamples = resamples_of(nothing_study, 2)
     transfer = measure_transfer(nothing_study, named, None, generator, resamples)
     assert transfer is not None
     # Without an effect both simulators are one, and so are the corrections: also their noise.
