@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import tofcorr
-from tofcorr.diagnosis.findings.impossible import LARGEST_GAP
+from tofcorr.diagnosis.findings.outliers import LARGEST_GAP
 from tofcorr.errors import TofcorrError
 from tofcorr.options import resolve_options
 from tofcorr.training.calibration import TrainingOptions

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.wrong_recordings.parts import Parts
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings import impossible
-from tofcorr.diagnosis.findings.impossible import LARGEST_GAP, refuse_impossible_gap
+from tofcorr.diagnosis.findings import outliers
+from tofcorr.diagnosis.findings.outliers import LARGEST_GAP, refuse_impossible_gap
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.errors import CalibrationDataError
@@ -57,7 +57,7 @@ def test_a_fit_that_diverged_has_no_size_and_single_wrong_frames_are_to_be_left_
     missed: float, outlying: tuple[int, ...], words: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four frames with the plane of another wall were off by 612802 mm, with no remedy."""
-    monkeypatch.setattr(impossible, "_missed", lambda _: missed)
+    monkeypatch.setattr(outliers, "missed_distance", lambda _: missed)
     odd: Any = SimpleNamespace(findings=(), outlying=outlying)
     recording = SimpleNamespace(path="wall")
     study: Any = SimpleNamespace(observations=SimpleNamespace(recording=recording))
