@@ -70,8 +70,10 @@ def stage_bars(result: "DiagnosisResult") -> Figure:
         for one in stages_shown(result)
         if one.gap is not None
     ]
-    study = result.evidence.study
-    steps = [(f"+ {effect_words(study, name)}", size, BLUE) for name, size in result.gap_steps]
+    steps = [
+        (f"+ {effect_words(result.evidence.study, name)}", size, BLUE)
+        for name, size in result.gap_steps
+    ]
     bars[-1:-1] = steps[:-1]
     if steps:  # Its bar is that of the stage. Three lines would touch the next bar's.
         bars[-1] = (f"{steps[-1][0].split(' (')[0]}:\n{bars[-1][0]}", *bars[-1][1:])
