@@ -18,7 +18,6 @@ from tofcorr.diagnosis.findings.gap import (
     resampled,
     stages_of,
 )
-from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.outliers import headline_of_given, refuse_impossible_gap
 from tofcorr.diagnosis.findings.shares import attribute, explained_squares, parts_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator
@@ -32,14 +31,12 @@ from tofcorr.diagnosis.report.words import list_causes, list_remarks, write_verd
 from tofcorr.diagnosis.rerun.checks import check_in_simulator, measure_transfer, observables_of
 from tofcorr.diagnosis.rerun.sensor import degraded_stage, fitted_values
 from tofcorr.diagnosis.rerun.simulator import simulator_of, tables_of, whole_patterns
-from tofcorr.diagnosis.sums.study import Study
 from tofcorr.estimation.linear import solvable
 from tofcorr.files import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
-from tofcorr.simulation.options import SimulatorOptions
 
 
 def diagnose(
