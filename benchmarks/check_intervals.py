@@ -10,19 +10,20 @@ are checked too. Both are checked with each kind of wall. Draws are independent;
 intervals.
 """
 
+import itertools
 import json
 import math
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks.sealed.scores import share
+from benchmarks.sealed.scores import share, table
 from benchmarks.timing import write
 from benchmarks.wrong_recordings.clean import drawn_simulator
 from tofcorr.correction.state import CalibrationState
@@ -95,52 +96,45 @@ def one_draw(number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
     result = train(folder / "train", options)
     state = calibration_state(result.data, options, result.fit)
     reference: Reference | None = run_reference(result.calibration, state)
-    known = Known(state, reference, check_options(camera, max(FRAMES), generator))
-    lines = [
-        *unchanged(known, frames, folder / "unchanged"),
-        *drifted(known, folder / "drifted"),
-    ]
+    later = check_options(camera, max(FRAMES), generator)
+    same = recorded(later, folder / "unchanged", frames, 0.0)
+    moved = recorded(later, folder / "drifted", max(FRAMES), DRIFT_MM)
+    lines = [*unchanged(state, reference, same), *drifted(state, reference, moved)]
     return [{"draw": number, "model": model, **line} for line in lines]
 
 
-class Known(NamedTuple):
-    """A calibration, and the simulator's options of the frames to check."""
-
-    state: CalibrationState
-    reference: Reference | None
-    later: dict[str, Any]
-
-    def recorded(self, folder: Path, frames: int, drift: float) -> Dataset:
-        """Simulate the frames to check."""
-        values = json.loads(json.dumps(self.later))
-        values["shots"][0]["poses"] = frames
-        values["sensor"]["delays"]["constant_mm"] += drift
-        simulate(SimulatorOptions.from_mapping(values, "drawn"), folder)
-        return Dataset((Recording.open(folder),))
+def recorded(later: dict[str, Any], folder: Path, frames: int, drift: float) -> Dataset:
+    """Simulate the frames to check."""
+    values = json.loads(json.dumps(later))
+    values["shots"][0]["poses"] = frames
+    values["sensor"]["delays"]["constant_mm"] += drift
+    simulate(SimulatorOptions.from_mapping(values, "drawn"), folder)
+    return Dataset((Recording.open(folder),))
 
 
-def unchanged(known: Known, frames: int, folder: Path) -> list[dict[str, Any]]:
+def unchanged(
+    state: CalibrationState, reference: Reference | None, dataset: Dataset
+) -> list[dict[str, Any]]:
     """Check an unchanged camera; return a line for each wall."""
-    dataset = known.recorded(folder, frames, 0.0)
     lines = []
     for wall in WALLS:
-        found = check_drift(known.state, dataset, wall, reference=known.reference)
+        found = check_drift(state, dataset, wall, reference=reference)
         low, high = (1e3 * end for end in found.interval)
         lines.append(
-            _line(wall, frames, 0.0, 1e3 * found.offset, low, high)
+            _line(wall, dataset.num_frames, 0.0, 1e3 * found.offset, low, high)
             | {"verdict": found.verdict, "headline": found.headline}
         )
     return lines
 
 
-def drifted(known: Known, folder: Path) -> list[dict[str, Any]]:
+def drifted(
+    state: CalibrationState, reference: Reference | None, dataset: Dataset
+) -> list[dict[str, Any]]:
     """Check a drifted camera with more and more frames; return a line for each wall and number."""
-    dataset = known.recorded(folder, max(FRAMES), DRIFT_MM)
-    reference = known.reference
     lines = []
     for wall in WALLS:
-        own = reference or unknown_reference(known.state, wall_is_known=False)
-        sums = OffsetSums(known.state, dataset, wall, own)
+        own = reference or unknown_reference(state, wall_is_known=False)
+        sums = OffsetSums(state, dataset, wall, own)
         for frames, _ in enumerate(sums.read(), 1):
             if frames in FRAMES:
                 found = sums.estimate()
@@ -165,35 +159,26 @@ def _line(
 
 def summary(lines: Sequence[dict[str, Any]]) -> str:
     """Return coverage and power by wall and number of frames."""
-    rows = [
-        "| wall | frames | draws, unchanged | coverage of 0 | half width, median mm | "
-        "RMS error, mm | said `drifted` | headlines | draws, drifted | "
-        f"coverage of {DRIFT_MM:g} mm | {DRIFT_MM:g} mm told from 0 |",
-        "|---|---|---:|---|---:|---:|---:|---:|---:|---|---|",
-    ]
-    for wall in WALLS:
-        for frames in (None, *FRAMES):
-            own = [one for one in lines if one["wall"] == wall and frames in (None, one["frames"])]
-            same = [one for one in own if not one["drift_mm"]]
-            moved = [one for one in own if one["drift_mm"]]
-            if not same or not moved:
-                continue
-            half = np.median([np.diff(one["interval_mm"])[0] / 2 for one in same])
-            error = math.sqrt(float(np.mean([one["offset_mm"] ** 2 for one in same])))
-            cells = [
-                wall,
-                "all" if frames is None else str(frames),
-                str(len(same)),
-                str(share(one["covered"] for one in same)),
-                f"{half:.2f}",
-                f"{error:.2f}",
-                str(sum(one["verdict"] == "drifted" for one in same)),
-                str(sum(one["headline"] is not None for one in same)),
-                # All numbers of frames together are not independent.
-                *(["", "", ""] if frames is None else _of_drifted(moved)),
-            ]
-            rows.append(f"| {' | '.join(cells)} |")
-    return "\n".join(rows)
+    head = ("wall", "frames", "draws, unchanged", "coverage of 0", "half width, median mm")
+    head += ("RMS error, mm", "said `drifted`", "headlines", "draws, drifted")
+    head += (f"coverage of {DRIFT_MM:g} mm", f"{DRIFT_MM:g} mm told from 0")
+    rows = []
+    for wall, frames in itertools.product(WALLS, (None, *FRAMES)):
+        own = [one for one in lines if one["wall"] == wall and frames in (None, one["frames"])]
+        same = [one for one in own if not one["drift_mm"]]
+        moved = [one for one in own if one["drift_mm"]]
+        if not same or not moved:
+            continue
+        half = np.median([np.diff(one["interval_mm"])[0] / 2 for one in same])
+        error = math.sqrt(float(np.mean([one["offset_mm"] ** 2 for one in same])))
+        drifts = sum(one["verdict"] == "drifted" for one in same)
+        headlines = sum(one["headline"] is not None for one in same)
+        held = share(one["covered"] for one in same)
+        cells = (len(same), held, f"{half:.2f}", f"{error:.2f}", drifts, headlines)
+        # All numbers of frames together are not independent.
+        of_drifted = ["", "", ""] if frames is None else _of_drifted(moved)
+        rows.append((wall, "all" if frames is None else frames, *cells, *of_drifted))
+    return table(head, rows)
 
 
 def _of_drifted(moved: Sequence[dict[str, Any]]) -> list[str]:
