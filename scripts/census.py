@@ -8,7 +8,7 @@ lower ones there. A count may rise only by a change of that file that says why.
 
 - statements: lines that are no docstring, comment, blank line or import;
 - numbers: what one could tune and a caller cannot reach: constants of a module that hold a number,
-  and fractions inside functions other than the plainest;
+  and fractions inside functions other than the plainest, written as 0.05 or as 1 / 20;
 - records: dataclasses and named tuples;
 - single: modules that exactly one other file imports, plug-ins aside: paragraphs of that file.
 """
@@ -87,13 +87,19 @@ def _numbers(tree: ast.Module) -> int:
     for function in ast.walk(tree):
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
             inside = [one for part in function.body for one in ast.walk(part)]
-            count += sum(
-                isinstance(one, ast.Constant)
-                and type(one.value) is float
-                and one.value not in PLAIN
-                for one in inside
-            )
+            fractions = [one.value for one in inside if isinstance(one, ast.Constant)]
+            count += sum(type(one) is float and one not in PLAIN for one in fractions)
+            count += sum(_is_quotient(one) for one in inside)
     return count
+
+
+def _is_quotient(node: ast.AST) -> bool:
+    """Whether a node is one whole number over another."""
+    return (
+        isinstance(node, ast.BinOp)
+        and isinstance(node.op, ast.Div)
+        and all(isinstance(one, ast.Constant) for one in (node.left, node.right))
+    )
 
 
 def _records(tree: ast.Module) -> int:

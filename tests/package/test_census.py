@@ -24,7 +24,7 @@ class Point:
 
 
 def circle(radius: float) -> float:
-    return 0.25 * math.pi * (2 * radius) ** 2 + 0.5
+    return 1 / 4 * math.pi * (2 * radius) ** 2 + 0.5
 '''
 
 
