@@ -10,7 +10,7 @@ from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.inputs import FREQUENCY, EffectInputs, inputs_from_state
-from tofcorr.simulation.effects.numerics import inner_range
+from tofcorr.simulation.effects.numerics import inner_range, side_by_side
 from tofcorr.simulation.hooks import FrameState
 
 # Periods of the error within the unambiguous range: multiples of the first. The harmonic of order
@@ -75,8 +75,8 @@ class WigglingEffect(SignalEffect):
 
     def shares(self, inputs: EffectInputs) -> Tensor:
         """Return sine and cosine of each number of periods: its wave, and that a quarter on."""
-        waves = torch.stack(self._waves(inputs.turn, inputs), dim=-1)
-        return torch.stack([waves, 1j * waves], dim=-1).flatten(1) / inputs.metres_per_radian
+        waves = [wave / inputs.metres_per_radian for wave in self._waves(inputs.turn, inputs)]
+        return side_by_side([share for wave in waves for share in (wave, 1j * wave)])
 
     def on_signal(self, state: FrameState) -> None:
         """Add the harmonics of order n + 1 to the light."""
