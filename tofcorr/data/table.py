@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions, condition
+from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions, Value, condition
 from tofcorr.data.arrays import LARGEST_DISTANCE
 from tofcorr.errors import CalibrationDataError, is_control
 from tofcorr.geometry import se3
@@ -33,7 +33,7 @@ unit): rounding to three digits. Part of the recording format, version 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FrameRow(Conditions[float]):
+class FrameRow(Conditions[Value]):
     """What is known of one frame besides its images; the conditions are those of `Conditions`.
 
     Attributes:
@@ -46,31 +46,19 @@ class FrameRow(Conditions[float]):
 
     world_from_tool: np.ndarray
     normal_world: np.ndarray
-    offset: float
-    target: str
-    pose_id: int | str | None = None
+    offset: Value
+    target: Any
+    pose_id: Any = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FrameTable(Conditions[np.ndarray]):
+class FrameTable(FrameRow[np.ndarray]):
     """The rows of `frames.csv` as arrays, one entry per frame; units as in `FrameRow`.
 
-    A condition has shape (N,). An optional column that the file lacks is None. An empty cell in an
-    optional column is NaN (the empty text in `pose_id`): unknown, never zero.
-
-    Attributes:
-        world_from_tool: Shape (N, 4, 4), metres.
-        normal_world: Shape (N, 3), exactly unit length.
-        offset: Shape (N,), metres.
-        target: Shape (N,), text.
-        pose_id: Shape (N,), text, or None.
+    A condition has shape (N,), and so have offsets, and targets and pose ids as text; poses have
+    shape (N, 4, 4), normals (N, 3), of exactly unit length. An optional column that the file lacks
+    is None. An empty cell in an optional column is NaN (the empty text in `pose_id`): unknown,
+    never zero.
     """
-
-    world_from_tool: np.ndarray
-    normal_world: np.ndarray
-    offset: np.ndarray
-    target: np.ndarray
-    pose_id: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return the number of frames."""
