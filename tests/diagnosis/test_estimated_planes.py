@@ -56,7 +56,8 @@ def with_walls_found(recording: Recording) -> Recording:
     image = np.array([int(view["view"]) for view in report["views"]])
     ids = image if table.pose_id is None else table.pose_id[image]
     # An importer knows no conditions of a frame: they are those of its image.
-    with RecordingWriter.with_header_of(out, found) as writer:
+    known = replace(found, modulation_frequency=recording.modulation_frequency)
+    with RecordingWriter.with_header_of(out, known) as writer:
         for frame, number in enumerate(image):
             plane = found.frames.row(frame)
             row = replace(
