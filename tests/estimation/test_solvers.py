@@ -121,10 +121,10 @@ def test_only_the_first_line_search_needs_several_evaluations(
     objective = MomentObjective(scene.moments())
     starts = [nearby(scene.truth, generator, 0.01) for _ in range(10)]
     found = [SOLVERS[0](objective, start) for start in starts]
-    evaluations = sum(solution.evaluations for solution in found)
-    iterations = sum(solution.iterations for solution in found)
-    # Only the first step, whose length SciPy guesses, is searched for.
-    assert evaluations < 1.6 * iterations
+    # Only the first step, whose length SciPy guesses, is searched for. Rounding, which differs
+    # from processor to processor, may still stop one search of many at the very end.
+    searched = [solution.evaluations - solution.iterations for solution in found]
+    assert np.median(searched) <= 6
 
 
 @solvers
