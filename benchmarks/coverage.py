@@ -63,7 +63,7 @@ def one_recording(
     truth = simulator.hand_eye.tool_from_camera()
     error = hand_eye_error(truth, result.solution.parameters.tool_from_camera)
     about_tool = (error @ truth[:3, :3].T).flatten()
-    return about_tool.numpy(), torch.cat(hand_eye_intervals(result)).numpy()
+    return about_tool.numpy(), torch.cat(tuple(hand_eye_intervals(result))).numpy()
 
 
 def study(

@@ -37,7 +37,7 @@ def main(name: str, count: int, seed: int) -> None:
         limits = ("-timeout=20", "-rss_limit_mb=4096", "-max_len=8192", "-len_control=0")
         atheris.Setup(
             [sys.argv[0], f"-runs={count}", f"-seed={seed}", *limits],
-            lambda data: test.hypothesis.fuzz_one_input(data) and None,
+            lambda data: test.hypothesis.fuzz_one_input(data) and None,  # pyright: ignore
         )
         atheris.Fuzz()
 

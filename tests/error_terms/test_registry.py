@@ -130,7 +130,7 @@ def test_the_polynomial_of_a_term_is_the_term(kind: str, generator: torch.Genera
 
 @pytest.mark.parametrize("kind", TERMS)
 def test_options_found_in_data_do_not_change_the_functions(kind: str) -> None:
-    options = TERMS[kind]()
+    options = TERMS[kind](kind=kind)
     assert set(options.found_in_data) <= set(type(options).model_fields)
     assert all(options.is_open(name) for name in options.found_in_data)
     assert not set(options.found_in_data) & set(options.structure())

@@ -6,6 +6,7 @@ second time.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -239,7 +240,7 @@ def looking(place: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
 
 
 def met(
-    planes: Iterable[tuple[np.ndarray, float]],
+    planes: Iterable[tuple[Any, float]],
     world: np.ndarray,
     place: np.ndarray,
     shown: Callable[[int, np.ndarray], np.ndarray | bool] = lambda number, points: True,

@@ -109,7 +109,8 @@ def test_curves_are_means_of_the_sampled_errors_in_bins_of_their_covariate(
     tags = [tag for tag in shown.Tags()["scalars"] if "/distance_x1000/" in tag]
     (tag,) = [tag for tag in tags if tag.endswith("/after")]
     x, error = sample.covariates["distance [m]"], sample.errors_mm["after"]
-    edges = np.linspace(*np.quantile(x, [0.001, 0.999]), 31)
+    low, high = np.quantile(x, [0.001, 0.999])
+    edges = np.linspace(low, high, 31)
     events = shown.Scalars(tag)
     assert len(events) > 3
     for event in events:

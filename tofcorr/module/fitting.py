@@ -140,7 +140,7 @@ def fit_to(
         tool_from_camera=tuple(tuple(row) for row in hand_eye["tool_from_camera"]),
         translation_se_mm=tuple(hand_eye["translation_se_mm"]),
         rotation_se_deg=tuple(hand_eye["rotation_se_deg"]),
-        stopped=result.solution.stopped,
+        stopped=str(result.solution.stopped),
         iterations=result.solution.iterations,
         train_frames=tuple(training.tolist()),
         test_frames=tuple(test.tolist()),

@@ -3,7 +3,7 @@
 import math
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -26,7 +26,7 @@ class Pose(NamedTuple):
 
     translation: list[float]
     rotation: np.ndarray
-    frames: list[str | None]
+    frames: Sequence[str | None]
 
 
 def rotation_of_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
@@ -128,7 +128,7 @@ def test_a_robot_reads_the_calibrated_pose(
     found = READERS[name, file]((tmp_path / file).read_text(encoding="utf-8"))
     np.testing.assert_allclose(np.array(found.translation, float), transform[:3, 3], atol=1e-9)
     np.testing.assert_allclose(found.rotation, transform[:3, :3], atol=1e-8)
-    assert found.frames == [names.tool, names.camera]
+    assert list(found.frames) == [names.tool, names.camera]
 
 
 @every_format

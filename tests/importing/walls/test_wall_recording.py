@@ -177,8 +177,6 @@ def _with_planes_of_nonsense(recording: Recording, out: Path, only: str | None =
                 normal = row.normal_world + np.roll([0.36, -0.18, 0.1], turns[row.target])
                 normal /= np.linalg.norm(normal)
                 row = replace(row, normal_world=normal, offset=row.offset + 0.2)
-            arrays = {
-                name: np.asarray(getattr(recording, name)[k]) for name in ("amplitude", "mask")
-            }
-            writer.append(recording.depth[k], row=row, **arrays)
+            amplitude, mask = (np.asarray(one)[k] for one in (recording.amplitude, recording.mask))
+            writer.append(recording.depth[k], row=row, amplitude=amplitude, mask=mask)
     return Recording.open(out)
