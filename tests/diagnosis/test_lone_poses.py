@@ -2,6 +2,7 @@
 
 import csv
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from diagnosed_recordings import recorded
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.report.words import lone_poses
@@ -71,3 +73,13 @@ def test_the_one_near_pose_is_named(far: Recording, tmp_path: Path) -> None:
     assert 0.4 < near <= distant < 1.0
     assert share > 90
     assert others < 1e3 * result.gap.before / 3
+
+
+def test_a_last_pose_without_a_pixel_is_one_without_a_say(time_missing: Recording) -> None:
+    # Its sums were left out, and the folds were of one pose more.
+    depth = np.array(time_missing.depth)
+    depth[-1] = np.nan
+    study = prepare(replace(time_missing, depth=depth), DiagnosisOptions(bootstraps=20), None).study
+    assert study.sums.num_units == study.folds.shape[1]
+    assert float(study.sums.count[-1]) == 0.0
+    assert name_effects(study).names == ("integration_time",)

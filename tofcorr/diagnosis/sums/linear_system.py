@@ -409,7 +409,8 @@ def pose_sums(
     layout = Layout(base=len(prior), effects=spans, prior=torch.block_diag(prior, ones))
     parts = [*columns.values(), pose, residual[:, None]]
     unit = observations.unit[observations.frame]
-    pixels = unit.argsort(stable=True).split(torch.bincount(unit).tolist())
+    sizes = torch.bincount(unit, minlength=observations.num_units)  # A pose may have no pixel.
+    pixels = unit.argsort(stable=True).split(sizes.tolist())
     weighted, plain, count = _products(parts, (fit.weight, fit.share), pixels)
     return PoseSums(
         weighted=weighted,
