@@ -112,8 +112,15 @@ def fit(
         covariance = jackknife_covariance(core.moments, optimum, prior, poses, problem.estimated)
         hand_eye_only = hand_eye_alone(problem, core.moments)
         problem, core, model, outcome, noise, shift = _completed(problem, core, weights)
+        assert core.observability is not None
         return Fit(
-            **vars(core),
+            options=core.options,
+            moments=core.moments,
+            start=core.start,
+            solution=core.solution,
+            smoothness=core.smoothness,
+            observability=core.observability,
+            prior=core.prior,
             model=model,
             domain=problem.domain,
             optimum=optimum if model.error.residual is None else core.solution.parameters,

@@ -114,7 +114,13 @@ def misfit_pixels(
     depth_before, amplitude_before = _before(data, of, sample.pixels)
     along_z = data.first.depth_kind == "z"
     return MisfitPixels(
-        **vars(replace(seen, unknowns=unknowns)),
+        pixels=seen.pixels,
+        ray=seen.ray,
+        normal=seen.normal,
+        distance=seen.distance,
+        residual=seen.residual,
+        gain=seen.gain,
+        unknowns=unknowns,
         frame=sample.frame,
         pose=torch.from_numpy(np.unique(data.pose_groups()[chosen], return_inverse=True)[1]),
         weight=torch.ones_like(unknown) if fit.weights is None else fit.weights.of_sample(sample),

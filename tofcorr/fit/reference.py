@@ -11,7 +11,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -405,7 +405,8 @@ _EXPECTED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
 
 def save_reference(path: Path, reference: Reference, state: CalibrationState) -> None:
     """Write a reference as JSON, with the coefficients that it belongs to."""
-    entries = {"coefficients": state.coefficients, **vars(reference)}
+    entries = {"coefficients": state.coefficients}
+    entries |= {one.name: getattr(reference, one.name) for one in fields(reference)}
     plain = {k: one.tolist() if isinstance(one, Tensor) else one for k, one in entries.items()}
     values = _FORMAT | plain
     values |= {"sha256": _digest(values)}

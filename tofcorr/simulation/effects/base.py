@@ -16,7 +16,7 @@ import torch
 from pydantic import create_model
 from torch import Tensor
 
-from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.geometry.rays import distance_along_rays, plane_in_frame
 from tofcorr.options import FiniteNumber, Options
 from tofcorr.simulation.effects.inputs import (
     EffectInputs,
@@ -258,11 +258,8 @@ class GeometryEffect(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return how much farther the rays meet the true plane, shape (M,), metres."""
-        recorded, true = (
-            plane_in_camera(inputs, facts)
-            for facts in (inputs.facts, self.moved(inputs.facts, coefficients))
-        )
-        return distance_to(inputs, *true) - distance_to(inputs, *recorded)
+        true = self.moved(inputs.facts, coefficients)
+        return distance_to(inputs, true) - distance_to(inputs, inputs.facts)
 
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the derivative of `shift`, shape (M, K): planes are differentiated by frame.
@@ -289,9 +286,10 @@ def plane_in_camera(inputs: EffectInputs, facts: FrameFacts) -> tuple[Tensor, Te
     return normal, height[:, None]
 
 
-def distance_to(inputs: EffectInputs, normal: Tensor, height: Tensor) -> Tensor:
+def distance_to(inputs: EffectInputs, facts: FrameFacts) -> Tensor:
     """Return how far along each ray the plane of its frame is, shape (M,), metres."""
-    return -height[inputs.frame, 0] / (inputs.rays * normal[inputs.frame]).sum(-1)
+    pose = facts.world_from_tool @ inputs.tool_from_camera
+    return distance_along_rays(inputs.rays, inputs.frame, pose, facts.normal_world, facts.offset)
 
 
 class SignalEffect(CatalogueEffect):

@@ -95,8 +95,8 @@ def _surfaces(inputs: EffectInputs) -> tuple[Tensor, Tensor]:
     """Return the normals (M, 3) that the rays meet, in the camera frame, and distances (M,)."""
     if inputs.normals_camera is not None:
         return inputs.normals_camera, inputs.radial_distance
-    normal, height = plane_in_camera(inputs, inputs.facts)
-    return normal[inputs.frame], distance_to(inputs, normal, height)
+    normal, _ = plane_in_camera(inputs, inputs.facts)
+    return normal[inputs.frame], distance_to(inputs, inputs.facts)
 
 
 def _changes(x: Tensor, y: Tensor, focal: float) -> tuple[list[Tensor], list[Tensor]]:
