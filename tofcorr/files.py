@@ -20,8 +20,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import click
 
@@ -37,8 +36,8 @@ _OURS = re.compile(r"\..+\.tofcorr-[0-9a-f]{8}\.part[^/]*|tofcorr-scratch-[0-9a-
 _LONGEST_NAME = 120
 """Longest part of a file's name that its temporary name repeats, bytes. File systems take 255 in
 all; the rest is for the suffix and the mark. Set by hand."""
-_BEGUN: dict[Path, Callable[[], object]] = {}
-"""How to remove each temporary file and folder that this process has begun."""
+_BEGUN: dict[Path, Callable[[Path], object]] = {}
+"""How to remove each file and folder that this process has begun, in the order of their making."""
 
 
 @contextmanager
@@ -56,16 +55,12 @@ def staged_file(path: Path | str, kind: type[TofcorrError] = ExportError) -> Ite
     Raises:
         TofcorrError: Of kind `kind`: the folder does not exist, or the file cannot be written.
     """
-    path = Path(path)
-    target = file_to_replace(path, kind)
+    target = file_to_replace(Path(path), kind)
     remove_leftovers(target.parent)
     part = target.with_name(temporary_name(target.stem, target.suffix))
-    try:
-        with _temporary(part, lambda: part.touch(exist_ok=False)):
-            yield part
-            part.replace(target)
-    except OSError as error:
-        raise kind(cannot_write(path, error)) from None
+    with writing_to(path, kind), _temporary(part, lambda: part.touch(exist_ok=False)):
+        yield part
+        part.replace(target)
 
 
 @contextmanager
@@ -84,8 +79,9 @@ def scratch_folder() -> Iterator[Path]:
         yield folder
 
 
-class StagedFolder:
-    """A temporary folder beside `path`, renamed to `path` when its block ends without an error.
+@contextmanager
+def staged_folder(path: Path | str) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`; it is renamed to `path` if the block succeeds.
 
     On any exception, Ctrl-C included, the temporary folder is removed, together with the parent
     folders that were made for it. Temporary folders that killed runs left beside it are removed.
@@ -95,67 +91,34 @@ class StagedFolder:
 
     Raises:
         CalibrationDataError: Something is at `path` already, or it cannot be written.
-
-    Attributes:
-        path: The folder to write.
-        folder: The temporary folder: files are written here.
     """
-
-    def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
-        refuse_existing(self.path)
-        # absolute() instead of resolve(): a symbolic link in the path is kept.
-        target = self.path.absolute()
-        self.folder = target.parent / temporary_name(target.name)
-        self._made = ExitStack()
-        _BEGUN[self.folder] = self.discard
-        with self._discarded_on_error():
-            for folder in reversed([one for one in target.parents if not one.exists()]):
-                folder.mkdir()
-                self._made.callback(_remove_empty, folder)
+    refuse_existing(Path(path))
+    # absolute() instead of resolve(): a symbolic link in the path is kept.
+    target = Path(path).absolute()
+    folder = target.parent / temporary_name(target.name)
+    with ExitStack() as made:
+        with writing_to(path):
+            for parent in reversed([one for one in target.parents if not one.exists()]):
+                made.enter_context(_begun(parent, parent.mkdir, Path.rmdir))
             remove_leftovers(target.parent)
             # The file system refuses a name that it cannot hold before any work is done.
             with suppress(FileNotFoundError):
                 os.lstat(target)
-            self._made.enter_context(_temporary(self.folder, self.folder.mkdir))
-
-    def commit(self) -> None:
-        """Rename the temporary folder to its final name."""
-        target = self.path.absolute()
-        with self._discarded_on_error():
+            made.enter_context(_temporary(folder, folder.mkdir))
+        yield folder
+        with writing_to(path):
             if os.path.lexists(target):
                 raise FileExistsError(0, "something appeared there in the meantime")
-            self.folder.rename(target)
-        self.discard()
+            folder.rename(target)
 
-    def discard(self) -> None:
-        """Remove the temporary folder, if it is still there, and the parents that are empty."""
-        _remove(self.folder)
-        self._made.close()
-        _BEGUN.pop(self.folder, None)
 
-    def __enter__(self) -> Self:
-        """Return the object; files are written to its `folder`."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Rename the folder into place, or remove it after an exception."""
-        self.commit() if kind is None else self.discard()
-
-    @contextmanager
-    def _discarded_on_error(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException as error:  # Ctrl-C too, which no block may handle yet.
-            self.discard()
-            if isinstance(error, OSError):
-                raise CalibrationDataError(cannot_write(self.path, error)) from None
-            raise
+@contextmanager
+def writing_to(path: Path | str, kind: type[TofcorrError] = CalibrationDataError) -> Iterator[None]:
+    """Say in one sentence, as an error of kind `kind`, why `path` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path}: cannot be written ({error.strerror or error}).") from None
 
 
 def remove_begun() -> None:
@@ -164,9 +127,9 @@ def remove_begun() -> None:
     Python may raise `KeyboardInterrupt` between any two steps: before a block has begun that would
     tidy up, or while it does so. The program calls this when it has been stopped.
     """
-    for path, undo in list(_BEGUN.items()):
+    for path, undo in reversed(list(_BEGUN.items())):
         with suppress(OSError):
-            undo()
+            undo(path)
         _BEGUN.pop(path, None)
 
 
@@ -176,21 +139,17 @@ def remove_leftovers(folder: Path) -> None:
     What another process is writing is locked, and stays. What cannot be removed is named.
     """
     for path in [*_leftovers(folder), *_leftovers(Path(tempfile.gettempdir()))]:
-        descriptor = None
+        said = "%s may be what a killed run left; if so, remove it."
         try:
-            if fcntl is None:
-                raise OSError("locks are unknown here")  # noqa: TRY301 - handled as the others
-            descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-            _LOG.warning("Removed %s, which a killed run had left.", path)
-        except (BlockingIOError, FileNotFoundError):
+            with _locked(path) as known:
+                if known:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+                    said = "Removed %s, which a killed run had left."
+        except (FileExistsError, FileNotFoundError):
             continue  # In use, or removed by another process in the same moment.
         except OSError:
-            _LOG.warning("%s may be what a killed run left; if so, remove it.", path)
-        finally:
-            if descriptor is not None:
-                os.close(descriptor)
+            pass
+        _LOG.warning(said, path)
 
 
 def temporary_name(name: str, suffix: str = "") -> str:
@@ -201,11 +160,6 @@ def temporary_name(name: str, suffix: str = "") -> str:
     if len(suffix) > _LONGEST_NAME or not suffix.isascii():
         suffix = ""
     return f".{name}.tofcorr-{uuid.uuid4().hex[:8]}.part{suffix}"
-
-
-def cannot_write(path: Path, error: OSError) -> str:
-    """Return the sentence that says why `path` could not be written."""
-    return f"{path}: cannot be written ({error.strerror or error})."
 
 
 def refuse_existing(path: Path) -> None:
@@ -233,7 +187,7 @@ def file_to_replace(path: Path, kind: type[TofcorrError]) -> Path:
             a pipe is there.
     """
     _refuse_name(path, kind)
-    try:
+    with writing_to(path, kind):  # For example a name too long for the file system.
         target = Path(os.path.realpath(path, strict=False))
         if path.is_symlink() and target.is_symlink():
             raise kind(f"{path}: is a symbolic link that leads to itself; remove it.")
@@ -243,8 +197,6 @@ def file_to_replace(path: Path, kind: type[TofcorrError]) -> Path:
             raise kind(f"{path}: is a folder; give the name of a file.")
         if target.exists() and not target.is_file():
             raise kind(f"{path}: is a device or a pipe, not a file; give the name of a file.")
-    except OSError as error:  # For example a name too long for the file system.
-        raise kind(cannot_write(path, error)) from None
     return target
 
 
@@ -257,49 +209,58 @@ def _refuse_name(path: Path, kind: type[TofcorrError]) -> None:
 
 
 @contextmanager
-def _temporary(path: Path, make: Callable[[], object]) -> Iterator[None]:
-    """Make a temporary file or folder, locked for the length of the block and removed after it.
-
-    The operating system lets go of the lock when the process ends, however it ends.
-    """
-    held = None
-    _BEGUN.setdefault(path, lambda: _remove(path))
+def _begun(
+    path: Path, make: Callable[[], object], undo: Callable[[Path], object]
+) -> Iterator[None]:
+    """Make something, and undo it after the block, or when the program is stopped."""
+    _BEGUN[path] = undo
     try:
         make()
-        held = _lock(path)
         yield
     finally:
-        _remove(path)
-        _BEGUN.pop(path, None)
-        if held is not None:
-            os.close(held)
+        with suppress(OSError):  # A parent folder is no longer empty.
+            undo(path)
+            _BEGUN.pop(path, None)
 
 
-def _lock(path: Path) -> int | None:
-    """Mark a temporary file or folder as in use until the descriptor that is returned is closed.
+@contextmanager
+def _temporary(path: Path, make: Callable[[], object]) -> Iterator[None]:
+    """Make a temporary file or folder, locked for the length of the block and removed after it."""
+    with _begun(path, make, _remove), _locked(path):
+        yield
 
-    Returns:
-        None where the file system knows no locks.
+
+@contextmanager
+def _locked(path: Path) -> Iterator[bool]:
+    """Mark a temporary file or folder as in use for the length of the block.
+
+    The operating system lets go of the lock when the process ends, however it ends.
+
+    Yields:
+        Whether the file system knows locks.
 
     Raises:
-        FileExistsError: Another process took `path` for a leftover in the same moment.
+        FileExistsError: Another process holds the lock, or removed `path` in the same moment.
         OSError: `path` cannot be opened.
     """
     if fcntl is None:
-        return None
-    descriptor = os.open(path, os.O_RDONLY)
+        yield False
+        return
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    known = own = True
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        same = os.path.samestat(os.fstat(descriptor), os.lstat(path))
-    except (BlockingIOError, FileNotFoundError):
-        same = False
-    except OSError:  # A file system without locks.
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            own = os.path.samestat(os.fstat(descriptor), os.lstat(path))
+        except (BlockingIOError, FileNotFoundError):
+            own = False
+        except OSError:
+            known = False
+        if not own:
+            raise FileExistsError(0, "another process removed a temporary file; try again")
+        yield known
+    finally:
         os.close(descriptor)
-        return None
-    if not same:
-        os.close(descriptor)
-        raise FileExistsError(0, "another process removed a temporary file; try again")
-    return descriptor
 
 
 def _leftovers(folder: Path) -> Iterator[Path]:
@@ -317,11 +278,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     with suppress(OSError):
         path.unlink()
-
-
-def _remove_empty(folder: Path) -> None:
-    with suppress(OSError):
-        folder.rmdir()
 
 
 _RECORD = "extra/tofcorr_seal"

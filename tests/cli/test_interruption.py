@@ -1,16 +1,18 @@
 """An interruption ends the program, whenever it comes, and leaves nothing half-written."""
 
+import shutil
 import signal
 import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
 
 from tofcorr.cli.main import group, main
-from tofcorr.files import StagedFolder, remove_begun, scratch_folder, staged_file
+from tofcorr.files import remove_begun, scratch_folder, staged_file, staged_folder
 
 
 @pytest.fixture
@@ -54,13 +56,16 @@ def test_what_a_second_interruption_kept_from_being_removed_is_removed_at_the_en
     monkeypatch: pytest.MonkeyPatch,
     program: Callable[[Callable[[], object]], tuple[object, str]],
 ) -> None:
-    def stop(*_: object) -> None:
+    remove = shutil.rmtree
+
+    def stop(*_: object, **__: object) -> None:
+        monkeypatch.setattr(shutil, "rmtree", remove)
         raise KeyboardInterrupt
 
     def work() -> None:
-        with StagedFolder(tmp_path / "new" / "run") as stage:
-            (stage.folder / "half").write_text("half")
-            monkeypatch.setattr(stage, "discard", stop)
+        with staged_folder(tmp_path / "new" / "run") as folder:
+            (folder / "half").write_text("half")
+            monkeypatch.setattr(shutil, "rmtree", stop)
             raise KeyboardInterrupt
 
     code, _ = program(work)
@@ -68,25 +73,21 @@ def test_what_a_second_interruption_kept_from_being_removed_is_removed_at_the_en
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("kind", ["folder", "file", "scratch"])
+@pytest.mark.parametrize("make", [staged_folder, staged_file, lambda _: scratch_folder()])
 def test_what_was_begun_before_its_block_is_removed(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
-    if kind == "folder":
-        begun = StagedFolder(tmp_path / "run")
-        assert begun.folder.is_dir()
-    else:
-        block = staged_file(tmp_path / "run.json") if kind == "file" else scratch_folder()
-        assert block.__enter__().exists()
+    block = make(tmp_path / "run")
+    assert block.__enter__().exists()
     remove_begun()
     assert list(tmp_path.rglob("*")) == [tmp_path / "temporary"]
 
 
 def test_what_is_done_is_not_removed(tmp_path: Path) -> None:
-    with StagedFolder(tmp_path / "run") as stage:
-        (stage.folder / "whole").write_text("whole")
+    with staged_folder(tmp_path / "run") as folder:
+        (folder / "whole").write_text("whole")
     with staged_file(tmp_path / "file") as part:
         part.write_text("whole")
     remove_begun()

@@ -16,7 +16,7 @@ from running import Program
 from small_recordings import write_small_recording
 
 from tofcorr.cli.main import group
-from tofcorr.files import StagedFolder
+from tofcorr.files import staged_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = str(ROOT / "configs" / "train" / "ea.yaml")
@@ -90,7 +90,7 @@ def test_a_full_disk_is_one_sentence(
 ) -> None:
     @click.command()
     def on_a_full_disk() -> None:
-        with StagedFolder(tmp_path / "run"):
+        with staged_folder(tmp_path / "run"):
             raise OSError(errno.ENOSPC, "No space left on device", "report.json")
 
     monkeypatch.setattr(group, "get_command", lambda context, name: on_a_full_disk)

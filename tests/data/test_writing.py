@@ -11,7 +11,7 @@ from small_recordings import CAMERA, frame_rows, small_images, write_small_recor
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import StagedFolder
+from tofcorr.files import staged_folder
 from tofcorr.geometry.camera import CameraIntrinsics
 
 
@@ -68,7 +68,7 @@ def test_what_exists_is_not_overwritten(tmp_path: Path, kind: str) -> None:
 def test_a_folder_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
     with (
         pytest.raises(CalibrationDataError, match="appeared there in the meantime"),
-        StagedFolder(tmp_path / "out"),
+        staged_folder(tmp_path / "out"),
     ):
         (tmp_path / "out").mkdir()
     assert contents(tmp_path) == ["out"]
@@ -124,8 +124,11 @@ def _with_row(**changes: Any) -> dict[str, Any]:
             {"depth": np.ones((0, 5, 7)), "rows": [], "amplitude": None, "mask": None, "raw": None},
             r"a recording of no frame",
         ),
-        (_changed("amplitude", (2, 0, 0), -1.0), r"frame 2, amplitude: negative amplitude"),
-        (_changed("mask", (2, 0, 0), 7), r"frame 2, mask: expected 0 or 1"),
+        (
+            _changed("amplitude", (2, 0, 0), -1.0),
+            r"amplitude\.npy: frame 2, row 0, column 0: negative amplitude",
+        ),
+        (_changed("mask", (2, 0, 0), 7), r"mask\.npy: frame 2, row 0, column 0: expected 0 or 1"),
         (_with_row(world_from_tool=2.0 * np.eye(4)), r"frame 3, world_from_tool: .*rigid"),
         (_with_row(world_from_tool=np.full((4, 4), np.nan)), r"frame 3, world_from_tool: .*finite"),
         (_with_row(normal_world=np.zeros(3)), r"frames\.csv: frame 3: the normal .* length 0"),

@@ -10,7 +10,7 @@ import pytest
 
 from tofcorr import files
 from tofcorr.errors import CalibrationDataError, ConfigError, ExportError
-from tofcorr.files import StagedFolder, scratch_folder, staged_file
+from tofcorr.files import scratch_folder, staged_file, staged_folder
 
 NAMES = ["a b", "-o", "--out", "ü ß 試.d", 'it\'s "quoted"', "*?[x]", "x" * 255, "é" * 127, "a.b.c"]
 ODD = ["two\nlines", "tab\there", "\x1b[31mred", "bytes\udcff", "\u2028"]
@@ -22,8 +22,8 @@ def write_file(path: Path, text: str = "new") -> None:
 
 
 def write_folder(path: Path) -> None:
-    with StagedFolder(path) as stage:
-        (stage.folder / "content").write_text("new")
+    with staged_folder(path) as folder:
+        (folder / "content").write_text("new")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -50,7 +50,7 @@ def test_a_name_too_long_for_the_file_system_is_refused_before_the_work(
     tmp_path: Path, name: str
 ) -> None:
     with pytest.raises(CalibrationDataError, match=r"cannot be written \(File name too long"):
-        StagedFolder(tmp_path / "new" / name)
+        write_folder(tmp_path / "new" / name)
     with pytest.raises(ExportError, match="File name too long"):
         write_file(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
@@ -112,9 +112,8 @@ def test_what_the_file_system_refuses_is_one_sentence(
 
 def die_while_writing(folder: Path) -> None:
     """End as a killed process does: no handler runs, the system lets go of the locks."""
-    stage = StagedFolder(folder / "run")
-    (stage.folder / "content").write_text("half")
-    with scratch_folder(), staged_file(folder / "file.yaml"):
+    with staged_folder(folder / "run") as run, scratch_folder(), staged_file(folder / "file.yaml"):
+        (run / "content").write_text("half")
         os._exit(9)
 
 
@@ -141,10 +140,10 @@ def test_the_next_run_removes_what_a_killed_one_left_and_says_so(
 
 
 def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
-    with StagedFolder(tmp_path / "one") as one, staged_file(tmp_path / "two") as two:
+    with staged_folder(tmp_path / "one") as one, staged_file(tmp_path / "two") as two:
         two.write_text("two")
         write_folder(tmp_path / "three")
-        assert one.folder.is_dir()
+        assert one.is_dir()
         assert two.is_file()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "three", "two"]
 

@@ -22,7 +22,7 @@ from tofcorr.comparison.options import (
     masks_of,
 )
 from tofcorr.comparison.statistics import Estimate, Table
-from tofcorr.files import StagedFolder
+from tofcorr.files import staged_folder
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.plausibility.examine import vet
@@ -288,7 +288,7 @@ def evaluate(
             lacks what a model needs; or `out` exists.
     """
     options = resolve_options(EvaluationOptions, config)
-    with StagedFolder(out) if out is not None else nullcontext() as stage:
+    with staged_folder(out) if out is not None else nullcontext() as folder:
         sets = opened(recordings)
         options = options.for_recordings(sets)
         data = [Dataset((recording,)) for recording in sets]
@@ -301,8 +301,8 @@ def evaluate(
                 for name, one, inspection in zip(names, data, inspections, strict=True)
             )
         result = EvaluationResult(evaluations, options, headlines)
-        if stage is not None:
-            result.write(stage.folder)
+        if folder is not None:
+            result.write(folder)
     return result
 
 

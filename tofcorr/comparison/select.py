@@ -16,7 +16,7 @@ from tofcorr.comparison.options import SelectionOptions, comparability_notes, ma
 from tofcorr.comparison.statistics import Ranking, Table, rank
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.files import StagedFolder
+from tofcorr.files import staged_folder
 from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
@@ -225,7 +225,7 @@ def select(
             be held out, or `out` exists.
     """
     options = resolve_options(SelectionOptions, config)
-    with StagedFolder(out) if out is not None else nullcontext() as stage:
+    with staged_folder(out) if out is not None else nullcontext() as folder:
         dataset = Dataset(opened(recordings))
         planes = resolved_planes(options.planes, dataset.recordings)
         inspection = vet(dataset, planes, force=force)
@@ -234,10 +234,10 @@ def select(
             found = rank_models(dataset, options, partial(advance, 1), inspection)
         # What the page says of the models is what was asked for.
         result = replace(found, options=options, headline=inspection.headline)
-        if stage is not None:
-            (stage.folder / "selection.md").write_text(result.markdown(), encoding="utf-8")
+        if folder is not None:
+            (folder / "selection.md").write_text(result.markdown(), encoding="utf-8")
             numbers = json.dumps(result.to_mapping(), indent=1, allow_nan=False)
-            (stage.folder / "selection.json").write_text(f"{numbers}\n", encoding="utf-8")
+            (folder / "selection.json").write_text(f"{numbers}\n", encoding="utf-8")
     return result
 
 

@@ -3,7 +3,7 @@
 import io
 import tokenize
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
@@ -39,7 +39,6 @@ class ImageArray:
         low: Smallest finite value that the format allows.
         high: Largest one.
         refusal: Says what is wrong with a value that is not allowed.
-        new_refusal: Says it of a frame that is to be written; empty: it is not checked.
     """
 
     name: str
@@ -49,7 +48,6 @@ class ImageArray:
     low: float = -inf
     high: float
     refusal: Callable[[Any], str]
-    new_refusal: str = ""
 
     def file(self, folder: Path) -> Path:
         """Return its file in the folder of a recording."""
@@ -59,8 +57,8 @@ class ImageArray:
         """Return the shape of one frame."""
         return (*self.per_frame, height, width)
 
-    def check(self, frames: np.ndarray, indices: np.ndarray, folder: Path) -> None:
-        """Refuse frames read from a file if a value is not allowed by the format.
+    def check(self, frames: np.ndarray, indices: Sequence[int] | np.ndarray, folder: Path) -> None:
+        """Refuse frames if a value is not allowed by the format.
 
         NaN and infinity mean "unknown", or "no return", and are allowed.
 
@@ -86,13 +84,6 @@ class ImageArray:
                 f"{self.refusal(frames[tuple(place)])}."
             )
 
-    def check_new(self, frame: np.ndarray, where: str) -> None:
-        """Refuse a frame that is to be written; the message begins with `where`."""
-        if self.new_refusal:
-            wrong = ~np.isin(frame, (0, 1)) if self.dtype is np.uint8 else frame < self.low
-            if np.any(wrong):
-                raise CalibrationDataError(f"{where}: {self.new_refusal}.")
-
 
 def _no_distance(value: np.floating) -> str:
     return f"{value:.6g} is no distance in metres; expected NaN or zero where there was no return"
@@ -107,20 +98,13 @@ IMAGE_ARRAYS = {
     array.name: array
     for array in (
         ImageArray(name="depth", required=True, high=LARGEST_DISTANCE, refusal=_no_distance),
-        ImageArray(
-            name="amplitude",
-            low=0,
-            high=LARGEST_NUMBER,
-            refusal=_no_amplitude,
-            new_refusal="negative amplitude; expected zero or more",
-        ),
+        ImageArray(name="amplitude", low=0, high=LARGEST_NUMBER, refusal=_no_amplitude),
         ImageArray(
             name="mask",
             dtype=np.uint8,
             low=0,
             high=1,
             refusal=lambda value: f"expected 0 or 1, got {value}",
-            new_refusal="expected 0 or 1 everywhere",
         ),
         ImageArray(
             name="raw",
@@ -239,14 +223,18 @@ class ArrayStream:
         """Return the frame in the type of the file.
 
         Raises:
-            CalibrationDataError: The frame has another shape; the message begins with `where`.
+            CalibrationDataError: The frame has another shape, or values that the type cannot hold;
+                the message begins with `where`.
         """
         if frame.shape != self._frame_shape:
             raise CalibrationDataError(
                 f"{where}: expected shape {self._frame_shape}, got {frame.shape}."
             )
-        with np.errstate(over="ignore"):
-            return np.ascontiguousarray(frame, dtype=self._dtype)
+        with np.errstate(over="ignore", invalid="ignore"):
+            converted = np.ascontiguousarray(frame, dtype=self._dtype)
+        if self._dtype.kind in "biu" and not np.array_equal(converted, frame):
+            raise CalibrationDataError(f"{where}: expected whole numbers of {self._dtype}.")
+        return converted
 
     def write(self, frame: np.ndarray) -> None:
         """Append a converted frame."""

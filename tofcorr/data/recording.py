@@ -32,6 +32,7 @@ PlaneOrigin = Literal["recorded", "estimated"]
 
 
 Row4 = tuple[Number, Number, Number, Number]
+_IDENTITY = tuple(map(tuple, np.eye(4).tolist()))
 
 
 def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
@@ -41,6 +42,9 @@ def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]
 
 RigidTransform = Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)]
 """A rigid transform as four rows."""
+_KnownOrIdentity = Annotated[
+    RigidTransform, BeforeValidator(lambda rows: _IDENTITY if rows is None else rows)
+]
 
 
 class Header(Options):
@@ -54,45 +58,9 @@ class Header(Options):
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None
     saturation_amplitude: PositiveNumber | None = None
-    tool_from_camera: RigidTransform = tuple(map(tuple, np.eye(4).tolist()))  # type: ignore[assignment]
+    tool_from_camera: _KnownOrIdentity = _IDENTITY  # type: ignore[assignment]
     planes: PlaneOrigin = "recorded"
     frames: FrameNames = FrameNames()
-
-    def tool_from_camera_matrix(self) -> np.ndarray:
-        """Return the guess of the hand-eye transform, shape (4, 4), its rotation exact.
-
-        Because of rounding in the file, the rotation may differ from an orthonormal one by up to
-        1e-3. The nearest rotation is returned.
-        """
-        return nearest_rigid(np.array(self.tool_from_camera, dtype=np.float64))
-
-
-def build_header(
-    camera: CameraIntrinsics,
-    depth_kind: DepthKind,
-    modulation_frequency: float | None,
-    saturation_amplitude: float | None,
-    tool_from_camera: np.ndarray | None,
-    planes: PlaneOrigin = "recorded",
-    frame_names: FrameNames | None = None,
-) -> Header:
-    """Check the arguments of a writer and build the header from them.
-
-    Raises:
-        CalibrationDataError: A value is not allowed in `recording.yaml`.
-    """
-    values: dict[str, Any] = {
-        "camera": camera.section(),
-        "depth_kind": depth_kind,
-        "modulation_frequency_hz": modulation_frequency,
-        "saturation_amplitude": saturation_amplitude,
-        "planes": planes,
-        "frames": (frame_names or FrameNames()).to_mapping(),
-        "tool_from_camera": None
-        if tool_from_camera is None
-        else np.asarray(tool_from_camera, dtype=np.float64).tolist(),
-    }
-    return _validated(values, HEADER_FILE)
 
 
 def read_header(path: Path) -> Header:
@@ -107,7 +75,7 @@ def read_header(path: Path) -> Header:
         if key not in values:
             raise CalibrationDataError(f"{path}: '{key}' is missing; is this a recording?")
     _refuse_misspelt(values, path)
-    return _validated(values, str(path))
+    return Header.from_mapping(values, str(path), CalibrationDataError)
 
 
 def header_text(header: Header) -> str:
@@ -117,12 +85,6 @@ def header_text(header: Header) -> str:
         if getattr(header, key) == Header.model_fields[key].default:
             del values[key]
     return dump_yaml(values, last="depth_kind")
-
-
-def _validated(values: Mapping[str, Any], where: str) -> Header:
-    if values.get("tool_from_camera", ()) is None:  # null: unknown, so the identity.
-        values = {key: value for key, value in values.items() if key != "tool_from_camera"}
-    return Header.from_mapping(values, where, CalibrationDataError)
 
 
 def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
@@ -245,7 +207,7 @@ class Recording:
             depth_kind=head.depth_kind,
             modulation_frequency=head.modulation_frequency_hz,
             saturation_amplitude=head.saturation_amplitude,
-            tool_from_camera=head.tool_from_camera_matrix(),
+            tool_from_camera=nearest_rigid(np.array(head.tool_from_camera, dtype=np.float64)),
             frames=frames,
             **{name: _opened(image, path, *size) for name, image in IMAGE_ARRAYS.items()},
             planes=head.planes,

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,15 +15,15 @@ from tofcorr.data.arrays import IMAGE_ARRAYS, ArrayStream, read_frames
 from tofcorr.data.recording import (
     HEADER_FILE,
     DepthKind,
+    Header,
     PlaneOrigin,
     Recording,
-    build_header,
     header_text,
     refuse_unless_rigid,
 )
 from tofcorr.data.table import TABLE_FILE, FrameRow, FrameTable, table_text
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import StagedFolder, cannot_write
+from tofcorr.files import staged_folder, writing_to
 from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import dump_yaml
@@ -68,21 +69,24 @@ class RecordingWriter:
         planes: PlaneOrigin = "recorded",
         frame_names: FrameNames | None = None,
     ) -> None:
-        self._header = build_header(
-            camera,
-            depth_kind,
-            modulation_frequency,
-            saturation_amplitude,
-            tool_from_camera,
-            planes,
-            frame_names,
-        )
+        matrix = None if tool_from_camera is None else np.asarray(tool_from_camera).tolist()
+        values = {
+            "camera": camera.section(),
+            "depth_kind": depth_kind,
+            "modulation_frequency_hz": modulation_frequency,
+            "saturation_amplitude": saturation_amplitude,
+            "tool_from_camera": matrix,
+            "planes": planes,
+            "frames": frame_names or FrameNames(),
+        }
+        self._header = Header.from_mapping(values, HEADER_FILE, CalibrationDataError)
         self._rows: list[FrameRow] = []
         self._rows_from: Path | None = None
         self._num_frames = 0
         self._streams: dict[str, ArrayStream] = {}
-        self._stage = StagedFolder(path)
-        self.path = self._stage.path
+        self.path = Path(path)
+        self._stack = ExitStack()
+        self._folder = self._stack.enter_context(staged_folder(path))
 
     @classmethod
     def with_header_of(cls, path: Path | str, recording: Recording) -> Self:
@@ -139,25 +143,21 @@ class RecordingWriter:
         given |= {"true_depth": true_depth}
         given |= {f"truth/{name}": value for name, value in (truth or {}).items()}
         images = {name: np.asarray(v) for name, v in given.items() if v is not None}
-        try:
+        with writing_to(self.path):
             self._write_images(images)
-        except OSError as error:
-            raise CalibrationDataError(cannot_write(self.path, error)) from None
         if row is not None:
             self._rows.append(row)
         self._num_frames += 1
 
     def add_truth(self, name: str, value: np.ndarray | Mapping[str, Any]) -> None:
         """Write `truth/NAME.npy` (an array) or `truth/NAME.yaml` (keys and values)."""
-        folder = self._stage.folder / "truth"
-        try:
+        folder = self._folder / "truth"
+        with writing_to(self.path):
             folder.mkdir(exist_ok=True)
             if isinstance(value, Mapping):
                 (folder / f"{name}.yaml").write_text(dump_yaml(value), encoding="utf-8")
             else:
                 np.save(folder / f"{name}.npy", np.asarray(value), allow_pickle=False)
-        except OSError as error:
-            raise CalibrationDataError(cannot_write(self.path, error)) from None
 
     def __enter__(self) -> Self:
         """Return the writer."""
@@ -170,20 +170,11 @@ class RecordingWriter:
         traceback: TracebackType | None,
     ) -> None:
         """Finish and check the recording and rename it into place, or leave nothing."""
-        try:
-            if kind is None:
+        with self._stack:
+            if error is not None:
+                raise error
+            with writing_to(self.path):
                 self._finish()
-                self._stage.commit()
-        except OSError as failure:
-            raise CalibrationDataError(cannot_write(self.path, failure)) from None
-        except CalibrationDataError as failure:
-            # The reader's checks name the temporary folder.
-            message = str(failure).replace(str(self._stage.folder), str(self.path))
-            raise CalibrationDataError(message) from None
-        finally:
-            for stream in self._streams.values():
-                stream.abandon()
-            self._stage.discard()
 
     def _check_pose(self, row: FrameRow) -> None:
         """Refuse a pose that has no quaternion; the reader checks everything else."""
@@ -198,10 +189,11 @@ class RecordingWriter:
         if self._num_frames == 0:
             size = (self._header.camera.height, self._header.camera.width)
             for name, image in images.items():
-                known, file = IMAGE_ARRAYS.get(name), self._stage.folder / f"{name}.npy"
+                known, file = IMAGE_ARRAYS.get(name), self._folder / f"{name}.npy"
                 shape = known.frame_shape(*size) if known else image.shape
                 dtype = np.dtype(known.dtype) if known else image.dtype
                 self._streams[name] = ArrayStream(file, dtype, shape)
+                self._stack.callback(self._streams[name].abandon)
         if images.keys() != self._streams.keys():
             differing = ", ".join(sorted(images.keys() ^ self._streams.keys()))
             raise CalibrationDataError(
@@ -213,15 +205,14 @@ class RecordingWriter:
             where = f"{self.path}: frame {self._num_frames}, {name}"
             frames[name] = self._streams[name].convert(image, where)
             if name in IMAGE_ARRAYS:
-                IMAGE_ARRAYS[name].check_new(image, where)
+                IMAGE_ARRAYS[name].check(frames[name][None], [self._num_frames], self.path)
         for name, frame in frames.items():
             self._streams[name].write(frame)
 
     def _finish(self) -> None:
         for stream in self._streams.values():
             stream.finish(self._num_frames)
-        folder = self._stage.folder
-        text = header_text(self._header)
+        folder, text = self._folder, header_text(self._header)
         (folder / HEADER_FILE).write_text(text, encoding="utf-8")
         if self._rows_from is not None:
             shutil.copyfile(self._rows_from, folder / TABLE_FILE)
@@ -230,8 +221,12 @@ class RecordingWriter:
             (folder / TABLE_FILE).write_text(rows, encoding="utf-8", newline="")
         if self._num_frames == 0:
             raise CalibrationDataError(f"{self.path}: a recording of no frame.")
-        # Amplitude and mask were checked when they were appended.
-        Recording.open(folder, check_contents=False)
+        try:
+            # Images were checked when they were appended.
+            Recording.open(folder, check_contents=False)
+        except CalibrationDataError as failure:  # It names the temporary folder.
+            message = str(failure).replace(str(folder), str(self.path))
+            raise CalibrationDataError(message) from None
 
 
 def write_recording(
@@ -337,10 +332,10 @@ def write_point_clouds(
     rays = ray_directions(recording.camera)
     directions = (rays / rays[..., 2:] if recording.depth_kind == "z" else rays).numpy()
     digits = max(3, len(str(recording.num_frames - 1)))
-    with StagedFolder(path) as stage, torch.inference_mode():
+    with staged_folder(path) as folder, torch.inference_mode():
         frames = _frames(corrector, recording, 1)
         for number, (depth, amplitude, _, corrected, kept) in enumerate(frames):
-            name = stage.folder / f"frame_{number:0{digits}d}"
+            name = folder / f"frame_{number:0{digits}d}"
             more = {} if amplitude is None else {"amplitude": amplitude[0]}
             _write_points(Path(f"{name}_before.ply"), depth[0], directions, more)
             more["valid"] = kept[0].astype(np.uint8)

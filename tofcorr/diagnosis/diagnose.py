@@ -32,7 +32,7 @@ from tofcorr.diagnosis.rerun.checks import check_in_simulator, measure_transfer,
 from tofcorr.diagnosis.rerun.sensor import degraded_stage, fitted_values
 from tofcorr.diagnosis.rerun.simulator import simulator_of, tables_of, whole_patterns
 from tofcorr.estimation.linear import solvable
-from tofcorr.files import StagedFolder
+from tofcorr.files import staged_folder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
 from tofcorr.plausibility.examine import vet
@@ -72,7 +72,7 @@ def diagnose(
             exists or cannot be written.
     """
     # First of all: what cannot be written is refused before any work.
-    with StagedFolder(out) if out is not None else nullcontext() as stage:
+    with staged_folder(out) if out is not None else nullcontext() as folder:
         if not isinstance(recording, Recording):
             recording = Recording.open(Path(recording))
         simulator = open_simulator(sim)
@@ -81,7 +81,7 @@ def diagnose(
         )
         with (
             thread_number(options.threads),
-            stages("diagnosing", 5 if stage is None else 6) as begin,
+            stages("diagnosing", 5 if folder is None else 6) as begin,
             solvable(recording.path, "diagnosis"),
         ):
             begin("fitting the base model")
@@ -93,9 +93,9 @@ def diagnose(
             result = conclude(prepared, simulator, begin)
             first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
             result = replace(result, verdict=" ".join(filter(None, first)))
-            if stage is not None:
+            if folder is not None:
                 begin("writing the report")
-                write_report(result, stage.folder)
+                write_report(result, folder)
         return result
 
 

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from tofcorr.data.recording import HEADER_FILE, build_header
+from tofcorr.data.recording import Header
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics, Matrix3
 from tofcorr.importing.numbers import any_numbers
@@ -68,11 +68,8 @@ class GivenIntrinsics:
             matrix=self.matrix_by_size.get(size, self.matrix),
             distortion=self.distortion,
         )
-        try:
-            build_header(camera, "z", None, None, None)
-        except CalibrationDataError as error:
-            message = str(error).replace(HEADER_FILE, self.source)
-            raise CalibrationDataError(message) from None
+        described = {"camera": camera.section(), "depth_kind": "z"}
+        Header.from_mapping(described, self.source, CalibrationDataError)
         if self.matrix[0][1] != 0:
             raise CalibrationDataError(
                 f"{self.source}: the pinhole matrix has a skew of {self.matrix[0][1]:g}; OpenCV's "

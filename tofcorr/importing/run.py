@@ -17,7 +17,7 @@ import numpy as np
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import StagedFolder
+from tofcorr.files import staged_folder
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
 
@@ -126,7 +126,7 @@ def run_import(
         CalibrationDataError: No view can be used, the source contradicts itself, or `out` exists
             or cannot be written.
     """
-    with StagedFolder(out) as stage:
+    with staged_folder(out) as folder:
         sieve = Sieve(source, progress)
         prepared = prepare(sieve)
         report = {
@@ -140,15 +140,15 @@ def run_import(
             **prepared.findings,
             "warnings": prepared.warnings,
         }
-        inner = stage.folder / "recording"
+        inner = folder / "recording"
         numbers = progress(range(len(prepared.views)), "writing")
         with prepared.writer(inner) as writer:
             for _, (row, depth, amplitude, mask) in zip(numbers, prepared.frames, strict=True):
                 writer.append(depth, row=row, amplitude=amplitude, mask=mask)
         for path in inner.iterdir():
-            path.rename(stage.folder / path.name)
+            path.rename(folder / path.name)
         inner.rmdir()
-        (stage.folder / FILE_NAME).write_text(report_text(report), encoding="utf-8")
+        (folder / FILE_NAME).write_text(report_text(report), encoding="utf-8")
     return report
 
 

@@ -24,7 +24,7 @@ from tofcorr.correction.state import (
 from tofcorr.errors import CalibrationDataError, ConfigError, ExportError
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Solution
-from tofcorr.files import StagedFolder, refuse_existing, staged_file
+from tofcorr.files import refuse_existing, staged_file, staged_folder
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import REFERENCE_FILE, Reference, estimate_reference, save_reference
 from tofcorr.options import dump_yaml, resolve_options
@@ -153,9 +153,9 @@ class TrainingResult:
         Raises:
             CalibrationDataError: Something is there already, or it cannot be written.
         """
-        with StagedFolder(folder) as stage:
-            self.write_into(stage.folder)
-        self.show_in(stage.path)
+        with staged_folder(folder) as staged:
+            self.write_into(staged)
+        self.show_in(Path(folder))
 
     def write_into(self, folder: Path) -> None:
         """Write all files but TensorBoard's into an existing folder."""
@@ -314,8 +314,8 @@ def train(
             data = usable_pixels(data, options, robust=robust, frames=train_frames)
         with process_group(options.device) as device, interruptible() as interrupted:
             # Every process fits, so that none waits; only the first one watches and writes.
-            folder = StagedFolder(out) if out is not None and is_first() else None
-            with folder or nullcontext():
+            place = Path(out) if out is not None and is_first() else None
+            with staged_folder(place) if place else nullcontext() as folder:
                 monitor = RunMonitor()
 
                 def watch(iteration: Solution) -> bool:
@@ -336,13 +336,13 @@ def train(
                 )
                 if folder:
                     with alone(), stage("write"):
-                        result.write_into(folder.folder)
+                        result.write_into(folder)
         # The run is on disk; what only helps to look at it follows.
-        if folder:
+        if place:
             try:
                 with stage("figures"):
-                    result.show_in(folder.path)
-                result.write_report(folder.path)
+                    result.show_in(place)
+                result.write_report(place)
             except (OSError, ExportError) as error:
                 _LOG.warning("%s is whole; its files for TensorBoard are not: %s", out, error)
         return result
