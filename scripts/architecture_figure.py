@@ -136,7 +136,7 @@ _FLOWS = (
         (
             ("recording", "depth, amplitude,", "poses, planes"),
             ("data + pixels", "checked, streamed,", "masked, split"),
-            ("estimation", "one pass: moments;", "L-BFGS on these"),
+            ("estimation", "one pass: moments;", "Gauss-Newton on these"),
             ("training", "held-out errors,", "intervals, advice"),
             ("run/", "corrector.ts, report,", "calibration.yaml"),
         ),

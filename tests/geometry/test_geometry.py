@@ -209,20 +209,6 @@ def test_rays_of_many_frames_meet_the_plane_of_their_own_frame(generator: torch.
     torch.testing.assert_close(height, torch.zeros_like(height), rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("size", [1e-20, 1e-9, 1e-3, 0.2, 1.0, 3.0])
-def test_exp_less_the_identity_keeps_its_digits(size: float, generator: torch.Generator) -> None:
-    twist = size * torch.randn(4, 6, generator=generator, dtype=torch.float64)
-    found = se3.exp_minus_identity(twist)
-    # e^X - 1 = X phi(X), and phi is found in the exponential of a larger matrix.
-    axes = torch.eye(6, dtype=torch.float64)
-    generators = 1e20 * se3.exp_minus_identity(1e-20 * axes)
-    matrix = torch.einsum("nk,kab->nab", twist, generators)
-    larger = torch.zeros(4, 8, 8, dtype=torch.float64)
-    larger[:, :4, :4], larger[:, :4, 4:] = matrix, torch.eye(4)
-    expected = matrix @ torch.linalg.matrix_exp(larger)[:, :4, 4:]
-    torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-14 * max(size, size**3))
-
-
 def test_transforms_are_apart_by_their_distance_and_the_angle_between_them() -> None:
     first = torch.eye(4, dtype=torch.float64)
     first[:3, 3] = torch.tensor([1.0, 0.0, 0.0])

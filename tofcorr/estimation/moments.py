@@ -207,18 +207,6 @@ class Parameters:
 class Objective(Protocol):
     """A sum of squared residuals as a function of the parameters."""
 
-    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
-        """Return the loss, a scalar through which autograd reaches the parameters."""
-        ...
-
-    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Return loss(origin.moved(step)) - loss(origin), differentiable in the step (P,).
-
-        Near the optimum the loss is a small difference of large sums, too inexact for a line
-        search. The change is computed without that cancellation.
-        """
-        ...
-
     def normal_equations(self, parameters: Parameters) -> NormalEquations:
         """Return loss, gradient and Gauss-Newton Hessian for a step of `Parameters.moved`."""
         ...
@@ -244,7 +232,6 @@ class MomentObjective:
 
     def __init__(self, moments: ImageMoments, prior: "Prior | None" = None) -> None:
         self.moments, self.prior = moments, prior
-        self._slope: tuple[Parameters, Tensor] | None = None
 
     @property
     def num_residuals(self) -> float:
@@ -272,19 +259,6 @@ class MomentObjective:
         """Return the loss, differentiable."""
         images = self.image_losses(parameters).sum()
         return images if self.prior is None else images + self.prior.penalty(parameters)
-
-    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Return the change of the loss by a step.
-
-        A step changes a by d, and the loss by d^T (2 Q a + Q d). Q a is rounded in the same way
-        whatever the step, so that its rounding adds no noise to a line search.
-        """
-        if self._slope is None or self._slope[0] is not origin:
-            with torch.no_grad():
-                self._slope = origin, self._joint @ origin.by_entries().flatten()
-        change = _change_of_entries(origin, step).flatten()
-        images = change @ (2 * self._slope[1] + self._joint @ change)
-        return images if self.prior is None else images + self.prior.change(origin, step)
 
     def image_equations(
         self, parameters: Parameters, further: Float[Tensor, "N S F"] | None = None
@@ -318,20 +292,6 @@ class MomentObjective:
 def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S"]:
     """Return p_i = (b outer R^T m_i, m_i . t + e_i), shape (N, S), S = 3C + 1."""
     return moments.planes @ parameters.by_entries()
-
-
-def _change_of_entries(origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, "4 S"]:
-    """Return what a step changes of A, without subtracting."""
-    pad, rotation = torch.nn.functional.pad, origin.tool_from_camera[:3, :3]
-    change_of_b = pad(-step[origin.twist_size :], (1, 0))
-    normals = change_of_b[:, None] * rotation[:, None, :]
-    shift = rotation.new_zeros(3, 1)
-    if origin.hand_eye_is_free:
-        b = pad(-origin.coefficients, (1, 0), value=1.0) + change_of_b
-        turned = rotation @ se3.exp_minus_identity(step[:6])[:3]
-        normals = normals + b[:, None] * turned[:, None, :3]
-        shift = turned[:, 3:]
-    return pad(torch.cat([normals.flatten(1), shift], dim=1), (0, 0, 0, 1))
 
 
 @dataclass(frozen=True)
@@ -397,8 +357,3 @@ class Prior:
     def penalty(self, parameters: Parameters) -> Float[Tensor, ""]:
         """Return the prior's part of the loss, differentiable."""
         return self.variance * self.deviation(parameters).square().sum()
-
-    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Return the change of that part by a step, differentiable."""
-        before, after = (self.deviation(one) for one in (origin, origin.moved(step)))
-        return self.variance * ((after - before) * (after + before)).sum()

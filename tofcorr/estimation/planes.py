@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.estimation.linear import Curvature, NormalEquations
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, residual_vectors
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.solvers import SolverOptions, minimise
 from tofcorr.geometry.rays import plane_in_frame, tangents
 
@@ -138,21 +138,6 @@ class _WallObjective:
     def num_residuals(self) -> float:
         return float(self.moments.count.sum().clamp(min=1))
 
-    def loss(self, parameters: _WithWalls) -> Float[Tensor, ""]:
-        """Return the loss."""
-        images = MomentObjective(parameters.walls.seen_by(self.moments)).loss(parameters)
-        return images + self._prior.at(parameters.total).loss
-
-    def change(self, origin: _WithWalls, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Return the change of the loss by a step, not as a difference of large sums."""
-        before, after = (
-            residual_vectors(one.walls.seen_by(self.moments), one)
-            for one in (origin, origin.moved(step))
-        )
-        images = torch.einsum("nq,nqr,nr->", after - before, self.moments.gram, after + before)
-        prior = self._prior.at(origin.total)
-        return images + 2 * prior.gradient @ step + step @ prior.hessian @ step
-
     def normal_equations(self, parameters: _WithWalls) -> NormalEquations:
         """Return loss, gradient and Gauss-Newton Hessian for a step."""
         walls = parameters.walls
@@ -180,7 +165,7 @@ def estimate_walls(
     together = _WithWalls(
         start.tool_from_camera, start.coefficients, start.hand_eye_is_free, walls=walls, total=zero
     )
-    options = SolverOptions(kind="levenberg_marquardt", max_iterations=most_steps)
+    options = SolverOptions(max_iterations=most_steps)
     objective = _WallObjective(moments, len(zero), prior)
     # Every point that the solver asks for is a step from the start: it has walls.
     end = minimise(objective, together, options).parameters  # pyright: ignore[reportArgumentType]

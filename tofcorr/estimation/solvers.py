@@ -1,10 +1,9 @@
-"""Where a fit starts, and how it finds the least loss: L-BFGS or damped Gauss-Newton steps.
+"""Where a fit starts, and how it finds the least loss: by damped Gauss-Newton steps.
 
-L-BFGS (SciPy's, Zhu, Byrd, Lu and Nocedal 1997) runs in whitened coordinates: one Gauss-Newton
-Hessian at the start makes every direction one standard error long. On raw parameters it stops while
-the hand-eye is still millimetres off, at an almost perfect residual; whitened, it needs a dozen
-iterations. The Gauss-Newton steps are damped in proportion to the curvature of each unknown
-(Levenberg and Marquardt).
+They are damped in proportion to the curvature of each unknown (Levenberg and Marquardt), so that
+metres, radians and coefficients need no common scale. A fit ends by the step that is left to the
+optimum, in standard errors, and not by the residual: on raw parameters a search along gradients
+stops while the hand-eye is still millimetres off, at an almost perfect residual.
 """
 
 import math
@@ -12,13 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from tofcorr.estimation.linear import ROUNDING, Curvature, NormalEquations, solved
+from tofcorr.estimation.linear import ROUNDING, Curvature, solved
 from tofcorr.estimation.moments import (
     LEAST_RESIDUAL,
     ImageMoments,
@@ -33,16 +31,16 @@ Stopped = Literal["converged", "iteration_limit", "line_search_failed", "not_fin
 
 
 class SolverOptions(Options):
-    """Options of both solvers.
+    """Options of the solver.
 
     Attributes:
-        kind: L-BFGS, or Levenberg-Marquardt for comparison.
+        kind: Both names mean the same solver; older configurations name one of them.
         max_iterations: A fit that reaches it is reported as not converged.
         tolerance: The fit has converged when the step left to the optimum is below this many
             standard errors of the parameters.
     """
 
-    kind: Literal["lbfgs", "levenberg_marquardt"] = "lbfgs"
+    kind: Literal["levenberg_marquardt", "lbfgs"] = "levenberg_marquardt"
     max_iterations: PositiveInt = 200
     tolerance: PositiveFloat = 1e-6
 
@@ -57,14 +55,12 @@ class Solution:
             iteration.
         step_left: Length of the step left to the optimum, in standard errors.
         stopped: Why the solver stopped; only "converged" is convergence. None: it has not yet.
-        evaluations: How often the loss was evaluated.
     """
 
     parameters: Parameters
     history: tuple[float, ...] = ()
     step_left: float = math.inf
     stopped: Stopped | None = None
-    evaluations: int = 0
 
     @property
     def loss(self) -> float:
@@ -109,137 +105,48 @@ def minimise(
     Args:
         objective: The loss.
         start: Where to begin.
-        options: Solver, iteration limit and tolerance.
+        options: Iteration limit and tolerance.
         watcher: Called after each iteration; returning False interrupts.
 
     Returns:
-        The best parameters and the reason for stopping. If the loss stops being finite, or the
-        line search fails, they are the last good ones, and `stopped` says so.
+        The best parameters and the reason for stopping. If the loss stops being finite, or no step
+        reduces it, they are the last good ones, and `stopped` says so.
     """
+    options, here = options or SolverOptions(), start.detached()
+    equations = tried = objective.normal_equations(here)
     if not start.size:  # There is nothing to estimate.
-        return Solution(start, (float(objective.loss(start)),), 0.0, "converged", 1)
-    options = options or SolverOptions()
-    run = _Run(objective, start, options, watcher)
-    {"lbfgs": _lbfgs, "levenberg_marquardt": _levenberg_marquardt}[options.kind](run)
-    found = run.found
-    return replace(
-        found,
-        parameters=found.parameters.detached(),
-        stopped=found.stopped or "line_search_failed",
-        evaluations=run.evaluations,
-    )
-
-
-class _Run:
-    """One minimisation: its best point so far, and why it stopped."""
-
-    def __init__(
-        self,
-        objective: Objective,
-        start: Parameters,
-        options: SolverOptions,
-        watcher: Watcher | None,
-    ) -> None:
-        self.objective, self.options, self.watcher = objective, options, watcher
-        self.found, self.evaluations = Solution(start), 0
-
-    def reached(self, parameters: Parameters, loss: float, step_left: float) -> bool:
-        """Take note of an iteration; return whether that is the end."""
-        self.found = Solution(parameters, (*self.found.history, loss), step_left)
-        stopped: Stopped | None = None
-        if self.watcher is not None and self.watcher(self.found) is False:
-            stopped = "interrupted"
-        elif step_left <= self.options.tolerance:
-            stopped = "converged"
-        elif self.found.iterations >= self.options.max_iterations:
-            stopped = "iteration_limit"
-        self.found = replace(self.found, stopped=stopped)
-        return stopped is not None
-
-    def equations(self, parameters: Parameters) -> NormalEquations | None:
-        """Return the normal equations at a point; None where they are not finite."""
-        self.evaluations += 1
-        found = self.objective.normal_equations(parameters)
-        return found if found.is_finite else None
-
-    def latest(self) -> NormalEquations | None:
-        """Return the normal equations at the best point; None where that is the end."""
-        if (equations := self.equations(self.found.parameters)) is None:
-            self.found = replace(self.found, stopped="not_finite")
-        return equations
-
-    def variance(self, equations: NormalEquations, loss: float) -> float:
-        """Return the mean weighted squared residual, on which standard errors are based."""
+        return Solution(here, (float(equations.loss),), 0.0, "converged")
+    found, damping = Solution(here), ROUNDING**0.5
+    while equations.is_finite:
+        loss = float(equations.loss)
         # The largest curvature is that of an unknown that moves every residual by about one metre.
-        least = LEAST_RESIDUAL**2 * float(equations.hessian.diagonal().max())
-        return max(loss, least) / self.objective.num_residuals
-
-
-def _lbfgs(run: _Run) -> None:
-    """Minimise by L-BFGS; where a line search stalls, it starts again from there, three times."""
-    for _ in range(4):
-        if run.found.stopped is None:
-            _descend(run)
-
-
-def _descend(run: _Run) -> None:
-    """Run L-BFGS from the best point, whitened there."""
-    from scipy.optimize import minimize  # A quarter of the time of torch to import.
-
-    origin, equations = run.found.parameters, run.latest()
-    if equations is None:
-        return
-    loss = float(equations.loss)
-    variance = run.variance(equations, loss)
-    white = whitening(equations.hessian / variance)
-    gradient = white.T @ equations.gradient / variance
-    if not run.found.history and run.reached(origin, loss, float(gradient.norm())):
-        return
-    zero = np.zeros(origin.size)
-    seen: list[tuple[np.ndarray, float, np.ndarray]] = [(zero, 0.0, gradient.numpy())]
-
-    def change(z: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the change of the loss since the origin over twice the residual variance."""
-        if not np.array_equal(z, seen[-1][0]):
-            run.evaluations += 1
-            point = torch.from_numpy(z.copy()).requires_grad_()
-            found = run.objective.change(origin, white @ point) / (2 * variance)
-            (slope,) = torch.autograd.grad(found, point)
-            seen.append((z.copy(), float(found.detach()), slope.numpy()))
-        return seen[-1][1:]
-
-    def iterated(z: np.ndarray) -> None:
-        """Take note of a point; the whitened gradient is the step left in standard errors."""
-        value, slope = change(z)
-        if not math.isfinite(value):
-            raise StopIteration
-        loss_here = loss + 2 * variance * value
-        left = math.sqrt(variance / run.variance(equations, loss_here))
-        here = origin.moved(white @ torch.from_numpy(z.copy()))
-        if run.reached(here, loss_here, left * float(np.linalg.norm(slope))):
-            raise StopIteration
-
-    options = {"maxcor": 20, "maxls": 25, "ftol": 0.0, "gtol": 0.0}
-    minimize(change, zero, jac=True, method="L-BFGS-B", callback=iterated, options=options)
-
-
-def _levenberg_marquardt(run: _Run) -> None:
-    """Minimise by damped Gauss-Newton steps on the normal equations."""
-    here, equations, damping = run.found.parameters, run.latest(), ROUNDING**0.5
-    while equations is not None:
-        loss, gradient = float(equations.loss), equations.gradient
-        decrease = float(gradient @ solved(equations.hessian, gradient))
-        left = math.sqrt(max(decrease, 0.0) / run.variance(equations, loss))
-        if run.reached(here, loss, left):
-            return
-        origin, hessian, equations = here, equations.hessian, None
+        # So large are the sums of squared distances of which the loss is what is left.
+        summed = float(equations.hessian.diagonal().max())
+        variance = max(loss, LEAST_RESIDUAL**2 * summed) / objective.num_residuals
+        decrease = float(equations.gradient @ solved(equations.hessian, equations.gradient))
+        left = math.sqrt(max(decrease, 0.0) / variance)
+        found = Solution(here, (*found.history, loss), left)
+        if stopped := _stopped(found, options, watcher):
+            return replace(found, stopped=stopped)
         # Beyond that, a step is too short to change the loss.
-        while equations is None and damping * ROUNDING < 1:
-            step = -solved(hessian, gradient, damping)
-            here = origin.moved(step)
-            equations = run.equations(here) if run.objective.change(origin, step) <= 0 else None
-            damping *= 10
-        damping = max(damping / 100, torch.finfo(torch.float64).eps)
+        while damping * ROUNDING < 1:
+            here = found.parameters.moved(-solved(equations.hessian, equations.gradient, damping))
+            tried, damping = objective.normal_equations(here), damping * 10
+            if float(tried.loss) <= loss + ROUNDING * summed:
+                break
+        else:
+            break
+        equations, damping = tried, max(damping / 100, torch.finfo(torch.float64).eps)
+    return replace(found, stopped="line_search_failed" if tried.is_finite else "not_finite")
+
+
+def _stopped(found: Solution, options: SolverOptions, watcher: Watcher | None) -> Stopped | None:
+    """Return why an iteration is the last one; None: it is not."""
+    if watcher is not None and watcher(found) is False:
+        return "interrupted"
+    if found.step_left <= options.tolerance:
+        return "converged"
+    return "iteration_limit" if found.iterations >= options.max_iterations else None
 
 
 def curved(hessian: Float[Tensor, "P P"]) -> Bool[Tensor, "P"]:
@@ -251,19 +158,6 @@ def curved(hessian: Float[Tensor, "P P"]) -> Bool[Tensor, "P"]:
     diagonal = hessian.diagonal()
     # Unknowns are metres and radians: the weakest that any recording resolves is far above it.
     return diagonal > ROUNDING**2 * diagonal.max()
-
-
-def whitening(hessian: Float[Tensor, "P P"]) -> Float[Tensor, "P P"]:
-    """Return W, shape (P, P), with W^T H W = 1 on every direction that float64 resolves.
-
-    The rows of unknowns without any curvature are zero.
-    """
-    used = curved(hessian)
-    blank = torch.where(used[:, None] & used, hessian, 0.0) + torch.diag((~used).to(hessian))
-    factored = Curvature(blank)
-    values = factored.values.clamp(min=ROUNDING * float(factored.values.max()))
-    whitened = factored.scale[:, None] * factored.vectors * values.rsqrt()
-    return torch.where(used[:, None], whitened, 0.0)
 
 
 def initial_parameters(

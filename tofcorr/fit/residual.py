@@ -10,10 +10,11 @@ from torch import Tensor
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
+from tofcorr.estimation.linear import Curvature
 from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.regularisation import total_weight
 from tofcorr.estimation.robust import student_tail
-from tofcorr.estimation.solvers import SolverOptions, minimise, whitening
+from tofcorr.estimation.solvers import minimise
 from tofcorr.fit.problem import Core, Problem, ResidualOptions
 from tofcorr.pixels.sample import FramePixels, draw_pixels
 
@@ -82,8 +83,7 @@ def _without(core: Core, images: Tensor) -> Core:
     if smooth is not None:
         share = total_weight(moments) / total_weight(core.moments)
         smooth = replace(smooth, variance=smooth.variance * share)
-    options = SolverOptions(kind="levenberg_marquardt")
-    solution = minimise(MomentObjective(moments, smooth), core.solution.parameters, options)
+    solution = minimise(MomentObjective(moments, smooth), core.solution.parameters)
     return replace(core, moments=moments, solution=solution, smoothness=smooth)
 
 
@@ -124,7 +124,7 @@ def _train(
     total, smooth = total_weight(core.moments), core.smoothness
     # Steps of about equal effect on the loss.
     hessian = MomentObjective(core.moments).normal_equations(best).hessian
-    white = whitening(hessian / (total * float(scale)))
+    white = Curvature(hessian / (total * float(scale))).basis
     step = torch.zeros(best.size, dtype=torch.float64, requires_grad=True)
 
     def loss_of_both() -> Tensor:

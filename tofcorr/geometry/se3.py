@@ -29,32 +29,18 @@ def product(left: Tensor, right: Tensor) -> Tensor:
 
 
 def exp(twist: Tensor) -> Tensor:
-    """Return the rigid transform of a twist.
+    r"""Return the rigid transform of a twist.
+
+    .. math:: e^X = 1 + X + \frac{1 - \cos\theta}{\theta^2} X^2
+        + \frac{\theta - \sin\theta}{\theta^3} X^3
+
+    for the matrix X of the twist and its angle theta (Lynch and Park 2017, section 3.3).
 
     Args:
         twist: Translational part first, metres and radians, shape (..., 6).
 
     Returns:
         Transforms, shape (..., 4, 4).
-    """
-    return torch.eye(4).to(twist) + exp_minus_identity(twist)
-
-
-def exp_minus_identity(twist: Tensor) -> Tensor:
-    r"""Return the rigid transform of a twist less the identity.
-
-    .. math:: e^X - 1 = X + \frac{1 - \cos\theta}{\theta^2} X^2
-        + \frac{\theta - \sin\theta}{\theta^3} X^3
-
-    for the matrix X of the twist and its angle theta (Lynch and Park 2017, section 3.3). It has
-    full relative precision for twists of any size; subtracting the identity from `exp` would lose
-    all digits of a twist below 1e-16.
-
-    Args:
-        twist: Translational part first, metres and radians, shape (..., 6).
-
-    Returns:
-        Shape (..., 4, 4).
     """
     matrix = (twist[..., None, None] * GENERATORS.to(twist)).sum(-3)
     square = twist[..., 3:].square().sum(-1)[..., None, None]
@@ -66,7 +52,7 @@ def exp_minus_identity(twist: Tensor) -> Tensor:
     second = torch.where(small, series[..., :1], (1 - torch.cos(angle)) / safe)
     third = torch.where(small, series[..., 1:], (angle - torch.sin(angle)) / (safe * angle))
     power = product(matrix, matrix)
-    return matrix + second * power + third * product(power, matrix)
+    return torch.eye(4).to(twist) + (matrix + second * power + third * product(power, matrix))
 
 
 def _generators() -> Tensor:

@@ -200,9 +200,9 @@ class DepthCorrection(FrameCorrection):
     ) -> FitReport:
         """Fit terms, residual network and hand-eye transform, as `tofcorr train` does.
 
-        One pass over the pixels sums moments; L-BFGS minimises the point-to-plane loss computed
-        from them. Ranges, depth kind and saturation amplitude become those of the recordings. The
-        parameters are changed in place: optimisers that refer to them stay valid.
+        One pass over the pixels sums moments; Gauss-Newton steps minimise the point-to-plane loss
+        computed from them. Ranges, depth kind and saturation amplitude become those of the
+        recordings. The parameters are changed in place: optimisers that refer to them stay valid.
 
         Args:
             recordings: Of this module's camera.
