@@ -24,7 +24,7 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.solvers import Solution, initial_parameters, minimise
-from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights, jackknife_covariance
+from tofcorr.estimation.uncertainty import jackknife_covariance
 from tofcorr.fit.problem import build_model
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
@@ -33,7 +33,6 @@ from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.calibration import TrainingOptions
 
 NUM_FOLDS = 6
-NUM_RESAMPLES = 1000
 
 
 def model_options(name: str) -> ErrorModelOptions:
@@ -52,8 +51,8 @@ def ours(
     return moments, solution
 
 
-def folds_and_bootstrap(batch: FrameBatch, domain: Domain, generator: torch.Generator) -> None:
-    """Six folds of three models, held-out errors, and a bootstrap of 1000 image resamples."""
+def folds(batch: FrameBatch, domain: Domain, generator: torch.Generator) -> None:
+    """Six folds of three models, and their held-out errors."""
     count = len(batch.indices)
     order = torch.randperm(count, generator=generator)
     for name in ("e0", "ea", "eb"):
@@ -63,9 +62,6 @@ def folds_and_bootstrap(batch: FrameBatch, domain: Domain, generator: torch.Gene
             kept[held_out] = False
             fold = minimise(MomentObjective(moments.images(kept)), whole.parameters)
             MomentObjective(moments.images(held_out)).image_losses(fold.parameters)
-        if name == "ea":
-            weights = draw_block_weights(torch.arange(count), NUM_RESAMPLES, generator)
-            bootstrap(moments, whole.parameters, weights)
 
 
 def scipy_fit(
@@ -132,9 +128,7 @@ def compare(repeats: int) -> dict[str, Any]:
     jobs = {
         "tofcorr": lambda: ours(batch, domain, options),
         "scipy lm, analytic jacobian": lambda: scipy_fit(batch, error, rays, start),
-        "tofcorr, 6 folds x 3 models + 1000 resamples": lambda: folds_and_bootstrap(
-            batch, domain, draws
-        ),
+        "tofcorr, 6 folds x 3 models": lambda: folds(batch, domain, draws),
     }
     seconds = {name: np.array(times) for name, times in timed(jobs, repeats).items()}
     base = np.median(seconds["tofcorr"])

@@ -139,3 +139,18 @@ def test_the_corrector_of_the_result_is_the_one_on_disk(trained: Trained) -> Non
     found, valid = trained.result.corrector()(depth, amplitude)
     assert torch.equal(valid, expected_valid)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-6, equal_nan=True)
+
+
+def test_the_curve_is_the_model_in_the_image_centre(trained: Trained) -> None:
+    rows = trained.calibration()["correction_curves"]["distance"]
+    error = trained.result.fit.model.error
+    centre = (slice(error.height // 2, error.height // 2 + 1), [15, 16])
+    for row in rows[::5]:
+        size = (error.height, error.width)
+        distance = torch.full(size, row["radial_distance_m"], dtype=torch.float64)
+        amplitude = torch.full(size, row["amplitude"], dtype=torch.float64)
+        with torch.no_grad():
+            middle = error(distance, amplitude)[centre].mean()
+        # The centre lies between two columns; the pixel term is quadratic, so the mean is close.
+        assert row["error_mm"] == pytest.approx(1e3 * float(middle), abs=0.05)
+        assert row["standard_error_mm"] > 0

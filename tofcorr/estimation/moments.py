@@ -77,7 +77,7 @@ class ImageMoments:
         return self._each(lambda part: part.to(device))
 
     def weighted(self, weights: Float[Tensor, "N"]) -> "ImageMoments":
-        """Return the moments with each image counted `weights` (N,) times, as a bootstrap does."""
+        """Return the moments with each image counted `weights` (N,) times."""
         return replace(self, gram=self.gram * weights[:, None, None], count=self.count * weights)
 
     def columns(self, symbols: Sequence[str]) -> "ImageMoments":
@@ -133,34 +133,32 @@ and would look like information. A hundredth of a millimetre is far below any ca
 class Parameters:
     """A point in the space of the unknowns: the hand-eye's twist, then the coefficients.
 
-    Or many of them, a batch (...).
-
     Attributes:
-        tool_from_camera: The hand-eye transform, shape (..., 4, 4).
-        coefficients: Constant and coefficients of the error model, shape (..., K), metres.
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+        coefficients: Constant and coefficients of the error model, shape (K,), metres.
         hand_eye_is_free: Whether the hand-eye is estimated; it is fixed without a robot.
     """
 
-    tool_from_camera: Float[Tensor, "*B 4 4"]
-    coefficients: Float[Tensor, "*B K"]
+    tool_from_camera: Float[Tensor, "4 4"]
+    coefficients: Float[Tensor, "K"]
     hand_eye_is_free: bool = True
 
     @property
     def size(self) -> int:
         """How many unknowns there are."""
-        return self.twist_size + self.coefficients.shape[-1]
+        return self.twist_size + len(self.coefficients)
 
     @property
     def twist_size(self) -> int:
         """6 if the hand-eye is estimated, else 0."""
         return 6 if self.hand_eye_is_free else 0
 
-    def moved(self, step: Float[Tensor, "*B P"]) -> "Parameters":
+    def moved(self, step: Float[Tensor, "P"]) -> "Parameters":
         """Return T exp(step[:6]) and coefficients + step[6:]; differentiable in the step (P,)."""
-        transform = self.tool_from_camera.expand(*step.shape[:-1], 4, 4)
+        transform = self.tool_from_camera
         if self.hand_eye_is_free:
-            transform = transform @ se3.exp(step[..., :6])
-        moved = self.coefficients + step[..., self.twist_size : self.size]
+            transform = transform @ se3.exp(step[:6])
+        moved = self.coefficients + step[self.twist_size : self.size]
         return replace(self, tool_from_camera=transform, coefficients=moved)
 
     def step_to(self, other: "Parameters") -> Float[Tensor, "P"]:
@@ -176,31 +174,31 @@ class Parameters:
         transform, coefficients = self.tool_from_camera.detach(), self.coefficients.detach()
         return replace(self, tool_from_camera=transform, coefficients=coefficients)
 
-    def by_entries(self) -> Float[Tensor, "*B 4 S"]:
-        """Return the matrix A whose rows a plane (m_i, e_i) sums to its residual vector."""
-        b = torch.nn.functional.pad(-self.coefficients, (1, 0), value=1.0)
-        rotation = self.tool_from_camera[..., :3, :3]
-        normals = (b[..., None, :, None] * rotation[..., :, None, :]).flatten(-2)
-        normals = torch.nn.functional.pad(normals, (0, 0, 0, 1))
-        last = torch.nn.functional.pad(self.tool_from_camera[..., :3, 3:], (0, 0, 0, 1), value=1.0)
-        return torch.cat([normals, last], dim=-1)
+    def _factors(self) -> Float[Tensor, "C"]:
+        """Return b, which the columns are multiplied with: of the distance and of each term."""
+        return torch.nn.functional.pad(-self.coefficients, (1, 0), value=1.0)
 
-    def slope(self) -> Float[Tensor, "*B 4 S P"]:
+    def by_entries(self) -> Float[Tensor, "4 S"]:
+        """Return the matrix A whose rows a plane (m_i, e_i) sums to its residual vector."""
+        rows = _entries(self._factors(), self.tool_from_camera[:3])
+        return torch.cat([rows, torch.eye(rows.shape[1]).to(rows)[-1:]])
+
+    def slope(self) -> Float[Tensor, "4 S P"]:
         """Return the derivative of that matrix by a step of `moved`."""
-        rotation, twist_size = self.tool_from_camera[..., :3, :3], self.twist_size
-        num = self.coefficients.shape[-1]
-        slope = rotation.new_zeros(*rotation.shape[:-2], 4, 3 * num + 4, twist_size + num)
-        if twist_size:
-            # (R exp(w))^T m = exp(-w) a = a + a x w: the derivative is the cross matrix of a.
-            b = torch.nn.functional.pad(-self.coefficients, (1, 0), value=1.0)
-            axes = torch.eye(3).to(rotation).expand(*rotation.shape[:-1], 3, 3)
-            crossed = torch.linalg.cross(rotation[..., None, :], axes).mT
-            slope[..., :3, -1, :3] = rotation
-            turned = b[..., None, :, None, None] * crossed[..., :, None, :, :]
-            slope[..., :3, :-1, 3:6] = turned.flatten(-3, -2)
-        for k in range(num):
-            slope[..., :3, 3 * (k + 1) : 3 * (k + 2), twist_size + k] = -rotation
-        return slope
+        rows, num = self.tool_from_camera[:3], len(self.coefficients)
+        turned = rows @ se3.GENERATORS[: self.twist_size].to(rows)
+        still = torch.nn.functional.pad(rows[:, :3], (0, 1)).expand(num, 3, 4)
+        each = -torch.eye(num + 1)[1:].to(rows)
+        slopes = torch.cat([_entries(self._factors(), turned), _entries(each, still)])
+        return torch.nn.functional.pad(slopes, (0, 0, 0, 1)).movedim(0, -1)
+
+
+def _entries(
+    factors: Float[Tensor, "*B C"], rows: Float[Tensor, "*T 3 4"]
+) -> Float[Tensor, "*T 3 S"]:
+    """Return the first three rows of A, which are linear in b and in those of a transform."""
+    normals = (factors[..., None, :, None] * rows[..., :, None, :3]).flatten(-2)
+    return torch.cat([normals, rows[..., 3:]], dim=-1)
 
 
 @runtime_checkable
@@ -238,17 +236,13 @@ class MomentObjective:
         """How many residuals the loss sums."""
         return float(self.moments.count.sum())
 
-    def joint(self, weights: Float[Tensor, "B N"]) -> Float[Tensor, "B E E"]:
-        """Return Q, E = 4 S, of images that count `weights` times; B times."""
-        planes, size = self.moments.planes, self.moments.gram.shape[-1]
-        pairs = (planes[:, :, None] * planes[:, None, :]).flatten(1)
-        each = (weights[:, :, None] * pairs).mT @ self.moments.gram.flatten(1)
-        by_entry = each.view(-1, 4, 4, size, size).transpose(2, 3)
-        return by_entry.reshape(len(weights), 4 * size, 4 * size)
-
     @cached_property
     def _joint(self) -> Float[Tensor, "E E"]:
-        return self.joint(self.moments.gram.new_ones(1, self.moments.num_images))[0]
+        """The matrix Q, E = 4 S."""
+        planes, size = self.moments.planes, self.moments.gram.shape[-1]
+        pairs = (planes[:, :, None] * planes[:, None, :]).flatten(1)
+        by_entry = (pairs.T @ self.moments.gram.flatten(1)).view(4, 4, size, size)
+        return by_entry.transpose(1, 2).reshape(4 * size, 4 * size)
 
     def image_losses(self, parameters: Parameters) -> Float[Tensor, "N"]:
         """Return the sum of squared residuals of each image, shape (N,)."""

@@ -114,7 +114,7 @@ class _WithWalls(Parameters):
         """How many unknowns there are."""
         return super().size + self.walls.size
 
-    def moved(self, step: Float[Tensor, "*B P"]) -> "_WithWalls":
+    def moved(self, step: Float[Tensor, "P"]) -> "_WithWalls":
         """Return the unknowns and the walls after a step."""
         own, of_walls = step.split([super().size, self.walls.size])
         walls = self.walls.moved(of_walls)

@@ -1,9 +1,7 @@
-r"""How uncertain an estimate is: by leaving out poses, by resampling them, and by its curvature.
+r"""How uncertain an estimate is: by leaving out poses, and by the curvature of the loss.
 
 Pixels of one image share its pose error and its target, so counting them as independent makes
-standard errors many times too small. Leaving out one pose at a time does not. A residual is linear
-in the matrix A of the unknowns (see `objective`), so the images of a resample add up to one matrix,
-and a thousand resamples are fitted by a few batched Newton steps.
+standard errors many times too small. Leaving out one pose at a time does not.
 
 In the curvature, metres and radians are comparable: one milliradian moves a point at one metre by
 one millimetre. A direction is a unit vector over all unknowns, and its sigma is the standard
@@ -21,10 +19,8 @@ from torch import Tensor
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import (
     Curvature,
-    NormalEquations,
     left_out_steps,
     robust_covariance,
-    solved,
 )
 from tofcorr.estimation.moments import (
     HAND_EYE_SYMBOLS,
@@ -35,7 +31,6 @@ from tofcorr.estimation.moments import (
     Prior,
 )
 from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian
-from tofcorr.geometry import se3
 
 PRIOR_SIGMA = 0.1
 """Standard deviation of the wide prior on every unknown: 100 mm, 100 mrad (5.7 degrees).
@@ -105,75 +100,6 @@ def jackknife_covariance(
         gain = curvature.inverse[:size, :size] @ (prior.variance * prior.factor.T)
         matrix = matrix + gain @ gain.T
     return Covariance(matrix, shift, int((~curvature.resolved).sum()))
-
-
-def draw_block_weights(
-    groups: Int[Tensor, "N"], num_resamples: int, generator: torch.Generator
-) -> Float[Tensor, "{num_resamples} N"]:
-    """Draw how often each image counts when whole blocks are drawn with replacement.
-
-    Args:
-        groups: The block of each image, shape (N,), from zero; images of one pose share it.
-        num_resamples: How many resamples B.
-        generator: Source of randomness.
-
-    Returns:
-        Shape (num_resamples, N), float64.
-
-    Raises:
-        CalibrationDataError: There are fewer than three blocks.
-    """
-    num_blocks = int(groups.max()) + 1 if len(groups) else 0
-    if num_blocks < 3:
-        raise CalibrationDataError(f"A bootstrap needs at least 3 poses, got {num_blocks}.")
-    drawn = torch.randint(num_blocks, (num_resamples, num_blocks), generator=generator)
-    counts = torch.zeros(num_resamples, num_blocks, dtype=torch.float64)
-    counts.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.float64))
-    return counts[:, groups]
-
-
-def bootstrap(
-    moments: ImageMoments,
-    optimum: Parameters,
-    weights: Float[Tensor, "B N"],
-    prior: Prior | None = None,
-) -> Float[Tensor, "B P"]:
-    """Fit resampled recordings, all at once: two Newton steps each.
-
-    The second step squares the distance to the optimum that the first one left, in standard errors.
-
-    Args:
-        moments: Moments of the images fitted.
-        optimum: The parameters at the optimum of all images.
-        weights: How often each image counts in each resample, shape (B, N).
-        prior: A prior that was part of the loss; every resample keeps it.
-
-    Returns:
-        Steps from the optimum of all images to that of each resample, as `Parameters.moved` takes
-        them.
-    """
-    objective, twist_size = MomentObjective(moments), optimum.twist_size
-    held = None if prior is None else prior.equations(optimum)
-    each = objective.image_equations(optimum)
-    resampled = NormalEquations(*(torch.tensordot(weights, part, dims=1) for part in each))
-    first = resampled.plus(held)
-    steps = -solved(first.hessian, first.gradient)
-    last = torch.zeros_like(steps)
-    # Matrices of 4 million entries are held at once: 32 MB.
-    entries = (4 * moments.gram.shape[-1]) ** 2
-    for chunk in torch.arange(len(weights)).split(max(1, 4_000_000 // entries)):
-        here = optimum.moved(steps[chunk])
-        slope = here.slope().flatten(1, 2)
-        weighted = objective.joint(weights[chunk]) @ slope
-        at = here.by_entries().flatten(1)[:, None]
-        found = NormalEquations(at.new_zeros(()), (at @ weighted)[:, 0], slope.mT @ weighted)
-        if held is not None:
-            found = found.plus(held._replace(gradient=held.gradient + steps[chunk] @ held.hessian))
-        last[chunk] = -solved(found.hessian, found.gradient)
-    if not twist_size:
-        return steps + last
-    twist = se3.log(se3.exp(steps[:, :6]) @ se3.exp(last[:, :6]))
-    return torch.cat([twist, steps[:, 6:] + last[:, 6:]], dim=1)
 
 
 def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:

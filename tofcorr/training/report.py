@@ -11,10 +11,8 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.state import HandEyeAccuracy
 from tofcorr.error_terms.model import Pixels
-from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import HAND_EYE_SYMBOLS
 from tofcorr.estimation.robust import outlying_images, student_quantile
-from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.dataset import Dataset
@@ -92,33 +90,6 @@ def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
     }
 
 
-def bootstrap_summary(
-    fit: Fit, generator: torch.Generator, resamples: int = 1000
-) -> dict[str, Any] | None:
-    """Return standard errors from resamples of poses.
-
-    None with too few poses, and where a resample leaves something undetermined.
-
-    Args:
-        fit: The fitted model.
-        generator: Source of randomness.
-        resamples: How many: a standard deviation of 1000 values is known to 2 %.
-    """
-    try:
-        weights = draw_block_weights(fit.poses, resamples, generator)
-    except CalibrationDataError:
-        return None
-    steps = bootstrap(fit.moments, fit.optimum, weights, fit.total_prior)
-    if not bool(steps.isfinite().all()):
-        return None
-    summary: dict[str, Any] = {"resamples": resamples, "poses": int(fit.poses.max()) + 1}
-    if not fit.optimum.hand_eye_is_free:
-        return summary
-    rotation = fit.optimum.tool_from_camera[:3, :3]
-    moved = torch.stack([steps[:, :3] @ rotation.T, steps[:, 3:6] @ rotation.T])
-    return summary | _in_units(moved.std(dim=1), "se")
-
-
 def correction_curves(fit: Fit, points: int = 21) -> dict[str, list[dict[str, float]]]:
     """Return the predicted error with its standard error over the calibrated ranges.
 
@@ -164,7 +135,7 @@ def training_report(
 
     Args:
         calibration: The fitted model and its errors.
-        options: Those of the training; the seed of the split also seeds bootstrap and advice.
+        options: Those of the training; the seed of the split also seeds the advice.
         inspection: What was odd about the recordings.
     """
     fit, data, seed = calibration.fit, calibration.data, options.split.seed
@@ -211,7 +182,6 @@ def training_report(
         "weights": None if fit.weights is None else fit.weights.to_mapping(),
         "walls": None if fit.walls is None else fit.walls.summary(),
         "outlying_images": [one._asdict() for one in outlying_images(after.frames, rms)],
-        "bootstrap": bootstrap_summary(fit, torch.Generator().manual_seed(seed)),
         "observability": observability_summary(fit, support),
         "advice": advice,
         "plausibility": [one.to_mapping() for one in inspection.findings],
