@@ -8,12 +8,12 @@ from synthetic_scene import EA, error_model
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
-from tofcorr.estimation.accumulator import Design, MomentAccumulator, moments_of_few
+from tofcorr.estimation.accumulator import Design, MomentAccumulator, moments_of_few, on_polynomials
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
 CAMERA = CameraIntrinsics(
-    width=7, height=5, matrix=((6.0, 0.0, 3.2), (0.0, 6.5, 1.8), (0.0, 0.0, 1.0))
+    width=66, height=66, matrix=((120.0, 0.0, 32.0), (0.0, 125.0, 33.0), (0.0, 0.0, 1.0))
 )
 DISTANCE = {"kind": "distance_polynomial", "degree": 2}
 
@@ -24,7 +24,7 @@ def design_of(model: ErrorModel) -> Design:
 
 def frames(generator: torch.Generator) -> FrameBatch:
     """Distances and amplitudes of twice the calibrated range; a fifth of the pixels is missing."""
-    distance, amplitude, chance = torch.rand(3, 4, 5, 7, generator=generator, dtype=torch.float64)
+    distance, amplitude, chance = torch.rand(3, 4, 66, 66, generator=generator, dtype=torch.float64)
     valid = chance > 0.2
     return FrameBatch(
         indices=torch.arange(4),
@@ -47,6 +47,7 @@ def test_moments_are_those_of_the_columns_pixel_by_pixel(
     model = ErrorModel(ErrorModelOptions.from_mapping({"terms": terms}, kind), DOMAIN)
     design, batch = design_of(model), frames(generator)
     weights = 0.2 + torch.rand(batch.valid.shape, generator=generator, dtype=torch.float64)
+    assert on_polynomials(design)
     for given in (None, weights):
         found = MomentAccumulator(design)(batch, given).gram
         expected = torch.stack([moments_of_few(design, batch, k, given) for k in range(4)])
@@ -54,6 +55,18 @@ def test_moments_are_those_of_the_columns_pixel_by_pixel(
         scale = size[:, :, None] * size[:, None]
         # Powers reach some thousands outside the range, and lose their digits with each other.
         assert ((found - expected).abs() / scale).max() < 1e-12
+
+
+def test_static_images_that_no_polynomials_follow_are_left_as_they_are() -> None:
+    model, focal = error_model(EA), 160.0 / 3.73
+    design = design_of(model)
+    # A step in one row, which no sample of rows need contain.
+    design.pixel_functions[1, 2, 33:] += 1.0
+    assert not on_polynomials(design)
+    # A view of 150 degrees across, whose rays no polynomial that is tried follows to rounding.
+    matrix = ((focal, 0.0, 160.0), (0.0, focal, 30.0), (0.0, 0.0, 1.0))
+    wide = CameraIntrinsics(width=320, height=60, matrix=matrix)
+    assert not on_polynomials(Design(model, DOMAIN, ray_directions(wide)))
 
 
 def test_products_with_the_distance_follow_from_those_of_its_polynomial() -> None:

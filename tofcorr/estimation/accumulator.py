@@ -10,12 +10,11 @@ with a static image: a product of pixel functions and rays. Rays and polynomials
 smooth along an image row and along a column, so a few orthogonal polynomials represent them to
 rounding. Products of frames are first projected onto those of each segment of a row, which shrinks
 W numbers to a few dozen, then onto those of the columns; the static images then need only as many.
-Where these are not smooth, an image stays as it is and nothing is lost but speed.
+Where these are not smooth, pixel by pixel is summed, and nothing is lost but speed.
 """
 
-from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
-from itertools import islice, pairwise
+from itertools import combinations_with_replacement, islice, pairwise, product
 from typing import Any
 
 import numpy as np
@@ -136,12 +135,7 @@ _BLOCK_PIXELS, _BLOCK_PIXELS_CUDA = 20_480, 4_194_304
 _EXACT = 1e-13
 # Numbers of polynomials that are tried. Multiples of 8, which processors multiply quickly: on
 # AVX-512, 24 columns take two thirds of the time of 21.
-_POLYNOMIALS = range(8, 49, 8)
-
-
-StaticImages = Callable[[Tensor | slice], Iterable[Float[Tensor, "G h W"]]]
-"""Yields rows of all static images, group by group."""
-
+_POLYNOMIALS = range(16, 49, 8)
 
 Images = Any
 """`tofcorr.data.recording.FrameBatch`, or what has its images, planes and valid pixels."""
@@ -171,24 +165,20 @@ class MomentAccumulator:
     few_pixels = 0.1
 
     def __init__(self, design: Design, device: str = "cpu") -> None:
-        self.design, self._device = design, device
-        height = len(design.ray_directions)
-        self._reduction = PixelReduction(
-            lambda rows: _static_products(design, rows), height, device
-        )
+        self.design = design
+        self._smooth = [part.to(device) for part in on_polynomials(design)]
         pairs = design.signal_pairs
         self._kept = [k for k in range(len(pairs)) if k != 1 or design.distance_as is None]
         # The functions themselves first: products with 1. Then one pair for each other product.
         place = {int(pairs[0, k]): n for n, k in enumerate(self._kept)}
         self.formed = [(0, n) for n in range(len(self._kept))]
-        for a in range(1, len(self._kept)):
-            for b in range(a, len(self._kept)):
-                product = int(pairs[self._kept[a], self._kept[b]])
-                if product not in place:
-                    place[product] = len(self.formed)
-                    self.formed.append((a, b))
+        for a, b in combinations_with_replacement(range(1, len(self._kept)), 2):
+            product = int(pairs[self._kept[a], self._kept[b]])
+            if product not in place:
+                place[product] = len(self.formed)
+                self.formed.append((a, b))
         index = torch.tensor([[place.get(k, 0) for k in row] for row in pairs.tolist()])
-        self._gather = self._gather_index(index).to(device)
+        self._gather = _gather_index(design, index).to(device)
         self._block = _BLOCK_PIXELS_CUDA if device.startswith("cuda") else _BLOCK_PIXELS
 
     def __call__(
@@ -200,53 +190,42 @@ class MomentAccumulator:
             batch: Frames on the accumulator's device.
             weights: Weights of the pixels, shape (B, H, W); 1 each if None.
         """
-        size = batch.valid[0].numel()
-        count = batch.valid.count_nonzero((1, 2))
+        size, count = batch.valid[0].numel(), batch.valid.count_nonzero((1, 2)).cpu()
         grams = []
         for frames in torch.arange(len(count)).split(max(1, self._block // size)):
-            chosen, used = slice(int(frames[0]), int(frames[-1]) + 1), int(count[frames].sum())
-            if batch.valid.is_cuda or used > self.few_pixels * size * len(frames):
-                whole = used == size * len(frames)
-                grams.append(self._frames(batch, weights, chosen, whole=whole))
+            many = batch.valid.is_cuda or count[frames].sum() > self.few_pixels * size * len(frames)
+            if self._smooth and many:
+                chosen = slice(int(frames[0]), int(frames[-1]) + 1)
+                grams.append(self._frames(batch, weights, chosen).cpu())
             else:
                 each = (moments_of_few(self.design, batch, int(k), weights) for k in frames)
                 grams.append(torch.stack(list(each)))
-        gram, number = torch.cat(grams), count.to(torch.float64)
-        planes = batch.normal_tool, batch.offset_tool
-        return ImageMoments(gram, *planes, number, self.design.symbols).to("cpu")
+        planes = batch.normal_tool.cpu(), batch.offset_tool.cpu()
+        return ImageMoments(torch.cat(grams), *planes, count.double(), self.design.symbols)
 
     def _frames(
-        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, *, whole: bool
+        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice
     ) -> Float[Tensor, "F S S"]:
-        """Return the Gram matrices of some frames, gathered from blocks of rows.
-
-        Args:
-            batch: The images.
-            weights: Of the pixels; None: 1 each.
-            frames: Which of them.
-            whole: Whether all of their pixels are valid.
-        """
+        """Return the Gram matrices of some frames, gathered from blocks of rows."""
         count, height, width = batch.valid[frames].shape
         step = max(1, self._block // (count * width))
-
-        valid = None if whole else batch.valid
-        others = batch.amplitude, valid, weights
+        along_row, along_column, static = self._smooth
+        valid = None if bool(batch.valid[frames].all()) else batch.valid
         # Each block is written over the last: it is in the cache.
-        memory = torch.empty(
-            len(self.formed) * count * step * width, dtype=torch.float64, device=self._device
+        memory = self._gather.new_empty(
+            len(self.formed) * count * step * width, dtype=torch.float64
         )
-
-        def blocks() -> Iterator[Float[Tensor, "F B h W"]]:
-            for row in range(0, height, step):
-                at = frames, slice(row, row + step)
-                rest = (one if one is None else one[at] for one in others)
-                yield self._products(batch.radial_distance[at], *rest, memory=memory)
-
-        reduced = self._reduction.reduced(blocks())
-        functions, products = reduced.tensor_split([count * len(self._kept)])
-        sums = self._reduction.sums(functions), self._reduction.sums(products, 10)
-        by_frame = [part.unflatten(0, (-1, count)).transpose(0, 1).flatten(1) for part in sums]
-        return self._with_distance(torch.cat(by_frame, dim=1)[:, self._gather])
+        blocks = []
+        for row in range(0, height, step):
+            at = frames, slice(row, row + step)
+            others = (one if one is None else one[at] for one in (batch.amplitude, valid, weights))
+            products = self._products(batch.radial_distance[at], *others, memory=memory)
+            segments = products.view(len(products) * count, -1, len(along_row))
+            by_row = _product(segments, along_row).view(len(segments), -1, static.shape[2])
+            blocks.append(_product(along_column[row : row + step].T, by_row))
+        sums = torch.stack(blocks).sum(dim=0).flatten(1) @ static.flatten(1).T
+        by_frame = sums.unflatten(0, (-1, count)).transpose(0, 1).flatten(1)
+        return self._with_distance(by_frame[:, self._gather])
 
     def _products(
         self,
@@ -305,28 +284,22 @@ class MomentAccumulator:
             gram[:, :, :3] = centre * gram[:, :, 3:6] + scale * gram[:, :, place : place + 3]
         return gram
 
-    def _gather_index(self, product_of: Int[Tensor, "F F"]) -> Int[Tensor, "S S"]:
-        """Return, for each entry of the Gram matrix, which of a frame's sums it is.
 
-        First come those of each function of the frame with every static image, then those of the
-        other products, which only columns without a function of the pixel share, with the ray
-        products.
-        """
-        design, functions = self.design, len(self._kept)
-        columns = torch.arange(design.num_columns).repeat_interleave(3)
-        zero = torch.zeros(1, dtype=torch.long)
-        signal = torch.cat([design.signal[columns], zero])
-        pixel = torch.cat([design.pixel[columns], zero])
-        axis = torch.cat([torch.arange(3).repeat(design.num_columns), zero + 3])
-        left, right = torch.triu_indices(4, 4)
-        ray_product = torch.zeros(4, 4, dtype=torch.long)
-        ray_product[left, right] = ray_product[right, left] = torch.arange(10)
-        product = product_of[signal[:, None], signal]
-        static = design.pixel_pairs[pixel[:, None], pixel] * 10
-        static = static + ray_product[axis[:, None], axis]
-        num_static = self._reduction.num_static
-        of_others = functions * num_static + (product - functions) * 10 + static
-        return torch.where(product < functions, product * num_static + static, of_others)
+def _gather_index(design: Design, product_of: Int[Tensor, "F F"]) -> Int[Tensor, "S S"]:
+    """Return, for each entry of the Gram matrix, which of a frame's sums it is.
+
+    Each product of signal functions is summed over every static image, one product after the other.
+    """
+    columns = torch.arange(design.num_columns).repeat_interleave(3)
+    zero = torch.zeros(1, dtype=torch.long)
+    signal, pixel = (torch.cat([part[columns], zero]) for part in (design.signal, design.pixel))
+    axis = torch.cat([torch.arange(3).repeat(design.num_columns), zero + 3])
+    left, right = torch.triu_indices(4, 4)
+    ray_product = torch.zeros(4, 4, dtype=torch.long)
+    ray_product[left, right] = ray_product[right, left] = torch.arange(10)
+    static = design.pixel_pairs[pixel[:, None], pixel] * 10 + ray_product[axis[:, None], axis]
+    num_static = 10 * (int(design.pixel_pairs.max()) + 1)
+    return product_of[signal[:, None], signal] * num_static + static
 
 
 def _write_powers(
@@ -350,27 +323,13 @@ def _write_powers(
         torch.mul(before, scaled, out=row)
 
 
-def _static_products(design: Design, rows: Tensor | slice) -> Iterator[Float[Tensor, "10 h W"]]:
-    """Yield, for each pair of pixel functions, its product with the ten ray products.
-
-    Those are the distinct products of x, y, z and 1; each yield has shape (10, h, W), for h rows.
-    """
-    functions = design.pixel_functions[:, rows]
-    axes = torch.cat([design.ray_directions[rows].movedim(-1, 0), functions[:1]])
-    left, right = torch.triu_indices(4, 4)
-    rays = axes[left] * axes[right]
-    for product in range(int(design.pixel_pairs.max()) + 1):
-        a, b = (design.pixel_pairs == product).nonzero()[0]
-        yield functions[a] * functions[b] * rays
-
-
 def moments_of_few(
     design: Design, batch: Images, frame: int, weights: Float[Tensor, "B H W"] | None = None
 ) -> Float[Tensor, "S S"]:
     """Return the Gram matrix of one image, as `MomentAccumulator` does, pixel by used pixel.
 
-    The factored pass costs the same however many pixels are used; this one costs (3C + 1)^2 a used
-    pixel. A target that fills a small part of the image is quicker this way.
+    The factored pass costs the same however many pixels are used, and needs smooth images; this one
+    costs (3C + 1)^2 a used pixel. A target that fills a small part of the image is quicker so.
 
     Args:
         design: The columns.
@@ -381,89 +340,86 @@ def moments_of_few(
     Returns:
         Shape (S, S) with S = 3C + 1.
     """
-    valid = batch.valid[frame]
     size = 3 * design.num_columns + 1
-    gram = torch.zeros(size, size, dtype=torch.float64, device=valid.device)
+    gram = torch.zeros(size, size, dtype=torch.float64)
+    images = batch.radial_distance, batch.amplitude, weights
+    measured, amplitude, weight = (one if one is None else one[frame].cpu() for one in images)
+    assert measured is not None
     # The products of so many pixels stay in the processor's cache. Set by timing.
     for rows, columns in zip(
-        *(index.split(8_192) for index in torch.nonzero(valid, as_tuple=True)), strict=True
+        *(index.split(8_192) for index in torch.nonzero(batch.valid[frame].cpu(), as_tuple=True)),
+        strict=True,
     ):
-        distance = batch.radial_distance[frame, rows, columns].double()
-        given = distance if batch.amplitude is None else batch.amplitude[frame, rows, columns]
+        distance = measured[rows, columns].double()
+        given = distance if amplitude is None else amplitude[rows, columns]
         signal = design.signal_functions(distance, given.double())[design.signal]
         column = signal * design.pixel_functions[:, rows, columns][design.pixel]
         rays = design.ray_directions[rows, columns].T.to(column)
         products = torch.cat([(column[:, None] * rays).flatten(0, 1), torch.ones_like(column[:1])])
-        own = products if weights is None else products * weights[frame, rows, columns]
+        own = products if weight is None else products * weight[rows, columns]
         gram += own @ products.T
     return gram
 
 
-class PixelReduction:
-    """Sums products of frame images with fixed static images.
+def on_polynomials(design: Design) -> tuple[Tensor, ...]:
+    """Return the static images on polynomials along segments of rows and along columns.
 
-    Args:
-        static: Takes numbers of rows (h,), or a slice of them, and yields these rows of the static
-            images anew at each call, in groups of shape (G, h, W), float64.
-        height: Rows of an image, H.
-        device: Where the sums are formed.
+    The fewest polynomials are taken that represent every image to rounding, on the longest segments
+    of a row: each number that a row is projected to is projected along the columns as well.
 
-    Attributes:
-        size: To how many numbers an image is reduced; H W if it is not.
-        num_static: How many static images there are, S.
+    Returns:
+        Polynomials of a segment of a row, shape (w, n), and of a column, (H, k), and the images'
+        numbers on them, (S, k, W / w n). Nothing where none that are tried represent them.
     """
-
-    def __init__(self, static: StaticImages, height: int, device: str = "cpu") -> None:
-        along_row, projected = _along_rows(static, height)
-        along_column, projected = _along_columns(projected)
-        self._along_row = along_row if along_row is None else along_row.to(device)
-        self._along_column = along_column if along_column is None else along_column.T.to(device)
-        self._shape = projected.shape[1:]
-        # A thousand numbers that no static image has more of than this share change a sum by less
-        # than `_EXACT`, relative to the images' norms.
-        tiny = torch.finfo(projected.dtype).tiny
-        numbers = torch.nn.functional.normalize(projected.flatten(1), dim=1, eps=tiny).abs()
-        self._used = (numbers.amax(0) > _EXACT / 100).nonzero()[:, 0].to(device)
-        self._static = projected.flatten(1).T.to(device)[self._used].contiguous()
-        self.size, self.num_static = self._static.shape
-
-    def reduced(self, blocks: Iterable[Float[Tensor, "*B _ W"]]) -> Float[Tensor, "N k n"]:
-        """Return the reduction of images, given as blocks of rows, one after the other."""
-        row, whole = 0, None
-        for images in blocks:
-            height, count = images.shape[-2], images.shape[:-2].numel()
-            projected = images
-            if self._along_row is not None:
-                segments = images.reshape(count, -1, len(self._along_row))
-                projected = _products(segments, self._along_row)
-            projected = projected.reshape(count, height, self._shape[1])
-            if whole is None:
-                whole = projected.new_zeros(count, *self._shape)
-            if self._along_column is not None:
-                whole += _products(self._along_column[:, row : row + height], projected)
-            else:
-                whole[:, row : row + height] = projected
-            row += height
-        assert whole is not None
-        return whole
-
-    def sums(
-        self, reduced: Float[Tensor, "N k n"], number: int | None = None
-    ) -> Float[Tensor, "N S"]:
-        """Return sum_v images[n, v] static[s, v], shape (N, S), of reduced images.
-
-        Args:
-            reduced: The images.
-            number: How many static images, S, the first ones; None: all.
-        """
-        return reduced.flatten(1).index_select(1, self._used) @ self._static[:, :number]
-
-    def __call__(self, images: Float[Tensor, "*N H W"]) -> Float[Tensor, "N S"]:
-        """Return sum_v images[n, v] static[s, v], shape (N, S), of images (..., H, W)."""
-        return self.sums(self.reduced([images]))
+    height, width = design.pixel_functions.shape[1:]
+    for number, segments in product(_POLYNOMIALS, range(1, width + 1)):
+        if width % segments == 0 and 2 * number <= width // segments:
+            along_row = _polynomials(width // segments, number)
+            if (by_row := _by_row(design, along_row)) is not None:
+                break
+    else:
+        return ()
+    for number in _POLYNOMIALS:
+        along_column = _polynomials(height, number)
+        projected = _projected(by_row.mT, along_column)
+        if 2 * number <= height and projected is not None:
+            return along_row, along_column, projected.mT.contiguous()
+    return ()
 
 
-def _products(left: Tensor, right: Tensor) -> Float[Tensor, "N a c"]:
+def _by_row(design: Design, along_row: Float[Tensor, "w n"]) -> Float[Tensor, "S H m"] | None:
+    """Return the static images on polynomials of each segment of a row; None: not spanned.
+
+    They are the products of two pixel functions with the ten distinct products of x, y, z and 1.
+    """
+    numbers = range(int(design.pixel_pairs.max()) + 1)
+    pairs = torch.stack([(design.pixel_pairs == k).nonzero()[0] for k in numbers])
+    left, right = torch.triu_indices(4, 4)
+    found = []
+    # All images of so many rows take a few megabytes.
+    for rows in torch.arange(len(design.ray_directions)).split(16):
+        functions = design.pixel_functions[:, rows]
+        axes = torch.cat([design.ray_directions[rows].movedim(-1, 0), functions[:1]])
+        products = functions[pairs[:, 0]] * functions[pairs[:, 1]]
+        images = products[:, None] * (axes[left] * axes[right])
+        segments = images.view(images.shape[:2].numel(), -1, len(along_row))
+        if (projected := _projected(segments, along_row)) is None:
+            return None
+        found.append(projected.view(len(segments), len(rows), -1))
+    return torch.cat(found, dim=1)
+
+
+def _projected(
+    images: Float[Tensor, "S R w"], basis: Float[Tensor, "w n"]
+) -> Float[Tensor, "S R n"] | None:
+    """Return the lines of images on orthonormal functions; None where these do not span them."""
+    projected = _product(images, basis)
+    left = (images - _product(projected, basis.T)).abs().amax((1, 2))
+    exact = left <= _EXACT * images.abs().amax((1, 2))
+    return projected if bool(exact.all()) else None
+
+
+def _product(left: Tensor, right: Tensor) -> Float[Tensor, "N a c"]:
     """Return the products of matrices (N, a, b) and (b, c), or (a, b) and (N, b, c).
 
     On a CPU by NumPy: torch's library, Intel's, takes twice the time for thin matrices on an AMD
@@ -475,103 +431,8 @@ def _products(left: Tensor, right: Tensor) -> Float[Tensor, "N a c"]:
     return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))
 
 
-def _along_rows(
-    static: StaticImages, height: int
-) -> tuple[Float[Tensor, "w n"] | None, Float[Tensor, "S H m"]]:
-    """Return polynomials of a segment of a row, or None, and all static images projected."""
-    # A few rows, evenly spread, on which polynomials are tried before all rows are checked.
-    tried = torch.cat(list(static(torch.linspace(0, height - 1, min(height, 9)).long())))
-    factors, width = _factors(tried), tried.shape[-1]
-    mixed = torch.tensordot(factors, tried, dims=1)
-    # Up to 20 segments are tried, those first that cost the least. The projection along the columns
-    # costs as much for each number that a row is projected to as 48 multiplications of that along
-    # rows: about 24 polynomials at half the speed. Set by timing.
-    costs = sorted(
-        (number + 48 * segments * number / width, width // segments, number)
-        for segments in range(1, 21)
-        for number in _POLYNOMIALS
-        if width % segments == 0 and 2 * number <= width // segments
-    )
-    for _, length, number in costs:
-        basis = _polynomials(length, number)
-        if _left_over(basis, mixed) <= _EXACT:
-            projected = _projected(static, (height, width), basis, factors)
-            if projected is not None:
-                return basis, projected
-    return None, torch.cat(list(static(slice(None))))
-
-
-def _along_columns(
-    images: Float[Tensor, "S H m"],
-) -> tuple[Float[Tensor, "H n"] | None, Float[Tensor, "S k m"]]:
-    """Return polynomials of an image column, or None, and images projected onto them."""
-    height = images.shape[1]
-    mixed = torch.tensordot(_factors(images), images, dims=1).transpose(1, 2)
-    for number in _POLYNOMIALS:
-        if 2 * number > height:
-            break
-        basis = _polynomials(height, number)
-        left_over = _left_over(basis, mixed)
-        if left_over > 10 * _EXACT:
-            continue
-        projected = _products(basis.T, images)
-        if left_over > _EXACT:
-            # What a mixture leaves over may be the roundings of all images together.
-            off = (images - _products(basis, projected)).abs().amax((1, 2))
-            if bool((off > _EXACT * images.abs().amax((1, 2))).any()):
-                continue
-        return basis, projected
-    return None, images
-
-
 @lru_cache(maxsize=64)
 def _polynomials(length: int, number: int) -> Float[Tensor, "l n"]:
     """Return orthonormal polynomials on so many evenly spread points; shared, not to be written."""
     grid = np.linspace(-1, 1, length)
     return torch.linalg.qr(torch.as_tensor(chebvander(grid, number - 1))).Q
-
-
-def _projected(
-    static: StaticImages,
-    shape: tuple[int, int],
-    basis: Float[Tensor, "w n"],
-    factors: Float[Tensor, "M S"],
-) -> Float[Tensor, "S H m"] | None:
-    """Return all static images on the basis of each segment of a row; None: not spanned."""
-    height, width = shape
-    # Ten images of so many pixels stay in the cache. Set by hand.
-    step = max(1, 10_240 // width)
-    slabs: list[Tensor] = []
-    for row in range(0, height, step):
-        numbers: list[Tensor] = []
-        mixed = factors.new_zeros(len(factors), min(step, height - row) * width)
-        first = 0
-        for group in static(slice(row, row + step)):
-            segments = group.reshape(len(group), -1, len(basis))
-            numbers.append(_products(segments, basis).view(*group.shape[:2], -1))
-            mixed.addmm_(factors[:, first : first + len(group)], group.flatten(1))
-            first += len(group)
-        if _left_over(basis, mixed) > _EXACT:
-            return None
-        slabs.append(torch.cat(numbers))
-    return torch.cat(slabs, dim=1)
-
-
-def _factors(images: Float[Tensor, "S H W"]) -> Float[Tensor, "M S"]:
-    """Return the factors of images in random sums of them, each image scaled to at most 1.
-
-    Four sums are checked in place of all images: one that leaves over ten times `_EXACT` stays
-    hidden if four normal numbers are all below a tenth, once in 25,000 designs; one that leaves
-    over more stays hidden more rarely.
-    """
-    size = images.abs().amax((1, 2))
-    size = torch.where(size > 0, size, size.max().clamp(min=torch.finfo(size.dtype).tiny))
-    # No result depends on the seed.
-    generator = torch.Generator().manual_seed(0)
-    return torch.randn(4, len(images), generator=generator, dtype=size.dtype) / size
-
-
-def _left_over(basis: Float[Tensor, "w n"], mixed: Float[Tensor, "*M W"]) -> float:
-    """Return the largest number that the basis leaves of images, of which these are random sums."""
-    segments = mixed.reshape(-1, len(basis))
-    return float(torch.addmm(segments, segments @ basis, basis.T, alpha=-1).abs().max())
