@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from tofcorr.estimation.linear import ROUNDING, Curvature, solved
+from tofcorr.estimation.linear import ROUNDING, Curvature
 from tofcorr.estimation.moments import (
     LEAST_RESIDUAL,
     ImageMoments,
@@ -118,25 +118,29 @@ def minimise(
         return Solution(here, (float(equations.loss),), 0.0, "converged")
     found, damping = Solution(here), ROUNDING**0.5
     while equations.is_finite:
-        loss = float(equations.loss)
+        loss, hessian = float(equations.loss), equations.hessian
+        moves = curved(hessian)
+        kept = torch.where(moves[:, None] & moves, hessian, 0.0) + (~moves).to(hessian).diag()
+        curvature = Curvature(kept)
+        along = curvature.vectors.T @ torch.where(moves, curvature.scale * equations.gradient, 0.0)
         # The largest curvature is that of an unknown that moves every residual by about one metre.
         # So large are the sums of squared distances of which the loss is what is left.
-        summed = float(equations.hessian.diagonal().max())
+        summed = float(hessian.diagonal().max())
         variance = max(loss, LEAST_RESIDUAL**2 * summed) / objective.num_residuals
-        decrease = float(equations.gradient @ solved(equations.hessian, equations.gradient))
-        left = math.sqrt(max(decrease, 0.0) / variance)
-        found = Solution(here, (*found.history, loss), left)
+        decrease = float((along.square() / curvature.values.clamp(min=ROUNDING)).sum())
+        found = Solution(here, (*found.history, loss), math.sqrt(decrease / variance))
         if stopped := _stopped(found, options, watcher):
             return replace(found, stopped=stopped)
         # Beyond that, a step is too short to change the loss.
         while damping * ROUNDING < 1:
-            here = found.parameters.moved(-solved(equations.hessian, equations.gradient, damping))
+            damped = along / (curvature.values.clamp(min=0.0) + damping)
+            here = found.parameters.moved(-curvature.scale * (curvature.vectors @ damped))
             tried, damping = objective.normal_equations(here), damping * 10
             if float(tried.loss) <= loss + ROUNDING * summed:
                 break
         else:
             break
-        equations, damping = tried, max(damping / 100, torch.finfo(torch.float64).eps)
+        equations, damping = tried, max(damping / 100, ROUNDING)
     return replace(found, stopped="line_search_failed" if tried.is_finite else "not_finite")
 
 
