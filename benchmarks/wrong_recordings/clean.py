@@ -11,9 +11,7 @@ from tqdm import tqdm
 
 from benchmarks.renewed.real import import_kinect
 from tofcorr.data.recording import Recording
-from tofcorr.data.table import FrameRow
-from tofcorr.data.writing import write_recording
-from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.importing.distances import command as distances
 from tofcorr.options import resolve_options, shipped_names
 from tofcorr.pixels.dataset import Dataset, resolved_planes
 from tofcorr.plausibility.examine import examine
@@ -102,22 +100,8 @@ def _recordings(draws: int, shipped: int, seed: int, folder: Path) -> Iterator[t
     if shipped and real is not None:
         yield "Kinect v2", import_kinect(Path(real), folder / "real")
         for trial in sorted((Path(real) / "wall_trials_l3cx").glob("L3CX_*")):
-            yield trial.name, _write_trial(trial, folder / trial.name)
-
-
-def _write_trial(trial: Path, out: Path) -> Path:
-    """Write a robot's poses and the distances of a single pixel; nobody measured the wall."""
-    poses = np.loadtxt(trial / "transforms.csv", delimiter=",", usecols=range(16))
-    lines = (trial / "measurements.csv").read_text(encoding="utf-8").splitlines()
-    readings = [[float(cell) for cell in line.split(",")[1:] if cell.strip()] for line in lines]
-    poses = poses.reshape(-1, 4, 4)
-    left, _, right = np.linalg.svd(poses[:, :3, :3])
-    poses[:, :3, :3] = left @ right  # The file has it to six digits.
-    wall = {"normal_world": np.array([0.0, 0.0, -1.0]), "offset": 1.0, "target": "wall"}
-    rows = [FrameRow(timestamp=float(k), world_from_tool=p, **wall) for k, p in enumerate(poses)]
-    depth = np.array([[[np.median(one) / 1e3]] for one in readings])
-    # The ray of a single pixel is the optical axis.
-    axis = CameraIntrinsics(width=1, height=1, matrix=((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0)))
-    how = {"camera": axis, "depth_kind": "radial", "planes": "estimated"}
-    write_recording(out, rows=rows, depth=depth, **how)
-    return out
+            out = folder / trial.name
+            distances.main(
+                [str(trial), "--depth-unit-mm", "1", "--out", str(out)], standalone_mode=False
+            )
+            yield trial.name, out

@@ -17,6 +17,7 @@ without a refusal:
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,39 +39,35 @@ GEOMETRY = {
     *("target_registration", "robot_kinematics", "timestamp_offset", "motion"),
     *("lens", "target_shape", "mixed_pixels"),
 }
-KINDS = (
-    "stopped",
-    "do not use",
-    "headline",
-    "within its errors",
-    "confident and wrong",
-    "traceback",
-)
+WRONG = ("confident and wrong", "traceback")
+KINDS = ("stopped", "do not use", "headline", "within its errors", *WRONG)
 """What may come of a command."""
-WRONG = KINDS[-2:]
 
 Said = dict[str, Any]
 """`headline`, `sentence`, and the numbers that a command's answer is judged by."""
 
 
+@dataclass(frozen=True)
 class Clean:
     """A clean recording with its truth, its calibration, and what each command says of it.
 
-    Args:
+    Attributes:
         folder: The recording.
         true_hand_eye: Shape (4, 4), metres.
         run: Folder for its calibration, made anew.
+        said: What each command said of it.
     """
 
-    def __init__(self, folder: Path, true_hand_eye: np.ndarray, run: Path) -> None:
-        self.true_hand_eye, self.run = true_hand_eye, run
-        self.folder, self._said = folder, dict[str, Said]()
+    folder: Path
+    true_hand_eye: np.ndarray
+    run: Path
+    said: dict[str, Said] = field(default_factory=dict)
 
     def says(self, command: str) -> Said:
         """Return what a command says of it; run once."""
-        if command not in self._said:
-            self._said[command] = COMMANDS[command][0](self.folder, self)
-        return self._said[command]
+        if command not in self.said:
+            self.said[command] = COMMANDS[command][0](self.folder, self)
+        return self.said[command]
 
     def calibration(self) -> Path:
         """Return the folder of its run; trained once."""
@@ -139,11 +136,8 @@ def _select(folder: Path, clean: Clean) -> Said:
 
 
 def _held_out(headline: str | None, error: float) -> Said:
-    return {
-        "headline": headline,
-        "sentence": headline or f"{error:.2f} mm held out",
-        "error_mm": error,
-    }
+    sentence = headline or f"{error:.2f} mm held out"
+    return {"headline": headline, "sentence": sentence, "error_mm": error}
 
 
 def _models(*names: str) -> list[dict[str, Any]]:

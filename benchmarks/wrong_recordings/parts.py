@@ -8,13 +8,24 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.table import FrameRow
+from tofcorr.data.table import FrameTable
 from tofcorr.data.writing import write_recording
+
+HEADER = (
+    *("camera", "depth_kind", "modulation_frequency", "saturation_amplitude"),
+    *("tool_from_camera", "planes"),
+)
+COLUMNS = {
+    "poses": "world_from_tool",
+    "normal": "normal_world",
+    **{name: name for name in ("offset", "target", "timestamp")},
+}
+IMAGES = {"depth": np.float32, "amplitude": np.float32, "mask": np.uint8}
 
 
 @dataclass(kw_only=True)
 class Parts:
-    """What a recording folder holds, as arrays; to be changed.
+    """What a recording folder holds, as arrays; images may be changed in place.
 
     Attributes:
         header: Keyword arguments of `write_recording` that are not arrays of frames.
@@ -40,70 +51,41 @@ class Parts:
 
     @property
     def rotation(self) -> np.ndarray:
-        """The rotations of the poses, shape (N, 3, 3), to be written to."""
+        """The rotations of the poses, shape (N, 3, 3)."""
         return self.poses[:, :3, :3]
 
     @property
     def place(self) -> np.ndarray:
-        """The translations of the poses, shape (N, 3), metres, to be written to."""
+        """The translations of the poses, shape (N, 3), metres."""
         return self.poses[:, :3, 3]
 
     @classmethod
     def read(cls, folder: Path | str) -> Self:
         """Read a recording whole; conditions and pose ids are left out."""
         one = Recording.open(folder)
-        return cls(
-            header={
-                "camera": one.camera,
-                "depth_kind": one.depth_kind,
-                "modulation_frequency": one.modulation_frequency,
-                "saturation_amplitude": one.saturation_amplitude,
-                "tool_from_camera": np.array(one.tool_from_camera),
-                "planes": one.planes,
-            },
-            poses=one.frames.world_from_tool.copy(),
-            normal=one.frames.normal_world.copy(),
-            offset=one.frames.offset.copy(),
-            target=one.frames.target.copy(),
-            timestamp=one.frames.timestamp.copy(),
-            depth=np.array(one.depth),
-            amplitude=None if one.amplitude is None else np.array(one.amplitude),
-            mask=None if one.mask is None else np.array(one.mask),
-        )
+        images = {name: one.read(name, np.arange(one.num_frames)) for name in IMAGES}
+        columns: Any = {own: getattr(one.frames, name) for own, name in COLUMNS.items()}
+        return cls(header={name: getattr(one, name) for name in HEADER}, **columns, **images)
 
-    def changed(self, **parts: np.ndarray | None) -> Self:
-        """Return a copy with other parts."""
-        return replace(self, **parts)
-
-    def with_header(self, **entries: object) -> Self:
-        """Return a copy with other entries of the header."""
-        return replace(self, header=self.header | entries)
+    def changed(self, **parts: Any) -> Self:  # noqa: ANN401 - arrays, or entries of the header
+        """Return a copy with other parts: fields, `place`, `rotation`, or entries of the header."""
+        poses = np.array(parts.pop("poses", self.poses))
+        poses[:, :3, 3] = parts.pop("place", poses[:, :3, 3])
+        poses[:, :3, :3] = parts.pop("rotation", poses[:, :3, :3])
+        header = {name: parts.pop(name) for name in HEADER if name in parts}
+        return replace(self, poses=poses, header=self.header | header, **parts)
 
     def frames(self, chosen: np.ndarray | slice) -> Self:
         """Return some frames, in this order."""
-        names = ("poses", "normal", "offset", "target", "timestamp", "depth", "amplitude", "mask")
-        arrays = {name: getattr(self, name) for name in names}
+        arrays = {name: getattr(self, name) for name in (*COLUMNS, *IMAGES)}
         return replace(self, **{name: a[chosen] for name, a in arrays.items() if a is not None})
 
     def write(self, folder: Path | str) -> Path:
         """Write the recording; nothing may be there yet."""
-        columns = zip(
-            self.timestamp.tolist(),
-            self.poses,
-            self.normal,
-            self.offset.tolist(),
-            self.target.tolist(),
-            strict=True,
-        )
-        names = ("timestamp", "world_from_tool", "normal_world", "offset", "target")
-        write_recording(
-            folder,
-            rows=[FrameRow(**dict(zip(names, row, strict=True))) for row in columns],
-            depth=self.depth.astype(np.float32),
-            amplitude=None if self.amplitude is None else self.amplitude.astype(np.float32),
-            mask=None if self.mask is None else self.mask.astype(np.uint8),
-            **self.header,
-        )
+        rows = FrameTable(**{name: getattr(self, own) for own, name in COLUMNS.items()})
+        given = {name: (getattr(self, name), kind) for name, kind in IMAGES.items()}
+        images: Any = {k: None if a is None else a.astype(kind) for k, (a, kind) in given.items()}
+        write_recording(folder, rows=rows, **images, **self.header)
         return Path(folder)
 
 

@@ -126,9 +126,9 @@ def test_waves_of_the_error_over_metres_are_the_cameras_where_the_frequency_is_k
     frequency = 120e6
     wave = 299_792_458.0 / (2 * frequency) / 4
     waved = parts.changed(depth=parts.depth + 0.03 * np.sin(2 * np.pi / wave * parts.depth))
-    known = waved.with_header(modulation_frequency=frequency).write(tmp_path / "known")
+    known = waved.changed(modulation_frequency=frequency).write(tmp_path / "known")
     assert inspect(known).headline is None
-    unknown = waved.with_header(modulation_frequency=None).write(tmp_path / "unknown")
+    unknown = waved.changed(modulation_frequency=None).write(tmp_path / "unknown")
     assert "modulation_frequency_hz" in str(inspect(unknown).headline)
 
 
@@ -208,7 +208,7 @@ def test_no_clean_recording_is_stopped_and_hardly_any_is_doubted(tmp_path: Path)
 
 def test_estimated_planes_may_lie_anywhere(parts: Parts, tmp_path: Path) -> None:
     turned = TABLE["planes 40 deg off"](parts, np.random.default_rng(1))
-    folder = turned.with_header(planes="estimated").write(tmp_path / "estimated")
+    folder = turned.changed(planes="estimated").write(tmp_path / "estimated")
     assert not inspect(folder).impossible
     assert inspect(folder, planes="known").impossible
 
