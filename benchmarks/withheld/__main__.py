@@ -1,6 +1,6 @@
 """`python -m benchmarks.withheld`: the regression set, and pairs of a camera and a simulator."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.renewed.real import write_real
@@ -24,7 +24,6 @@ from benchmarks.sealed.scores import (
     scores_table,
     set_sizes,
     share_score,
-    shares_of,
     unknown,
     wrong,
 )
@@ -60,104 +59,100 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
         tier: [one for one in outcomes if one.tier == tier and one.role == "main"] for tier in TIERS
     }
     find = {tier: [one for one in cases if one.must_find] for tier, cases in main.items()}
+    again = {one.answer["main"]: one for one in outcomes if one.role in ("fresh", "cured")}
     scores = [
-        *_single(find["A"], outcomes),
+        *_single(find["A"], again),
         *_several(main["B"]),
         *_nothing(main["C"]),
-        *_not_in_catalogue("D", find, 0.95),
-        *_not_in_catalogue("E", find, 0.85),
-        *_confounded(main["F"], outcomes),
+        *_not_in_catalogue(find),
+        *_confounded(main["F"], find["F"], again),
         *_missing(main["G"]),
-        *_others(main, find),
+        *_few_and_noisy(find["H"], main["I"]),
+        *_other_base(main["J"]),
         *_real([one for one in outcomes if one.tier == "K"]),
         share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
     ]
     return [one for one in scores if one.count], scores_table(scores)
 
 
-def _single(cases: Sequence[Outcome], outcomes: Sequence[Outcome]) -> list[Score]:
+def _single(cases: Sequence[Outcome], fresh: Mapping[str, Outcome]) -> list[Score]:
     """Tier A: one effect that can be found."""
     said = [one for one in cases if named(one)]
-    closed = [
-        one.said.report["gap_mm"]["closed_fraction"] / one.oracle.closed_fraction for one in said
-    ]
-    fresh = {one.answer["main"]: one for one in outcomes if one.role == "fresh"}
-    again = [(one, fresh[one.name]) for one in said if one.name in fresh]
-    shrinkage = "shrinkage against the oracle, median"
+    closed = [_closed(one) / one.oracle.closed_fraction for one in said]
+    both = [(one, fresh[one.name]) for one in said if one.name in fresh]
+    seen_again = "closed_ci holds what a fresh session shows"
     return [
-        *shares_of("A", cases, {"named first": (named_first, at_least(0.85))}),
-        *shares_of("A", cases, {"in the set": (right, at_least(0.95))}),
+        share_score("A", "named first", cases, named_first, at_least(0.85)),
+        share_score("A", "in the set", cases, right, at_least(0.95)),
         mean_score("A", "size of the set", set_sizes(cases), at_most(1.5)),
-        *shares_of("A", cases, {"something named": (named,)}),
-        quantile_score("A", shrinkage, closed, 0.5, at_least(0.9)),
+        share_score("A", "something named", cases, named),
+        quantile_score("A", "shrinkage against the oracle, median", closed, 0.5, at_least(0.9)),
         quantile_score("A", "the same, 10th percentile", closed, 0.1, at_least(0.6)),
-        *shares_of(
-            "A", again, {"closed_ci holds what a fresh session shows": (_holds, at_least(0.9))}
-        ),
+        share_score("A", seen_again, both, lambda pair: _holds(*pair), at_least(0.9)),
     ]
 
 
-def _holds(pair: tuple[Outcome, Outcome]) -> bool | None:
+def _closed(one: Outcome) -> float:
+    return one.said.report["gap_mm"]["closed_fraction"]
+
+
+def _holds(one: Outcome, again: Outcome) -> bool | None:
     """Whether the interval holds the closed share of another session with the same names."""
-    one, again = (one.said for one in pair)
-    if set(one.effects) != set(again.effects):
+    if set(one.said.effects) != set(again.said.effects):
         return None
-    low, high = one.report["gap_mm"]["closed_ci"]
-    return low <= again.report["gap_mm"]["closed_fraction"] <= high
+    low, high = one.said.report["gap_mm"]["closed_ci"]
+    return low <= _closed(again) <= high
 
 
 def _several(cases: Sequence[Outcome]) -> list[Score]:
     """Tier B: two or three effects."""
     wanted = [(one, name) for one in cases for name in sorted(one.must_find)]
-    said = [(one, name) for one in cases for name in one.said.effects]
+    said = [name in one.truths for one in cases for name in one.said.effects]
     limits = bootstrap(cases, macro_f1)
     return [
         Score("B", "macro-F1", macro_f1(cases), limits, len(cases), at_least(0.75)),
-        *shares_of("B", wanted, {"in a set, of the effects findable": (lambda x: _covers(*x),)}),
-        *shares_of("B", said, {"precision": (lambda pair: pair[1] in pair[0].truths,)}),
+        share_score("B", "in a set, of the effects findable", wanted, lambda pair: _covers(*pair)),
+        share_score("B", "precision", said, bool),
     ]
 
 
 def _nothing(cases: Sequence[Outcome]) -> list[Score]:
     """Tier C: no effect, or one of 0.2 mm."""
-    nulls = {
-        "named though nothing is there": (named, at_most(0.08)),
-        "called unknown": (unknown,),
-        "detected": (detected,),
-    }
-    nearly = {"a false name beside 0.2 mm": (lambda one: bool({*one.said.effects} - one.truths),)}
+    nulls = [one for one in cases if not one.truths]
+    nearly = [set(one.said.effects) - one.truths for one in cases if one.truths]
     return [
-        *shares_of("C", [one for one in cases if not one.truths], nulls),
-        *shares_of("C", [one for one in cases if one.truths], nearly),
+        share_score("C", "named though nothing is there", nulls, named, at_most(0.08)),
+        share_score("C", "called unknown", nulls, unknown),
+        share_score("C", "detected", nulls, detected),
+        share_score("C", "a false name beside 0.2 mm", nearly, bool),
     ]
 
 
-def _not_in_catalogue(tier: str, find: dict[str, list[Outcome]], target: float) -> list[Score]:
+def _not_in_catalogue(find: Mapping[str, Sequence[Outcome]]) -> list[Score]:
     """Tiers D and E: effects that the catalogue does not have."""
-    positives, negatives = ([one.said.abstains for one in find[name]] for name in (tier, "A"))
-    what = "AUROC of abstention against tier A"
-    judges = {"called unknown": (unknown,), "a wrong single name": (wrong,)}
-    area = area_score(tier, what, positives, negatives, at_least(target))
-    return [area, *shares_of(tier, find[tier], judges)]
+    scores = []
+    for tier, target in (("D", 0.95), ("E", 0.85)):
+        positives, negatives = ([one.said.abstains for one in find[name]] for name in (tier, "A"))
+        what = "AUROC of abstention against tier A"
+        scores += [
+            area_score(tier, what, positives, negatives, at_least(target)),
+            share_score(tier, "called unknown", find[tier], unknown),
+            share_score(tier, "a wrong single name", find[tier], wrong),
+        ]
+    return scores
 
 
-def _confounded(cases: Sequence[Outcome], outcomes: Sequence[Outcome]) -> list[Score]:
+def _confounded(
+    cases: Sequence[Outcome], must: Sequence[Outcome], cured: Mapping[str, Outcome]
+) -> list[Score]:
     """Tier F: designs that confound effects, each with a sound session."""
-    cured = {one.answer["main"]: one for one in outcomes if one.role == "cured"}
-    must = [one for one in cases if one.must_find]
-
-    def resolved(one: Outcome) -> bool:
-        return one.name in cured and cured[one.name].said.sets == (one.truths,)
-
-    judges = {
-        "sets that a sound session resolves": (resolved,),
-        "advice that names the remedy": (_advises,),
-    }
     open_ = [one for one in must if one.said.sets and len(one.said.sets[0]) > 1]
+    resolved = [one.name in cured and cured[one.name].said.sets == (one.truths,) for one in open_]
     return [
-        *shares_of("F", must, {"truth in the set": (right, at_least(0.9))}),
-        *shares_of("F", cases, {"a wrong single name": (wrong, at_most(0.05))}),
-        *shares_of("F", open_, judges),
+        share_score("F", "truth in the set", must, right, at_least(0.9)),
+        share_score("F", "a wrong single name", cases, wrong, at_most(0.05)),
+        share_score("F", "sets that a sound session resolves", resolved, bool),
+        share_score("F", "advice that names the remedy", open_, _advises),
     ]
 
 
@@ -168,14 +163,12 @@ def _advises(one: Outcome) -> bool:
 
 def _missing(cases: Sequence[Outcome]) -> list[Score]:
     """Tier G: columns or files missing."""
-    blind = {
-        "says that the effect cannot be judged": (_says_unavailable,),
-        "a wrong single name": (wrong,),
-    }
+    blind = [one for one in cases if not one.case["judged"]]
     seen = [one for one in cases if one.case["judged"] and one.must_find]
     return [
-        *shares_of("G", [one for one in cases if not one.case["judged"]], blind),
-        *shares_of("G", seen, {"in the set where it can be judged still": (right,)}),
+        share_score("G", "says that the effect cannot be judged", blind, _says_unavailable),
+        share_score("G", "a wrong single name", blind, wrong),
+        share_score("G", "in the set where it can be judged still", seen, right),
     ]
 
 
@@ -184,29 +177,31 @@ def _says_unavailable(one: Outcome) -> bool:
     return any(row["effect"] == one.truth and not row["available"] for row in ranking)
 
 
-def _others(main: dict[str, list[Outcome]], find: dict[str, list[Outcome]]) -> list[Score]:
-    """Tiers H, I and J: few frames, other noise, a base of another form."""
-    few = {n: [one for one in find["H"] if one.case["design"]["frames"] == n] for n in (15, 30, 60)}
-    nulls = [one for one in main["I"] if not one.truths]
-    kinds = {one.case["noise"]: [] for one in sorted(nulls, key=lambda one: one.case["noise"])}
-    for one in nulls:
-        kinds[one.case["noise"]].append(one)
-    found = [one for one in find["J"] if len(one.truths) > 1]
-    own = {
-        "named though not there": (_falsely_named,),
-        "the base's own term in a set": (lambda one: _covers(one, one.case["base"]),),
-    }
-    beside = {
-        "the effect in a set": (lambda one: _covers(one, *(one.truths - {one.case["base"]})),)
-    }
+def _few_and_noisy(few: Sequence[Outcome], noisy: Sequence[Outcome]) -> list[Score]:
+    """Tiers H and I: few frames, other noise."""
+    scores = []
+    for what, judge in (("named", named), ("in the set", right)):
+        for n in (15, 30, 60):
+            some = [one for one in few if one.case["design"]["frames"] == n]
+            scores.append(share_score("H", f"{n} frames: {what}", some, judge))
+    nulls = [one for one in noisy if not one.truths]
+    found = [one for one in noisy if one.truths and one.must_find]
+    scores.append(share_score("I", "named though nothing is there", nulls, named))
+    for kind in sorted({one.case["noise"] for one in nulls}):
+        some = [one for one in nulls if one.case["noise"] == kind]
+        scores.append(share_score("I", f"the same, {kind}", some, named))
+    return [*scores, share_score("I", "in the set", found, right)]
+
+
+def _other_base(cases: Sequence[Outcome]) -> list[Score]:
+    """Tier J: a base of another form, alone or beside an effect."""
+    own = [_covers(one, one.case["base"]) for one in cases]
+    beside = [one for one in cases if one.must_find and len(one.truths) > 1]
+    found = [_covers(one, *(one.truths - {one.case["base"]})) for one in beside]
     return [
-        *(share_score("H", f"{n} frames: named", cases, named) for n, cases in few.items()),
-        *(share_score("H", f"{n} frames: in the set", cases, right) for n, cases in few.items()),
-        share_score("I", "named though nothing is there", nulls, named),
-        *(share_score("I", f"the same, {kind}", cases, named) for kind, cases in kinds.items()),
-        share_score("I", "in the set", [one for one in find["I"] if one.truths], right),
-        *shares_of("J", main["J"], own),
-        *shares_of("J", found, beside),
+        share_score("J", "named though not there", cases, _falsely_named),
+        share_score("J", "the base's own term in a set", own, bool),
+        share_score("J", "the effect in a set", found, bool),
     ]
 
 
@@ -222,16 +217,12 @@ def _falsely_named(one: Outcome) -> bool:
 
 def _real(cases: Sequence[Outcome]) -> list[Score]:
     """Tier K: what is named of what was done to real images."""
-    done = {role: [one for one in cases if one.role == role] for role in ("term", "added")}
-    judges = {"in a set": right, "named first": named_first}
-    return [
-        *(
-            share_score("K", f"{role}: {what}", some, judge)
-            for role, some in done.items()
-            for what, judge in judges.items()
-        ),
-        *shares_of("K", done["added"], {NEW_NAME: (names_something_new(cases),)}),
-    ]
+    scores = []
+    for role in ("term", "added"):
+        some = [one for one in cases if one.role == role]
+        scores.append(share_score("K", f"{role}: in a set", some, right))
+        scores.append(share_score("K", f"{role}: named first", some, named_first))
+    return [*scores, share_score("K", NEW_NAME, some, names_something_new(cases))]
 
 
 main = Check(
