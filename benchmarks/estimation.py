@@ -16,10 +16,9 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from benchmarks.scene import camera_of, frames_in_memory, write_vga
+from benchmarks.scene import wall, write_vga
 from benchmarks.timing import JSON, machine, spread, timed, write
 from tofcorr.data.recording import FrameBatch, Recording
-from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
@@ -27,7 +26,6 @@ from tofcorr.estimation.solvers import Solution, initial_parameters, minimise
 from tofcorr.estimation.uncertainty import jackknife_covariance
 from tofcorr.fit.problem import build_model
 from tofcorr.geometry import se3
-from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.calibration import TrainingOptions
@@ -40,23 +38,26 @@ def model_options(name: str) -> ErrorModelOptions:
     return resolve_options(TrainingOptions, name).model
 
 
-def ours(
-    batch: FrameBatch, domain: Domain, options: ErrorModelOptions
-) -> tuple[ImageMoments, Solution]:
+def built(data: Dataset, name: str, num_frames: int | None = None) -> tuple[ErrorModel, Design]:
+    """Return a shipped model, and its columns over the domain of some frames."""
+    frames = np.arange(num_frames or data.num_frames)
+    return build_model(data, model_options(name), covered_domain(data, frames))
+
+
+def ours(batch: FrameBatch, design: Design) -> tuple[ImageMoments, Solution]:
     """Arrays in memory to converged parameters with covariance."""
-    rays = ray_directions(camera_of(domain.height, domain.width))
-    moments = MomentAccumulator(Design(ErrorModel(options, domain), domain, rays))(batch)
+    moments = MomentAccumulator(design)(batch)
     solution = minimise(MomentObjective(moments), initial_parameters(moments))
     jackknife_covariance(moments, solution.parameters)
     return moments, solution
 
 
-def folds(batch: FrameBatch, domain: Domain, generator: torch.Generator) -> None:
+def folds(data: Dataset, batch: FrameBatch, generator: torch.Generator) -> None:
     """Six folds of three models, and their held-out errors."""
     count = len(batch.indices)
     order = torch.randperm(count, generator=generator)
     for name in ("e0", "ea", "eb"):
-        moments, whole = ours(batch, domain, model_options(name))
+        moments, whole = ours(batch, built(data, name)[1])
         for held_out in order.chunk(NUM_FOLDS):
             kept = torch.ones(count, dtype=torch.bool)
             kept[held_out] = False
@@ -115,20 +116,21 @@ def _body_derivative(twist: np.ndarray) -> np.ndarray:
     return torch.autograd.functional.jacobian(body, x).numpy()  # type: ignore[union-attr]
 
 
-def compare(repeats: int) -> dict[str, Any]:
+def compare(path: Path, repeats: int) -> dict[str, Any]:
     """Run both on 62 frames of 50 x 64 pixels."""
-    batch, domain = frames_in_memory(62, camera_of(50, 64), torch.Generator().manual_seed(1))
-    rays, options = ray_directions(camera_of(50, 64)), model_options("ea")
-    moments, solution = ours(batch, domain, options)
-    start, error = initial_parameters(moments), ErrorModel(options, domain)
-    loss, transform, note = scipy_fit(batch, error, rays, start)
+    data = Dataset((wall(path, 62, 50, 64),))
+    (batch,) = data.batches(chunk_pixels=2**20)
+    model, design = built(data, "ea")
+    moments, solution = ours(batch, design)
+    fitted = (batch, model, data.ray_directions(), initial_parameters(moments))
+    loss, transform, note = scipy_fit(*fitted)
     apart = 1e3 * float((solution.parameters.tool_from_camera - transform)[:3, 3].norm())
     off = abs(loss / solution.loss - 1)
     draws = torch.Generator().manual_seed(2)
     jobs = {
-        "tofcorr": lambda: ours(batch, domain, options),
-        "scipy lm, analytic jacobian": lambda: scipy_fit(batch, error, rays, start),
-        "tofcorr, 6 folds x 3 models": lambda: folds(batch, domain, draws),
+        "tofcorr": lambda: ours(batch, design),
+        "scipy lm, analytic jacobian": lambda: scipy_fit(*fitted),
+        "tofcorr, 6 folds x 3 models": lambda: folds(data, batch, draws),
     }
     seconds = {name: np.array(times) for name, times in timed(jobs, repeats).items()}
     base = np.median(seconds["tofcorr"])
@@ -140,16 +142,14 @@ def compare(repeats: int) -> dict[str, Any]:
     return {"pixels": int(batch.valid.sum()), "rows": rows, "agreement": agreement}
 
 
-def scale(num_frames: int, repeats: int) -> dict[str, object]:
+def scale(path: Path, num_frames: int, repeats: int) -> dict[str, object]:
     """Read VGA frames from disk: pixels a second, memory, and growth with the frames."""
     sizes = (num_frames // 2, num_frames)
     context = get_context("spawn")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "vga"
-        write_vga(path, num_frames)
-        # The two sizes take turns, each in a process of its own, so that both see the same machine.
-        with ProcessPoolExecutor(1, context, max_tasks_per_child=1) as pool:
-            runs = list(pool.map(read_and_sum, [path] * 2 * repeats, sizes * repeats))
+    write_vga(path, num_frames)
+    # The two sizes take turns, each in a process of its own, so that both see the same machine.
+    with ProcessPoolExecutor(1, context, max_tasks_per_child=1) as pool:
+        runs = list(pool.map(read_and_sum, [path] * 2 * repeats, sizes * repeats))
     half, whole = np.array(runs[::2]), np.array(runs[1::2])
     return {
         "frames": num_frames,
@@ -163,9 +163,9 @@ def scale(num_frames: int, repeats: int) -> dict[str, object]:
 def read_and_sum(path: Path, num_frames: int) -> tuple[float, float, float]:
     """Return seconds and pixels of a pass over a recording, and the memory it took, MiB."""
     baseline, start = _status("VmRSS"), time.perf_counter()
-    dataset, frames = Dataset((Recording.open(path),)), np.arange(num_frames)
-    _, design = build_model(dataset, model_options("ea"), covered_domain(dataset, frames))
-    pixels = float(dataset.moments(design, frames).count.sum())
+    data = Dataset((Recording.open(path),))
+    design = built(data, "ea", num_frames)[1]
+    pixels = float(data.moments(design, np.arange(num_frames)).count.sum())
     return time.perf_counter() - start, pixels, (_status("VmHWM") - baseline) / 1024
 
 
@@ -181,7 +181,10 @@ def _status(key: str) -> int:
 @JSON
 def main(repeats: int, scale_frames: int, out: Path | None) -> None:
     """Compare the speed of SciPy and tofcorr on the same arrays."""
-    result = compare(repeats) | {"scale": scale(scale_frames, repeats), "machine": machine()}
+    with tempfile.TemporaryDirectory() as folder:
+        result = compare(Path(folder) / "wall", repeats)
+        result["scale"] = scale(Path(folder) / "vga", scale_frames, repeats)
+    result["machine"] = machine()
     click.echo(f"62 x 50 x 64 pixels, EA ({result['machine']})")
     for name, row in result["rows"].items():
         low, middle, high = row["ratio"]

@@ -132,7 +132,8 @@ def _saved(save: Callable[[Any, Any], Any]) -> Callable[[Any], bytes]:
 
 def _save_array(values: Any, file: Any) -> None:  # noqa: ANN401 - any value
     if isinstance(values, dict):
-        np.savez(file, **{str(name): np.asarray(one) for name, one in values.items()})
+        arrays: Any = {str(name): np.asarray(one) for name, one in values.items()}
+        np.savez(file, **arrays)
     else:
         np.save(file, np.asarray(values), allow_pickle=False)
 

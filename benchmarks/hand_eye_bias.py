@@ -16,34 +16,45 @@ from pathlib import Path
 import click
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.coverage import fitted, hand_eye_error
 from benchmarks.levels import small_images
 from benchmarks.renewed.recording import record, write_recording
 from benchmarks.renewed.world import draw_world
 from benchmarks.sealed.scores import share, table
+from tofcorr.data.recording import Recording
 from tofcorr.estimation.robust import student_quantile
+from tofcorr.fit.fitting import fit
+from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.calibration import TrainingOptions
 
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")
 
 
 def one_recording(seed: int, number: int) -> np.ndarray:
-    """Draw and fit one recording.
+    """Draw and fit one recording, see `measured`."""
+    rng = np.random.default_rng([seed, 1, number])
+    with small_images("nothing"), tempfile.TemporaryDirectory() as folder:
+        world = draw_world(rng, None)
+        write_recording(Path(folder) / "recording", record(rng, world, [])[0])
+        options = resolve_options(TrainingOptions, "ea")
+        return measured(Path(folder) / "recording", options, world.tool_from_camera)
+
+
+def measured(recording: Path, options: TrainingOptions, tool_from_camera: np.ndarray) -> np.ndarray:
+    """Fit all frames of a recording, and compare with the true hand-eye transform.
 
     Returns:
         (6, 6), metres and radians of each component: error at the least loss; error with the shift
         taken off; half-widths by the scatter of poses, by that and the shift, and as stated; and
         the noise's shift.
     """
-    rng = np.random.default_rng([seed, 1, number])
-    with small_images("nothing"), tempfile.TemporaryDirectory() as folder:
-        world = draw_world(rng, None)
-        write_recording(Path(folder) / "recording", record(rng, world, [])[0])
-        found = fitted(Path(folder) / "recording", resolve_options(TrainingOptions, "ea"))
-    true = torch.as_tensor(world.tool_from_camera)
+    data, true = Dataset((Recording.open(recording),)), torch.as_tensor(tool_from_camera)
+    frames = np.arange(data.num_frames)
+    found = fit(data, frames, options, covered_domain(data, frames))
     quantile = student_quantile(0.975, found.covariance.degrees_of_freedom)
     shift = found.noise_shift.twist if found.noise_shift else torch.zeros(6).double()
     scatter = found.covariance.matrix[:6, :6]
@@ -56,6 +67,12 @@ def one_recording(seed: int, number: int) -> np.ndarray:
         for matrix in (scatter, scatter + torch.outer(shift, shift), found.hand_eye_covariance)
     ]
     return torch.stack([*errors, *half_widths, shift]).numpy()
+
+
+def hand_eye_error(true: Tensor, found: Tensor) -> Tensor:
+    """Return place and turn (2, 3) of a hand-eye transform off the true one, in camera axes."""
+    turn = se3.log(se3.assemble(true[:3, :3].T @ found[:3, :3], torch.zeros(3).double()))[3:]
+    return torch.stack([true[:3, :3].T @ (found - true)[:3, 3], turn])
 
 
 def tables(rows: list[np.ndarray]) -> str:

@@ -25,6 +25,7 @@ from tofcorr.correction.export.pt2 import export_pt2, load_pt2
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import Domain, Interval
+from tofcorr.simulation.options import CameraOptions
 
 # Height, width, frames that follow one another.
 CASES = ((50, 64, 8), (172, 224, 8), (480, 640, 8), (1024, 1024, 8), (480, 640, 1))
@@ -47,7 +48,7 @@ def calibration(height: int, width: int) -> CalibrationState:
         coefficients=torch.tensor(COEFFICIENTS, dtype=torch.float64),
         tool_from_camera=torch.eye(4, dtype=torch.float64),
         hand_eye_estimated=True,
-        camera=camera_of(height, width),
+        camera=CameraOptions(**camera_of(height, width)).intrinsics(),
         depth_kind="radial",
     )
 

@@ -1,11 +1,10 @@
 """One large recording, trained on by 1, 2 and 4 processes of torchrun.
 
-python -m benchmarks.shared_pass [--frames 977] [--processes 1 2 4] [--repeats 1]
+python -m benchmarks.shared_pass [--frames 977] [--processes 1 --processes 2] [--repeats 1]
 
 977 VGA frames are 300 million pixels and 2.4 GB on disk. Every process computes with one thread.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -13,6 +12,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+import click
 
 from benchmarks.scene import write_vga
 
@@ -34,22 +35,21 @@ def train(recording: Path, out: Path, processes: int) -> tuple[float, dict[str, 
     return seconds, json.loads((out / "report.json").read_text())["seconds"]
 
 
-def main() -> None:
+@click.command()
+@click.option("--frames", default=977, show_default=True)
+@click.option("--processes", multiple=True, default=(1, 2, 4), show_default=True)
+@click.option("--repeats", default=1, show_default=True)
+def main(frames: int, processes: tuple[int, ...], repeats: int) -> None:
     """Write the recording, train on it, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=977)
-    parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--repeats", type=int, default=1)
-    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "vga"
-        write_vga(recording, arguments.frames)
-        print(f"{arguments.frames * 480 * 640 / 1e6:.0f} million pixels, {os.cpu_count()} cores")
-        for round_number in range(arguments.repeats):
-            for processes in arguments.processes:
-                out = Path(folder) / f"run_{processes}_{round_number}"
-                seconds, stages = train(recording, out, processes)
-                print(f"{processes} processes: {seconds:.1f} s in all, fit {stages['fit']:.1f} s")
+        write_vga(recording, frames)
+        print(f"{frames * 480 * 640 / 1e6:.0f} million pixels, {os.cpu_count()} cores")
+        for round_number in range(repeats):
+            for number in processes:
+                out = Path(folder) / f"run_{number}_{round_number}"
+                seconds, stages = train(recording, out, number)
+                print(f"{number} processes: {seconds:.1f} s in all, fit {stages['fit']:.1f} s")
 
 
 if __name__ == "__main__":

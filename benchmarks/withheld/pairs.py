@@ -34,13 +34,11 @@ from benchmarks.sealed.command import Check
 from benchmarks.sealed.oracle import at_other_poses, counted, linearise
 from benchmarks.sealed.scores import (
     ANY,
-    Limits,
     Score,
     at_least,
     at_most,
     known,
     scores_table,
-    share,
     share_score,
 )
 from benchmarks.withheld.tiers import TEXTBOOK
@@ -275,30 +273,17 @@ def _held_out(
     return ideal, arrays | fields
 
 
-@dataclass(frozen=True)
-class Degraded:
-    """Degraded frames of another session, whose poses and conditions the diagnosis never saw.
+def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> dict[str, float] | None:
+    """Compare a pair's degraded frames with what the camera would measure; None without any.
 
-    Neither side of a gap has noise, so that no floor is taken off. `own_mm` is what the camera
-    leaves at the poses of the recording: the last stage, known exactly. `oracle_mm` is what least
-    squares leave in the other session if they know the effect but for its strength, and are fitted
-    to the recording as well. Pixels count whose distance and amplitude lie within those of the
-    recording. `error_of_square` is the standard error of the square of the gap, with stations as
-    the unit, mm^2.
+    They are of another session, whose poses and conditions the diagnosis never saw. Neither side of
+    a gap has noise, so that no floor is taken off. `own_mm` is what the camera leaves at the poses
+    of the recording: the last stage, known exactly. `oracle_mm` is what least squares leave in the
+    other session if they know the effect but for its strength, and are fitted to the recording as
+    well. Pixels count whose distance and amplitude lie within those of the recording.
+    `error_of_square` is the standard error of the square of the gap, with stations as the unit,
+    mm^2; `missing` is a share of the pixels on the target.
     """
-
-    gap_mm: float
-    error_of_square: float
-    own_mm: float
-    oracle_mm: float
-    noise_mm: float
-    true_noise_mm: float
-    missing: float  # share of the pixels on the target
-    true_missing: float
-
-
-def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> Degraded | None:
-    """Compare a pair's degraded frames with what the camera would measure; None without any."""
     parts = [out / part / name for part in ("degraded", "expected", "own")]
     if not all((part / "depth.npy").exists() for part in parts):
         return None
@@ -318,16 +303,16 @@ def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> Degraded |
     both = np.isfinite(deviation) & np.isfinite(true)
     noise = [1e3 * float(np.sqrt(np.mean(x[both] ** 2))) for x in (deviation, sigma)]
     on_target = np.load(out / "degraded" / name / "mask.npy") > 0
-    return Degraded(
-        gap_mm=gap,
-        error_of_square=error,
-        own_mm=gap_of(left, load(out, name, "sigma"), real.columns["pose_id"])[0],
-        oracle_mm=gap_of(oracle_error(real, ideal, fields), sigma, stations)[0],
-        noise_mm=noise[0],
-        true_noise_mm=noise[1],
-        missing=float(np.mean(~drawn.valid[on_target])),
-        true_missing=float(np.mean(~np.isfinite(true[on_target]))),
-    )
+    return {
+        "gap_mm": gap,
+        "error_of_square": error,
+        "own_mm": gap_of(left, load(out, name, "sigma"), real.columns["pose_id"])[0],
+        "oracle_mm": gap_of(oracle_error(real, ideal, fields), sigma, stations)[0],
+        "noise_mm": noise[0],
+        "true_noise_mm": noise[1],
+        "missing": float(np.mean(~drawn.valid[on_target])),
+        "true_missing": float(np.mean(~np.isfinite(true[on_target]))),
+    }
 
 
 def within(other: Data, recording: Data) -> np.ndarray:
@@ -374,166 +359,55 @@ def oracle_error(real: Data, ideal: Data, fields: list[tuple[Array, Array]]) -> 
     return error
 
 
-@dataclass(frozen=True)
-class Judged:
-    """One pair; each judgement is None where it was not measured."""
+Held = dict[str, bool | None]
+"""What is held against the truth, by figure; None was not measured."""
 
-    outcome: Outcome
-    degraded: Degraded | None = None
+DEGRADED_NEAR = "degraded frames within 1.1 times the last stage"
+TARGETS = {
+    "gap as given within 5 %": at_least(0.95),
+    "first number of the verdict within 5 %": at_least(0.95),
+    "every share within 0.05": at_least(0.9),
+    "effect in its set": at_least(0.95),
+    "something else named": at_most(0.05),
+    "an effect named that both have": at_most(0.05),
+    "an effect named though none is missing": at_most(0.05),
+}
 
-    @property
-    def truth(self) -> dict[str, Any]:
-        """Sealed truth of the pair."""
-        return self.outcome.answer["truth"]
 
-    @property
-    def failed(self) -> bool:
-        """Whether the program ended with an error."""
-        return bool(self.outcome.said.failure)
+def judge(one: Outcome, found: Mapping[str, float] | None = None) -> Held:
+    """Hold what was said of one pair, and degraded frames, against the truth.
 
-    @property
-    def report(self) -> dict[str, Any]:
-        """The diagnosis; empty if there is none."""
-        return self.outcome.said.report
-
-    def stage(self, name: str) -> dict[str, Any]:
-        """A stage: its gap in millimetres and interval; empty if there is none."""
-        return {row["name"]: row for row in self.report.get("stages") or []}.get(name, {})
-
-    def size_right(self) -> bool | None:
-        """Whether the gap as given has its true size."""
-        return _near(self.stage("as_given").get("gap_mm"), self.truth["as_given_mm"], self.failed)
-
-    def verdict_right(self) -> bool | None:
-        """Whether the first number of the verdict, which people read, is the gap as given."""
-        first = re.search(r"(\d+\.\d+) mm", self.report.get("verdict") or "")
-        return _near(first and float(first[1]), self.truth["as_given_mm"], self.failed)
-
-    def no_gap(self) -> bool | None:
-        """Whether the gap as given is no larger than poses vary, where there is none."""
-        said = self.stage("as_given").get("gap_mm")
-        return None if said is None else said <= NOTHING_MM
-
-    def share_errors(self) -> dict[str, float]:
-        """Share that was said minus the true one, of every cause that is there or was said.
-
-        What was said of an effect whose set holds the true one is said of the true one.
-        """
-        errors = {name: -share for name, share in self.truth["shares"].items()}
-        for row in self.report["attribution"]:
-            name = self._meant(row["cause"])
-            errors[name] = errors.get(name, 0.0) + row["share"]
-        return errors
-
-    def shares_right(self) -> bool | None:
-        """Whether every share of the attribution is right."""
-        if self.failed or not self.report.get("attribution"):
-            return False if self.failed else None
-        return all(abs(error) <= WITHIN for error in self.share_errors().values())
-
-    def shares_covered(self) -> list[bool]:
-        """Whether each share that was said has the true one in its interval."""
-        true = self.truth["shares"]
-        return [
-            row["ci"][0] <= true.get(self._meant(row["cause"]), 0.0) <= row["ci"][1]
-            for row in self.report.get("attribution") or []
-            if row.get("ci") and row["kind"] != "unexplained"
-        ]
-
-    @property
-    def sets(self) -> list[frozenset[str]]:
-        """The sets named, in the names that the checks use."""
-        return [known(members) for members in self.outcome.said.sets]
-
-    def _meant(self, cause: str) -> str:
-        (cause,) = known([cause])
-        for members in self.sets:
-            for true in self.outcome.truths:
-                if {cause, true} <= members and cause not in ("hand_eye", *TERMS):
-                    return true
-        return cause
-
-    def in_set(self) -> bool | None:
-        """Whether the withheld effect is in a set that was named."""
-        return any(self.outcome.truth in members for members in self.sets)
-
-    def in_set_if_findable(self) -> bool | None:
-        """The same, only where the oracle finds the effect."""
-        return self.in_set() if self.outcome.must_find else None
-
-    def false_names(self) -> set[str]:
-        """Effects named whose set holds nothing that is withheld."""
-        pairs = zip(self.outcome.said.effects, self.sets, strict=False)
-        return {name for name, members in pairs if not members & self.outcome.truths}
-
-    def named_falsely(self) -> bool | None:
-        """Whether an effect is named that is not withheld."""
-        return None if self.failed else bool(self.false_names())
-
-    def shared_named(self) -> bool | None:
-        """Whether an effect is named that both have, other than beside the true one in its set."""
-        both = set(self.outcome.case["shared"])
-        return bool(both & self.false_names()) if both and not self.failed else None
-
-    def noise_right(self) -> bool | None:
-        """Whether the ratio of the noises is right."""
-        block = self.report.get("noise") or {}
-        real, sim = block.get("real_mm"), block.get("sim_mm")
-        return _near(real / sim if real and sim else None, self.truth["noise_ratio"])
-
-    def dropouts_right(self) -> bool | None:
-        """Whether both shares of missing pixels are right."""
-        block = self.report.get("dropouts") or None
-        return block and all(
-            abs(block[f"{who}_share"] - self.truth[f"{who}_dropouts"]) <= DROPOUT_WITHIN
-            for who in ("real", "sim")
-        )
-
-    def amplitude_right(self) -> bool | None:
-        """Whether the ratio of the amplitudes is right."""
-        block = self.report.get("amplitude") or {}
-        return _near(block.get("ratio"), self.truth["amplitude_ratio"])
-
-    def near_stage(self, gap_mm: float | None = None) -> bool | None:
-        """Whether degraded frames, or such a gap, are as near as the stage with effects says."""
-        stage = self.stage("with_effects").get("gap_mm")
-        if self.degraded is None or stage is None:
-            return None
-        gap = self.degraded.gap_mm if gap_mm is None else gap_mm
-        return gap <= MOST * max(stage, LEAST_GAP_MM)
-
-    def oracle_near(self) -> bool | None:
-        """The same of an oracle's fit to the same recording."""
-        return None if self.degraded is None else self.near_stage(self.degraded.oracle_mm)
-
-    def not_worse(self) -> bool | None:
-        """Whether degraded frames are as near, or not significantly farther (one-sided, 5 %).
-
-        Squares are compared, for these have normal errors; that of the stage is in its interval.
-        """
-        near, stage = self.near_stage(), self.stage("with_effects")
-        if near is not False or self.degraded is None or not stage.get("ci"):
-            return near
-        excess = self.degraded.gap_mm**2 - (MOST * stage["gap_mm"]) ** 2
-        error = MOST**2 * (stage["ci"][1] ** 2 - stage["ci"][0] ** 2) / (2 * TWO_SIDED)
-        return excess <= ONE_SIDED * math.hypot(error, self.degraded.error_of_square)
-
-    def kept(self) -> bool | None:
-        """Whether they are as near as at the poses that the camera was fitted to."""
-        found = self.degraded
-        return found and found.gap_mm <= MOST * max(found.own_mm, LEAST_GAP_MM)
-
-    def as_noisy(self) -> bool | None:
-        """Whether they are as noisy as the camera's."""
-        found = self.degraded
-        return found and abs(found.noise_mm / found.true_noise_mm - 1) <= 2 * WITHIN
-
-    def as_many_missing(self) -> bool | None:
-        """Whether as many pixels are missing as in the camera's frames."""
-        if self.degraded is None:
-            return None
-        off = abs(self.degraded.missing - self.degraded.true_missing)
-        return off <= max(2 * WITHIN * self.degraded.true_missing, DROPOUT_WITHIN)
+    A failed run is wrong in size, shares and cause.
+    """
+    truth, report, failed = one.answer["truth"], one.said.report, bool(one.said.failure)
+    stages = {row["name"]: row for row in report.get("stages") or []}
+    given = stages.get("as_given", {}).get("gap_mm")
+    sets = [known(members) for members in one.said.sets]
+    named = zip(one.said.effects, sets, strict=False)
+    false = {name for name, members in named if not members & one.truths}
+    if not truth["shares"]:
+        return {
+            "runs that failed": failed,
+            "gap as given at most 1 mm": None if given is None else given <= NOTHING_MM,
+            "an effect named though none is missing": None if failed else bool(false),
+            **_blocks_right(report, truth),
+        }
+    # The first number of the verdict is what people read.
+    first, shared = re.search(r"(\d+\.\d+) mm", report.get("verdict") or ""), {*one.case["shared"]}
+    in_set = any(members & one.truths for members in sets)
+    return {
+        "runs that failed": failed,
+        "gap as given within 5 %": _near(given, truth["as_given_mm"], failed),
+        "first number of the verdict within 5 %": _near(
+            first and float(first[1]), truth["as_given_mm"], failed
+        ),
+        "every share within 0.05": _shares_right(one, sets),
+        "effect in its set": in_set,
+        "effect in its set, of those findable": in_set if one.must_find else None,
+        "something else named": None if failed else bool(false),
+        "an effect named that both have": bool(shared & false) if shared and not failed else None,
+        **_degraded_right(one, stages.get("with_effects", {}), found),
+    }
 
 
 def _near(said: float | None, true: float | None, failed: bool = False) -> bool | None:
@@ -542,64 +416,95 @@ def _near(said: float | None, true: float | None, failed: bool = False) -> bool 
     return abs(said / true - 1) <= WITHIN
 
 
-Judge = Callable[[Judged], bool | None]
+def _blocks_right(report: Mapping[str, Any], truth: Mapping[str, Any]) -> Held:
+    """Whether noise, missing pixels and amplitude are right."""
+    noise, lost = report.get("noise") or {}, report.get("dropouts")
+    real, sim = noise.get("real_mm"), noise.get("sim_mm")
+    off = [lost[f"{who}_share"] - truth[f"{who}_dropouts"] for who in ("real", "sim") if lost]
+    ratio = (report.get("amplitude") or {}).get("ratio")
+    return {
+        "noise ratio within 5 %": _near(real / sim if real and sim else None, truth["noise_ratio"]),
+        "dropout shares within 0.002": max(map(abs, off)) <= DROPOUT_WITHIN if off else None,
+        "amplitude ratio within 5 %": _near(ratio, truth["amplitude_ratio"]),
+    }
 
 
-def _shown(judge: Judge) -> Judge:
-    """The same judgement, of effects that depth images can show."""
-    return lambda one: None if one.outcome.truths & BEYOND_IMAGES else judge(one)
+def _meant(one: Outcome, cause: str, sets: Sequence[frozenset[str]]) -> str:
+    """A cause; what was said of an effect whose set holds the true one is said of the true one."""
+    (cause,) = known([cause])
+    for members in sets:
+        for true in one.truths:
+            if {cause, true} <= members and cause not in ("hand_eye", *TERMS):
+                return true
+    return cause
 
 
-Rows = list[tuple[str, Judge, Limits]]
-GAP: Rows = [
-    ("gap as given within 5 %", Judged.size_right, at_least(0.95)),
-    ("first number of the verdict within 5 %", Judged.verdict_right, at_least(0.95)),
-    ("every share within 0.05", Judged.shares_right, at_least(0.9)),
-]
-CAUSE: Rows = [
-    ("effect in its set", Judged.in_set, at_least(0.95)),
-    ("effect in its set, of those findable", Judged.in_set_if_findable, ANY),
-    ("something else named", Judged.named_falsely, at_most(0.05)),
-    ("an effect named that both have", Judged.shared_named, at_most(0.05)),
-]
-NOTHING: Rows = [
-    ("gap as given at most 1 mm", Judged.no_gap, ANY),
-    ("an effect named though none is missing", Judged.named_falsely, at_most(0.05)),
-    ("noise ratio within 5 %", Judged.noise_right, ANY),
-    ("dropout shares within 0.002", Judged.dropouts_right, ANY),
-    ("amplitude ratio within 5 %", Judged.amplitude_right, ANY),
-]
-DEGRADED: Rows = [
-    ("degraded frames within 1.1 times the last stage", Judged.near_stage, ANY),
-    ("the same, of effects that a depth image can show", _shown(Judged.near_stage), ANY),
-    ("these, or not significantly more", _shown(Judged.not_worse), ANY),
-    ("these, within 1.1 times what the stage truly leaves", _shown(Judged.kept), ANY),
-    ("the last stage, by an oracle's fit to the same frames", _shown(Judged.oracle_near), ANY),
-    ("noise of degraded frames within 10 %", Judged.as_noisy, ANY),
-    ("their missing pixels within 10 % or 0.002", _shown(Judged.as_many_missing), ANY),
-]
+def _shares_right(one: Outcome, sets: Sequence[frozenset[str]]) -> bool | None:
+    """Whether every share that is there or was said is right."""
+    if one.said.failure or not one.said.report.get("attribution"):
+        return False if one.said.failure else None
+    errors = {name: -share for name, share in one.answer["truth"]["shares"].items()}
+    for row in one.said.report["attribution"]:
+        name = _meant(one, row["cause"], sets)
+        errors[name] = errors.get(name, 0.0) + row["share"]
+    return all(abs(error) <= WITHIN for error in errors.values())
 
 
-def score_pairs(judged: Sequence[Judged]) -> list[Score]:
-    """All scores of the kinds that are there; a failed run is wrong in size, shares and cause."""
-    scores = []
-    for kind in KINDS:
-        cases = [one for one in judged if one.outcome.tier == kind]
-        gap = any(one.truth["shares"] for one in cases)
-        rows = [*GAP, *CAUSE, *DEGRADED] if gap else NOTHING
-        scores.append(share_score(kind, "runs that failed", cases, lambda one: one.failed))
-        scores += [share_score(kind, what, cases, judge, target) for what, judge, target in rows]
-        if gap:
-            held = share(found for one in cases for found in one.shares_covered())
-            what = "single shares in their intervals"
-            scores.append(Score(kind, what, held.value, held.interval, held.total))
-    return [one for one in scores if one.count]
+def shares_covered(one: Outcome) -> list[bool]:
+    """Whether each share that was said has the true one in its interval."""
+    true, sets = one.answer["truth"]["shares"], [known(members) for members in one.said.sets]
+    return [
+        row["ci"][0] <= true.get(_meant(one, row["cause"], sets), 0.0) <= row["ci"][1]
+        for row in one.said.report.get("attribution") or []
+        if row.get("ci") and row["kind"] != "unexplained"
+    ]
+
+
+def _degraded_right(
+    one: Outcome, stage: Mapping[str, Any], found: Mapping[str, float] | None
+) -> Held:
+    """Whether degraded frames are as near, as noisy and as full as they should be.
+
+    *Not significantly more*: squares are compared, for these have normal errors (one-sided, 5 %);
+    that of the stage is in its interval.
+    """
+    if found is None or "gap_mm" not in stage:
+        return {}
+    most = MOST * max(stage["gap_mm"], LEAST_GAP_MM)
+    near = found["gap_mm"] <= most
+    excess = found["gap_mm"] ** 2 - (MOST * stage["gap_mm"]) ** 2
+    low, high = stage["ci"]
+    error = math.hypot(MOST**2 * (high**2 - low**2) / (2 * TWO_SIDED), found["error_of_square"])
+    noise, lost = found["noise_mm"] / found["true_noise_mm"], found["true_missing"]
+    of_images: Held = {
+        "the same, of effects that a depth image can show": near,
+        "these, or not significantly more": near or excess <= ONE_SIDED * error,
+        "these, within 1.1 times what the stage truly leaves": (
+            found["gap_mm"] <= MOST * max(found["own_mm"], LEAST_GAP_MM)
+        ),
+        "the last stage, by an oracle's fit to the same frames": found["oracle_mm"] <= most,
+        "their missing pixels within 10 % or 0.002": (
+            abs(found["missing"] - lost) <= max(2 * WITHIN * lost, DROPOUT_WITHIN)
+        ),
+    }
+    if one.truths & BEYOND_IMAGES:
+        of_images = dict.fromkeys(of_images)
+    noise_right = abs(noise - 1) <= 2 * WITHIN
+    return {DEGRADED_NEAR: near, **of_images, "noise of degraded frames within 10 %": noise_right}
 
 
 def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]:
-    """All figures, and them as text."""
-    judged = [Judged(one, read_degraded(out, one.name, one.answer)) for one in outcomes]
-    scores = score_pairs(judged)
+    """All figures of the kinds that are there, and them as text."""
+    scores: list[Score] = []
+    for kind in KINDS:
+        cases = [one for one in outcomes if one.tier == kind]
+        held = [judge(one, read_degraded(out, one.name, one.answer)) for one in cases]
+        for what in dict.fromkeys(what for row in held for what in row):
+            judged = [row.get(what) for row in held]
+            scores.append(share_score(kind, what, judged, lambda one: one, TARGETS.get(what, ANY)))
+        covered = [found for one in cases for found in shares_covered(one)]
+        scores.append(share_score(kind, "single shares in their intervals", covered, bool))
+    scores = [one for one in scores if one.count]
     return scores, scores_table(scores)
 
 

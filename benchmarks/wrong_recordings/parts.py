@@ -63,9 +63,9 @@ class Parts:
     def read(cls, folder: Path | str) -> Self:
         """Read a recording whole; conditions and pose ids are left out."""
         one = Recording.open(folder)
-        images = {name: one.read(name, np.arange(one.num_frames)) for name in IMAGES}
-        columns: Any = {own: getattr(one.frames, name) for own, name in COLUMNS.items()}
-        return cls(header={name: getattr(one, name) for name in HEADER}, **columns, **images)
+        parts: dict[str, Any] = {own: getattr(one.frames, name) for own, name in COLUMNS.items()}
+        parts |= {name: one.read(name, np.arange(one.num_frames)) for name in IMAGES}
+        return cls(header={name: getattr(one, name) for name in HEADER}, **parts)
 
     def changed(self, **parts: Any) -> Self:  # noqa: ANN401 - arrays, or entries of the header
         """Return a copy with other parts: fields, `place`, `rotation`, or entries of the header."""

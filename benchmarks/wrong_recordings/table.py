@@ -394,7 +394,7 @@ UNLISTED: dict[str, Fault] = {
     "a board 30 mm before the wall": to(
         place=lambda p, g: p.place + 0.03 * p.normal * (p.target == p.target[-1])[:, None]
     ),
-    "amplitude one frame late": to(amplitude=lambda p, g: np.roll(p.amplitude, 1, axis=0)),
+    "amplitude one frame late": to(amplitude=lambda p, g: np.roll(np.array(p.amplitude), 1, 0)),
     "images rolled by two columns": of_images(lambda images: np.roll(images, 2, axis=2)),
     "half of the poses of another flange": to(poses=other_flange),
     "a robot 4 % too long": to(place=lambda p, g: either(1.04, g) * p.place),

@@ -14,12 +14,13 @@ from benchmarks.renewed.recording import Data, read
 from benchmarks.sealed.answers import Outcome, Said
 from benchmarks.sealed.oracle import Oracle
 from benchmarks.withheld.pairs import (
+    DEGRADED_NEAR,
     KINDS,
-    Degraded,
-    Judged,
+    TARGETS,
     gap_of,
+    judge,
     oracle_error,
-    score_pairs,
+    shares_covered,
     within,
     write_pair,
 )
@@ -129,79 +130,68 @@ def test_what_no_pixel_of_a_recording_was_like_does_not_count(tmp_path: Path) ->
     assert not within(farther, camera).any()
 
 
-def judged(
-    sets: list[list[str]],
-    degraded: Degraded | None = None,
-    shared: tuple[str, ...] = (),
-    **more: Any,
-) -> Judged:
+def outcome(sets: list[list[str]], shared: tuple[str, ...] = (), **more: Any) -> Outcome:
     effects = [members[0] for members in sets]
     stages = [
         {"name": "as_given", "gap_mm": 10.2, "ci": [9.0, 11.0]},
         {"name": "with_effects", "gap_mm": 1.0, "ci": [0.9, 1.1]},
     ]
-    attribution = [
-        {"cause": "distance", "share": 0.4, "ci": [0.3, 0.45], "kind": "parameter"},
-        {
-            "cause": effects[0] if effects else "lens",
-            "share": 0.6,
-            "ci": [0.5, 0.7],
-            "kind": "effect",
-        },
-    ]
-    report = {"stages": stages, "attribution": attribution, "verdict": "Differ by 10.3 mm."} | more
+    named = {"cause": [*effects, "lens"][0], "share": 0.6, "ci": [0.5, 0.7], "kind": "effect"}
+    distance = {"cause": "distance", "share": 0.4, "ci": [0.3, 0.45], "kind": "parameter"}
+    report = {"stages": stages, "attribution": [distance, named], "verdict": "Differ by 10.3 mm."}
+    truth = {"as_given_mm": 10.0, "shares": {"distance": 0.42, "lens": 0.58}}
     answer = {
         "case": {"tier": "ideal", "shared": list(shared)},
         "sizes_mm": {"lens": 5.0},
-        "truth": {
-            "as_given_mm": 10.0,
-            "shares": {"distance": 0.42, "lens": 0.58},
-            "noise_ratio": 2.0,
-        }
-        | {"real_dropouts": 0.01, "sim_dropouts": 0.0, "amplitude_ratio": 1.0},
+        "truth": truth,
     }
-    said = Said(tuple(effects), tuple(map(frozenset, sets)), report=report)
-    return Judged(Outcome("r", answer, Oracle(5.0, 1.0, {"lens": 9.0}), said), degraded)
+    said = Said(tuple(effects), tuple(map(frozenset, sets)), report=report | more)
+    return Outcome("r", answer, Oracle(5.0, 1.0, {"lens": 9.0}), said)
 
 
 def test_size_share_and_cause_by_hand() -> None:
-    one = judged([["target_shape", "lens"]])
-    assert one.size_right()
-    assert one.verdict_right()
-    assert one.shares_right()
-    assert one.shares_covered() == [True, True]
-    assert one.in_set()
-    assert not one.named_falsely()
-    assert judged([["warm_up"]]).named_falsely()
-    assert judged([["warm_up"]]).shares_right() is False
-    assert judged([["warm_up"]], shared=("warm_up",)).shared_named()
-    assert not judged([["warm_up", "lens"]], shared=("warm_up",)).shared_named()
+    one = outcome([["target_shape", "lens"]])
+    held = judge(one)
+    assert held["gap as given within 5 %"]
+    assert held["first number of the verdict within 5 %"]
+    assert held["every share within 0.05"]
+    assert shares_covered(one) == [True, True]
+    assert held["effect in its set"]
+    assert not held["something else named"]
+    held = judge(outcome([["warm_up"]], ("warm_up",)))
+    assert held["something else named"]
+    assert held["every share within 0.05"] is False
+    assert held["an effect named that both have"]
+    both = judge(outcome([["warm_up", "lens"]], ("warm_up",)))
+    assert not both["an effect named that both have"]
 
 
 def test_a_report_without_stages_and_blocks_is_not_measured() -> None:
-    one = judged([["lens"]], stages=None, attribution=None, verdict="")
-    blocks = (one.noise_right, one.dropouts_right, one.amplitude_right, one.near_stage)
-    for judge in (one.size_right, one.verdict_right, one.shares_right, *blocks):
-        assert judge() is None
+    one = outcome([["lens"]], stages=None, attribution=None, verdict="")
+    held = judge(one, NEAR)
+    for what in (*list(TARGETS)[:3], DEGRADED_NEAR):
+        assert held.get(what) is None
     noise = {"real_mm": 4.1, "sim_mm": 2.0}
     dropouts = {"real_share": 0.011, "sim_share": 0.0}
-    told = judged([["lens"]], noise=noise, dropouts=dropouts, amplitude={"ratio": 1.2})
-    assert (told.noise_right(), told.dropouts_right(), told.amplitude_right()) == (
-        True,
-        True,
-        False,
-    )
+    one = outcome([], noise=noise, dropouts=dropouts, amplitude={"ratio": 1.2})
+    blocks = {"noise_ratio": 2.0, "real_dropouts": 0.01, "sim_dropouts": 0.0}
+    one.answer["truth"] = {"shares": {}, "amplitude_ratio": 1.0, **blocks}
+    assert [*judge(one).values()] == [False, False, False, True, True, False]
+
+
+NEAR = {
+    "gap_mm": 1.05, "error_of_square": 0.1, "own_mm": 1.0, "oracle_mm": 0.9,
+    "noise_mm": 4.2, "true_noise_mm": 4.0, "missing": 0.01, "true_missing": 0.011,
+}
 
 
 def test_degraded_frames_are_held_against_the_last_stage() -> None:
-    near = Degraded(1.05, 0.1, 1.0, 0.9, 4.2, 4.0, 0.01, 0.011)
-    far = Degraded(3.0, 0.1, 1.0, 0.9, 6.0, 4.0, 0.05, 0.01)
-    one, other = judged([["lens"]], near), judged([["lens"]], far)
-    for judge in ("near_stage", "not_worse", "kept", "oracle_near", "as_noisy", "as_many_missing"):
-        assert getattr(one, judge)(), judge
-        assert bool(getattr(other, judge)()) is (judge == "oracle_near"), judge
-    figures = {score.what: score.value for score in score_pairs([one, other])}
-    assert figures["degraded frames within 1.1 times the last stage"] == 0.5
+    far = NEAR | {"gap_mm": 3.0, "noise_mm": 6.0, "missing": 0.05, "true_missing": 0.01}
+    plain = judge(outcome([["lens"]]))
+    one, other = (judge(outcome([["lens"]]), found) for found in (NEAR, far))
+    for what in one.keys() - plain.keys():
+        assert one[what], what
+        assert other[what] is ("oracle" in what), what
 
 
 @pytest.mark.slow
@@ -211,6 +201,7 @@ def test_the_verdict_says_the_gap_of_the_simulator_as_given(seed: int, tmp_path:
     answer = json.loads((tmp_path / "answers" / entry["id"] / "answer.json").read_text())
     folder, options = tmp_path / "recordings", {"simulate_anew": False, "page": False}
     found = tofcorr.diagnose(folder / entry["id"], folder / entry["sim"], options)
+    effects = dict.fromkeys(answer["sizes_mm"], 9.0)
     said = Said(report={"verdict": found.verdict})
-    one = Judged(Outcome("r", answer, Oracle(5.0, 1.0, {}), said))
-    assert one.verdict_right()
+    held = judge(Outcome("r", answer, Oracle(5.0, 1.0, effects), said))
+    assert held["first number of the verdict within 5 %"]
