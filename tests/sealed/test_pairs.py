@@ -179,10 +179,10 @@ def test_a_report_without_stages_and_blocks_is_not_measured() -> None:
     assert [*judge(one).values()] == [False, False, False, True, True, False]
 
 
-NEAR = {
-    "gap_mm": 1.05, "error_of_square": 0.1, "own_mm": 1.0, "oracle_mm": 0.9,
-    "noise_mm": 4.2, "true_noise_mm": 4.0, "missing": 0.01, "true_missing": 0.011,
-}
+# Gaps, an error of a square, noise and missing pixels of degraded frames, see `read_degraded`.
+FIGURES = ("gap_mm", "error_of_square", "own_mm", "oracle_mm", "noise_mm", "true_noise_mm")
+NEAR = dict(zip(FIGURES, (1.05, 0.1, 1.0, 0.9, 4.2, 4.0), strict=True))
+NEAR |= {"missing": 0.01, "true_missing": 0.011}
 
 
 def test_degraded_frames_are_held_against_the_last_stage() -> None:
