@@ -5,7 +5,7 @@ configuration: a shipped name, a file, a mapping or options that exist already.
 """
 
 import reprlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
@@ -237,13 +237,11 @@ def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold an
         ConfigError: The text is not YAML, or its aliases expand to too much.
     """
     try:
-        _refuse_depth(text, where)
-        loader = _LOADER(text)  # Refuses control characters already.
-        root = loader.get_single_node()
-        if root is None:
-            return None
-        _refuse_expansion(root, where)
-        return loader.construct_document(root)
+        events = yaml.parse(text, Loader=_LOADER)  # Refuses control characters already.
+        for event in events:
+            if isinstance(event, yaml.NodeEvent):
+                _size(event, events, {}, where, 0)
+        return _LOADER(text).get_single_data()
     except ConfigError:
         raise
     except _NOT_YAML as error:
@@ -264,66 +262,59 @@ def dump_yaml(values: Mapping[str, Any], last: str = "") -> str:
     return yaml.dump(ordered, Dumper=_DUMPER, sort_keys=False, allow_unicode=True, width=100)
 
 
-def _refuse_depth(text: str, where: str) -> None:
-    """Refuse a document that is nested too deeply, or holds too much, before it is built."""
-    depth = 0
-    for number, event in enumerate(yaml.parse(text, Loader=_LOADER)):
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        if depth > _DEEPEST:
-            raise ConfigError(
-                f"{where}: lists and mappings are nested more than {_DEEPEST} levels deep in line "
-                f"{event.start_mark.line + 1}."
-            )
-        if number > 2 * _MOST_NODES:
-            raise ConfigError(f"{where}: more than {_MOST_NODES} values; that is no configuration.")
+def _size(
+    event: yaml.NodeEvent,
+    further: Iterator[yaml.Event],
+    sizes: dict[str | None, int | None],
+    where: str,
+    depth: int,
+) -> int:
+    """Return how many values an entry means, aliases written out, before any of it is built.
 
+    Args:
+        event: Begins the entry.
+        further: The events after it; read to the end of the entry.
+        sizes: The number found of each anchor; None while its entry is read.
+        where: What to call the source in an error message.
+        depth: How many lists and mappings the entry stands in.
 
-def _refuse_expansion(root: yaml.Node, where: str) -> None:
-    """Refuse a document whose aliases, written out, make too many nodes or have no end."""
-    sizes: dict[int, int | None] = {}  # By id of the node; None while its children are counted.
-
-    def size(node: yaml.Node) -> int:
-        known = sizes.get(id(node), 0)
+    Raises:
+        ConfigError: It is nested too deeply, means too much or has no end; or a key stands twice in
+            a mapping, of which YAML would silently take the last.
+    """
+    line = event.start_mark.line + 1
+    if isinstance(event, yaml.AliasEvent):
+        known = sizes.get(event.anchor, 1)  # The parser itself refuses an unknown anchor.
         if known is None:
-            line = node.start_mark.line + 1
             raise ConfigError(f"{where}: the alias in line {line} repeats the entry that holds it.")
-        if known:
-            return known
-        sizes[id(node)] = None
-        _refuse_doubled(node, where)
-        total = 1 + sum(size(child) for child in _children(node))
-        if total > _MOST_NODES:
+        return known
+    if depth > _DEEPEST:
+        raise ConfigError(
+            f"{where}: lists and mappings are nested more than {_DEEPEST} levels deep in line "
+            f"{line}."
+        )
+    size, keys, sizes[event.anchor] = 1, set[str](), None
+    for number, child in enumerate(further if isinstance(event, yaml.CollectionStartEvent) else ()):
+        if not isinstance(child, yaml.NodeEvent):
+            break
+        if isinstance(event, yaml.MappingStartEvent) and number % 2 == 0:
+            key = (
+                child.value if isinstance(child, yaml.ScalarEvent) else "<<"
+            )  # A merge may repeat.
+            if key in keys - {"<<"}:
+                line = child.start_mark.line + 1
+                raise ConfigError(
+                    f"{where}: the key '{one_line(key)}' in line {line} stands twice."
+                )
+            keys.add(key)
+        size += _size(child, further, sizes, where, depth + 1)
+        if size > _MOST_NODES:
             raise ConfigError(
                 f"{where}: more than {_MOST_NODES} values once its aliases are written out; "
                 "the limit keeps a small file from filling the memory."
             )
-        sizes[id(node)] = total
-        return total
-
-    size(root)
-
-
-def _refuse_doubled(node: yaml.Node, where: str) -> None:
-    """Refuse a key that stands twice in one mapping: YAML would silently take the last."""
-    if not isinstance(node, yaml.MappingNode):
-        return
-    seen: set[str] = set()
-    for key, _ in node.value:
-        name = key.value if isinstance(key, yaml.ScalarNode) else None
-        if name in seen and name != "<<":
-            line = key.start_mark.line + 1
-            raise ConfigError(f"{where}: the key '{one_line(name)}' in line {line} stands twice.")
-        if name is not None:
-            seen.add(name)
-
-
-def _children(node: yaml.Node) -> list[yaml.Node]:
-    if isinstance(node, yaml.MappingNode):
-        return [one for pair in node.value for one in pair]
-    return node.value if isinstance(node, yaml.SequenceNode) else []
+    sizes[event.anchor] = size
+    return size
 
 
 def load_options(cls: type[OptionsT], path: Path | str) -> OptionsT:
@@ -357,7 +348,7 @@ def resolve_options(
     values, where = _values_of(cls, config)
     if changes:
         where += " with " + one_line(", ".join(changes))
-        values = apply_changes(values, changes, lambda: _with_defaults(cls, values))
+        values = apply_changes(values, changes, _with_defaults(cls, values))
     return cls.from_mapping(values, where)
 
 
@@ -385,7 +376,7 @@ def _with_defaults(cls: type[Options], values: Mapping[str, Any]) -> Mapping[str
 
 
 def apply_changes(
-    values: Mapping[str, Any], changes: Iterable[str], defaults: Callable[[], Mapping[str, Any]]
+    values: Mapping[str, Any], changes: Iterable[str], defaults: Mapping[str, Any]
 ) -> Any:  # noqa: ANN401 - YAML may hold anything
     """Return `values` with single entries replaced; whether a key exists is not checked here.
 
@@ -393,8 +384,8 @@ def apply_changes(
         values: Keys and values, as YAML gives them; not modified.
         changes: `dotted.key=value`; the value is YAML, and an entry of a list is named by its
             index from zero.
-        defaults: Gives all keys with their defaults; asked when a change leads into a mapping or
-            list that `values` leaves out.
+        defaults: All keys with their defaults, for a change that leads into a mapping or list that
+            `values` leaves out.
 
     Raises:
         ConfigError: A change is not of this form, or leads into a value that has no entries.
@@ -408,25 +399,20 @@ def apply_changes(
                 "such as solver.max_iterations=30."
             )
         value = parse_yaml(text, f"'{one_line(change)}'")
-        values = _replaced(values, names, 0, value, defaults)
+        values = _replaced(values, defaults, names, 0, value)
     return values
 
 
-def _replaced(
-    here: Any,  # noqa: ANN401 - any YAML value
-    names: list[str],
-    depth: int,
-    value: object,
-    defaults: Callable[[], Mapping[str, Any]],
-) -> Any:  # noqa: ANN401
+def _replaced(here: Any, default: Any, names: list[str], depth: int, value: object) -> Any:  # noqa: ANN401 - any YAML value
     """Return the value below `names[:depth]` with the entry at `names` replaced."""
     if depth == len(names):
         return value
     above, name = ".".join(names[:depth]), names[depth]
     if here is None:
-        here = _default(defaults(), names[:depth])
+        here = {} if default is None else default
     if isinstance(here, Mapping):
-        return {**here, name: _replaced(here.get(name), names, depth + 1, value, defaults)}
+        below = default.get(name) if isinstance(default, Mapping) else None
+        return {**here, name: _replaced(here.get(name), below, names, depth + 1, value)}
     if not isinstance(here, list | tuple):
         raise ConfigError(
             one_line(f"'{'.'.join(names)}': '{above}' is the value {here!r}, ")
@@ -437,17 +423,10 @@ def _replaced(
         raise ConfigError(
             f"'{one_line(f'{above}.{name}')}': '{above}' is a list; its entries are {span}."
         )
-    changed = _replaced(here[int(name)], names, depth + 1, value, defaults)
-    return [changed if index == int(name) else one for index, one in enumerate(here)]
-
-
-def _default(here: Any, names: list[str]) -> Any:  # noqa: ANN401 - any YAML value
-    """Return the default at `names`, or an empty mapping where there is none."""
-    for name in names:
-        if isinstance(here, list):
-            here = {str(index): entry for index, entry in enumerate(here)}
-        here = here.get(name) if isinstance(here, Mapping) else None
-    return {} if here is None else here
+    changed = list(here)
+    below = dict(enumerate(default)).get(int(name)) if isinstance(default, list) else None
+    changed[int(name)] = _replaced(here[int(name)], below, names, depth + 1, value)
+    return changed
 
 
 def configs_folder() -> Path:
