@@ -204,15 +204,17 @@ ARRAYS: dict[str, Damage] = {
     r"depth\.npy: not a readable": truncated("depth.npy"),
 }
 VALUES: dict[str, Damage] = {
-    r"depth.*frame 3, row 1, column 2: 3\.4e\+38 is no distance": value("depth", (3, 1, 2), 3.4e38),
-    r"amplitude.*frame 4, row 2, column 3: negative amplitude -0\.5": value(
+    r"depth.*frame 3, row 1, column 2: 3\.4e\+38; expected metres": value(
+        "depth", (3, 1, 2), 3.4e38
+    ),
+    r"amplitude.*frame 4, row 2, column 3: -0\.5; expected 0 to 1e\+12": value(
         "amplitude", (4, 2, 3), -0.5
     ),
-    r"amplitude.*frame 4, row 2, column 3: no amplitude: 3e\+38": value(
+    r"amplitude.*frame 4, row 2, column 3: 3e\+38; expected 0 to": value(
         "amplitude", (4, 2, 3), 3e38
     ),
-    r"raw.*frame 4, A1, row 2, column 3: -3e\+38 is larger": value("raw", (4, 1, 2, 3), -3e38),
-    r"mask\.npy: frame 1, row 0, column 6: expected 0 or 1": value("mask", (1, 0, 6), 255),
+    r"raw.*frame 4, A1, row 2, column 3: -3e\+38; expected": value("raw", (4, 1, 2, 3), -3e38),
+    r"mask\.npy: frame 1, row 0, column 6: 255; expected 0 or 1": value("mask", (1, 0, 6), 255),
 }
 FILES = (MISSING, HEADERS, TEXTS, TABLES, CELLS, ARRAYS)
 REFUSALS = {message: damage for sort in (*FILES, VALUES) for message, damage in sort.items()}

@@ -11,7 +11,6 @@ from small_recordings import CAMERA, NUM_FRAMES, write_small_recording
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_point_clouds
-from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import ray_directions
 
 Frames = tuple[torch.Tensor, torch.Tensor]
@@ -57,20 +56,3 @@ def test_a_recording_without_amplitude_gives_points_without_it(tmp_path: Path) -
     write_point_clouds(nearer_by_a_tenth, recording, tmp_path / "clouds")
     _, values = read(tmp_path / "clouds" / "frame_005_before.ply")
     assert list(values) == ["x", "y", "z"]
-
-
-def test_a_folder_that_exists_is_not_overwritten(tmp_path: Path) -> None:
-    recording = Recording.open(write_small_recording(tmp_path / "wall"))
-    with pytest.raises(CalibrationDataError, match="not overwritten"):
-        write_point_clouds(nearer_by_a_tenth, recording, tmp_path)
-
-
-def test_an_interrupted_export_leaves_nothing(tmp_path: Path) -> None:
-    recording = Recording.open(write_small_recording(tmp_path / "wall"))
-
-    def stop(_: int) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_point_clouds(nearer_by_a_tenth, recording, tmp_path / "clouds", progress=stop)
-    assert [path.name for path in tmp_path.iterdir()] == ["wall"]

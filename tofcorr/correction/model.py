@@ -123,50 +123,19 @@ class CalibrationModel(nn.Module):
                 raise ValueError("The error model has an amplitude term: expected amplitudes.")
             amplitude = radial_distance
         corrected = radial_distance - self.error(radial_distance, amplitude, conditions)
-        return distance_to_plane(
-            corrected, ray_directions, normal_tool, offset_tool, self.hand_eye()
-        )
-
-
-def distance_to_plane(
-    radial_distance: Tensor,
-    ray_directions: Tensor,
-    normal_tool: Tensor,
-    offset_tool: Tensor,
-    tool_from_camera: Tensor,
-) -> Tensor:
-    """Return the signed distance of points, given by their distance along the ray, to a plane.
-
-    Args:
-        radial_distance: Shape (B, H, W), metres.
-        ray_directions: Unit rays in the camera frame, shape (H, W, 3).
-        normal_tool: Unit normals in the tool frame, shape (B, 3).
-        offset_tool: Offsets of the planes in the tool frame, shape (B,), metres.
-        tool_from_camera: The hand-eye transform, shape (4, 4).
-
-    Returns:
-        Shape (B, H, W), metres; positive on the side to which the normal points.
-    """
-    normal_camera = product(normal_tool, tool_from_camera[:3, :3])
-    cosine = projected(ray_directions, normal_camera)
-    origin_to_plane = (normal_tool * tool_from_camera[:3, 3]).sum(-1) + offset_tool
-    return cosine * radial_distance + origin_to_plane[:, None, None]
+        tool_from_camera = self.hand_eye()
+        cosine = projected(ray_directions, product(normal_tool, tool_from_camera[:3, :3]))
+        origin_to_plane = (normal_tool * tool_from_camera[:3, 3]).sum(-1) + offset_tool
+        return cosine * corrected + origin_to_plane[:, None, None]
 
 
 def _rigid(transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> Tensor:
     """Return a float64 copy of `transform`, after checking that it is rigid."""
     matrix = torch.as_tensor(transform, dtype=torch.float64).detach().clone()
-    if matrix.shape != (4, 4):
-        raise ValueError(f"A hand-eye transform has shape (4, 4), got {tuple(matrix.shape)}.")
-    rotation = matrix[:3, :3]
-    bottom = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
-    apart = (rotation.T @ rotation - torch.eye(3).to(matrix)).abs().max()
-    proper = apart < _RIGIDITY_TOLERANCE and torch.det(rotation) > 0
-    if not (matrix.isfinite().all() and proper and torch.equal(matrix[3], bottom)):
-        raise ValueError(
-            "A hand-eye transform is a rotation and a translation over the row (0, 0, 0, 1), "
-            f"got {matrix.tolist()}."
-        )
+    try:
+        se3.refuse_unless_rigid(matrix.cpu().numpy(), _RIGIDITY_TOLERANCE)
+    except ValueError as error:
+        raise ValueError(f"A hand-eye transform: {error}, got {matrix.tolist()}.") from None
     return matrix
 
 
@@ -242,6 +211,11 @@ class CameraGeometry(nn.Module):
         given = {"depth": depth} if amplitude is None else {"depth": depth, "amplitude": amplitude}
         for name, frame in given.items():
             refuse_other_than_tensor(name, frame)
+            if not frame.dtype.is_floating_point:
+                raise FrameError(
+                    f"{name}: expected a floating-point type, got {frame.dtype}. Convert with "
+                    f"{name}.float(), and depth to metres."
+                )
         size = list(self.radial_of_depth.shape)
         if depth.dim() < 2 or list(depth.shape[-2:]) != size:
             raise FrameError(
@@ -253,12 +227,6 @@ class CameraGeometry(nn.Module):
                 f"amplitude: expected the shape of depth, {list(depth.shape)}; got "
                 f"{list(amplitude.shape)}."
             )
-        for name, frame in given.items():
-            if not frame.dtype.is_floating_point:
-                raise FrameError(
-                    f"{name}: expected a floating-point type, got {frame.dtype}. Convert with "
-                    f"{name}.float(), and depth to metres."
-                )
 
 
 class CalibratedRanges(nn.Module):

@@ -3,12 +3,11 @@
 import io
 import tokenize
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +37,7 @@ class ImageArray:
         required: Whether every recording has it.
         low: Smallest finite value that the format allows.
         high: Largest one.
-        refusal: Says what is wrong with a value that is not allowed.
+        expected: Says what a value should be.
     """
 
     name: str
@@ -47,7 +46,7 @@ class ImageArray:
     required: bool = False
     low: float = -inf
     high: float
-    refusal: Callable[[Any], str]
+    expected: str
 
     def file(self, folder: Path) -> Path:
         """Return its file in the folder of a recording."""
@@ -81,39 +80,30 @@ class ImageArray:
             where = [f"frame {indices[frame]}", *(f"A{k}" for k in sample)]
             raise CalibrationDataError(
                 f"{self.file(folder)}: {', '.join(where)}, row {row}, column {column}: "
-                f"{self.refusal(frames[tuple(place)])}."
+                f"{frames[tuple(place)]:.6g}; {self.expected}."
             )
 
 
-def _no_distance(value: np.floating) -> str:
-    return f"{value:.6g} is no distance in metres; expected NaN or zero where there was no return"
-
-
-def _no_amplitude(value: np.floating) -> str:
-    what = "negative amplitude" if value < 0 else "no amplitude:"
-    return f"{what} {value:.6g}; expected 0 to {LARGEST_NUMBER:g}"
-
-
+_DISTANCE = "expected metres; NaN or zero where there was no return"
 IMAGE_ARRAYS = {
     array.name: array
     for array in (
-        ImageArray(name="depth", required=True, high=LARGEST_DISTANCE, refusal=_no_distance),
-        ImageArray(name="amplitude", low=0, high=LARGEST_NUMBER, refusal=_no_amplitude),
+        ImageArray(name="depth", required=True, high=LARGEST_DISTANCE, expected=_DISTANCE),
         ImageArray(
-            name="mask",
-            dtype=np.uint8,
+            name="amplitude",
             low=0,
-            high=1,
-            refusal=lambda value: f"expected 0 or 1, got {value}",
+            high=LARGEST_NUMBER,
+            expected=f"expected 0 to {LARGEST_NUMBER:g}",
         ),
+        ImageArray(name="mask", dtype=np.uint8, low=0, high=1, expected="expected 0 or 1"),
         ImageArray(
             name="raw",
             per_frame=(4,),
             low=-LARGEST_NUMBER,
             high=LARGEST_NUMBER,
-            refusal=lambda value: f"{value:.6g} is larger than {LARGEST_NUMBER:g}",
+            expected=f"expected at most {LARGEST_NUMBER:g}",
         ),
-        ImageArray(name="true_depth", high=LARGEST_DISTANCE, refusal=_no_distance),
+        ImageArray(name="true_depth", high=LARGEST_DISTANCE, expected=_DISTANCE),
     )
 }
 """The arrays of the recording format, by name."""

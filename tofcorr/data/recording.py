@@ -8,13 +8,14 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BeforeValidator, ConfigDict
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray, frame_chunks, open_array, read_frames
 from tofcorr.data.table import COLUMN_OF, TABLE_FILE, UNIT_LENGTH_TOLERANCE, FrameTable, read_table
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
 from tofcorr.geometry.rays import plane_in_frame, radial_distance_from_z_depth, ray_directions
 from tofcorr.options import (
@@ -32,18 +33,19 @@ PlaneOrigin = Literal["recorded", "estimated"]
 
 
 Row4 = tuple[Number, Number, Number, Number]
-_IDENTITY = tuple(map(tuple, np.eye(4).tolist()))
 
 
 def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
-    refuse_unless_rigid(np.array(rows))
+    se3.refuse_unless_rigid(np.array(rows), UNIT_LENGTH_TOLERANCE)
     return rows
 
 
 RigidTransform = Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)]
 """A rigid transform as four rows."""
 _KnownOrIdentity = Annotated[
-    RigidTransform, BeforeValidator(lambda rows: _IDENTITY if rows is None else rows)
+    RigidTransform,
+    BeforeValidator(lambda rows: np.eye(4).tolist() if rows is None else rows),
+    Field(validate_default=True),
 ]
 
 
@@ -58,7 +60,7 @@ class Header(Options):
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None
     saturation_amplitude: PositiveNumber | None = None
-    tool_from_camera: _KnownOrIdentity = _IDENTITY  # type: ignore[assignment]
+    tool_from_camera: _KnownOrIdentity = None  # type: ignore[assignment]
     planes: PlaneOrigin = "recorded"
     frames: FrameNames = FrameNames()
 
@@ -96,40 +98,6 @@ def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
             raise CalibrationDataError(
                 f"{path}: '{key}' is not a known key. Did you mean '{close[0]}'?"
             )
-
-
-def refuse_unless_rigid(matrix: np.ndarray) -> None:
-    """Refuse a matrix that is not a finite rigid transform of shape (4, 4).
-
-    Raises:
-        ValueError: It is not; the message says why.
-    """
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError("expected a 4x4 matrix of finite numbers")
-    if np.any(matrix[3] != [0, 0, 0, 1]):
-        raise ValueError("the last row of a rigid transform is 0 0 0 1")
-    rotation = matrix[:3, :3]
-    # Entries above 2 cannot belong to a rotation, and their squares may overflow.
-    if np.abs(rotation).max() > 2 or (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * UNIT_LENGTH_TOLERANCE
-    ):
-        raise ValueError("the upper left 3x3 block must be a rotation: orthonormal, to 0.001")
-    if np.linalg.det(rotation) < 0:
-        raise ValueError("the upper left 3x3 block is a reflection, not a rotation")
-
-
-def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
-    """Return the transform with its rotation made exact, shape (4, 4).
-
-    Because of rounding in a file a rotation is only nearly orthonormal; the nearest rotation is
-    returned.
-    """
-    left, _, right = np.linalg.svd(matrix[:3, :3])
-    exact = matrix.copy()
-    # What is exact but for the rounding of float64 stays as it is, to the last digit.
-    if np.abs(left @ right - matrix[:3, :3]).max() > 1000 * np.finfo(np.float64).eps:
-        exact[:3, :3] = left @ right
-    return exact
 
 
 _HEADER_KEY = {
@@ -207,7 +175,7 @@ class Recording:
             depth_kind=head.depth_kind,
             modulation_frequency=head.modulation_frequency_hz,
             saturation_amplitude=head.saturation_amplitude,
-            tool_from_camera=nearest_rigid(np.array(head.tool_from_camera, dtype=np.float64)),
+            tool_from_camera=se3.nearest_rigid(np.array(head.tool_from_camera, dtype=np.float64)),
             frames=frames,
             **{name: _opened(image, path, *size) for name, image in IMAGE_ARRAYS.items()},
             planes=head.planes,
@@ -370,9 +338,8 @@ def iterate_frames(
     recording: Recording,
     indices: Sequence[int] | np.ndarray | None = None,
     chunk_pixels: int = 2_000_000,
-    dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
-    image_dtype: torch.dtype | None = None,
+    image_dtype: torch.dtype = torch.float64,
 ) -> Iterator[FrameBatch]:
     """Yield frames in batches of bounded size, read from disk as they are needed.
 
@@ -380,10 +347,9 @@ def iterate_frames(
         recording: The recording.
         indices: Which frames, in this order, repeats allowed; None: all.
         chunk_pixels: Largest number of pixels per batch, but at least one frame.
-        dtype: Of the floating point tensors.
         device: Of all tensors.
-        image_dtype: Of distance and amplitude; None: `dtype`. Radial distances and amplitudes are
-            recorded in float32, which holds them without loss.
+        image_dtype: Of distance and amplitude. Radial distances and amplitudes are recorded in
+            float32, which holds them without loss; planes and conditions are of float64.
 
     Yields:
         Batches that together contain every chosen frame, in order.
@@ -396,7 +362,6 @@ def iterate_frames(
     camera = recording.camera
     normals, offsets = planes_in_tool(recording)
     conditions = frame_conditions(recording.frames)
-    image_dtype = image_dtype or dtype
     rays = None
     if recording.depth_kind == "z":
         rays = ray_directions(camera).to(device=device, dtype=image_dtype)
@@ -408,23 +373,19 @@ def iterate_frames(
         distance = torch.from_numpy(depth).to(device, image_dtype)
         if rays is not None:
             distance = radial_distance_from_z_depth(distance, rays)
-        amplitude = _read(recording, "amplitude", chunk)
+        amplitude, mask = (recording.read(name, chunk) for name in ("amplitude", "mask"))
         if amplitude is not None:
-            amplitude = amplitude.to(device, image_dtype)
-        mask = _read(recording, "mask", chunk)
+            amplitude = torch.from_numpy(amplitude).to(device, image_dtype)
+        if mask is not None:
+            mask = torch.from_numpy(mask).to(device)
         yield FrameBatch(
             indices=torch.from_numpy(chunk).to(device),
             radial_distance=distance,
             amplitude=amplitude,
-            valid=valid_pixels(
-                distance,
-                amplitude,
-                None if mask is None else mask.to(device),
-                recording.saturation_amplitude,
-            ),
-            normal_tool=normals[chunk].to(device, dtype),
-            offset_tool=offsets[chunk].to(device, dtype),
-            conditions=conditions[chunk].to(device, dtype),
+            valid=valid_pixels(distance, amplitude, mask, recording.saturation_amplitude),
+            normal_tool=normals[chunk].to(device),
+            offset_tool=offsets[chunk].to(device),
+            conditions=conditions[chunk].to(device),
         )
 
 
@@ -486,8 +447,3 @@ def _checked_indices(indices: Sequence[int] | np.ndarray | None, num_frames: int
     for wrong in chosen[(chosen < 0) | (chosen >= num_frames)][:1]:
         raise IndexError(f"there is no frame {wrong}: the recording has {num_frames}.")
     return chosen
-
-
-def _read(recording: Recording, name: str, chunk: np.ndarray) -> Tensor | None:
-    frames = recording.read(name, chunk)
-    return None if frames is None else torch.from_numpy(frames)

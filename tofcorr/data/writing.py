@@ -19,13 +19,19 @@ from tofcorr.data.recording import (
     PlaneOrigin,
     Recording,
     header_text,
-    refuse_unless_rigid,
 )
-from tofcorr.data.table import TABLE_FILE, FrameRow, FrameTable, table_text
+from tofcorr.data.table import (
+    TABLE_FILE,
+    UNIT_LENGTH_TOLERANCE,
+    FrameRow,
+    FrameTable,
+    table_text,
+)
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import staged_folder, writing_to
 from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.se3 import refuse_unless_rigid
 from tofcorr.options import dump_yaml
 
 
@@ -179,7 +185,8 @@ class RecordingWriter:
     def _check_pose(self, row: FrameRow) -> None:
         """Refuse a pose that has no quaternion; the reader checks everything else."""
         try:
-            refuse_unless_rigid(np.asarray(row.world_from_tool, dtype=np.float64))
+            pose = np.asarray(row.world_from_tool, dtype=np.float64)
+            refuse_unless_rigid(pose, UNIT_LENGTH_TOLERANCE)
         except ValueError as error:
             raise CalibrationDataError(
                 f"{self.path}: frame {self._num_frames}, world_from_tool: {error}."

@@ -8,6 +8,7 @@ they are.
 
 import math
 
+import numpy as np
 import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
@@ -95,6 +96,46 @@ def assemble(rotation: Tensor, translation: Tensor) -> Tensor:
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
+
+
+def refuse_unless_rigid(matrix: np.ndarray, tolerance: float) -> None:
+    """Refuse a matrix that is not a finite rigid transform of shape (4, 4).
+
+    Args:
+        matrix: What should be one.
+        tolerance: Largest difference from 1 of the length of a column of the rotation (no unit).
+
+    Raises:
+        ValueError: It is not; the message says why.
+    """
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError("expected a 4x4 matrix of finite numbers")
+    if np.any(matrix[3] != [0, 0, 0, 1]):
+        raise ValueError("the last row of a rigid transform is 0 0 0 1")
+    rotation = matrix[:3, :3]
+    # Entries above 2 cannot belong to a rotation, and their squares may overflow.
+    if np.abs(rotation).max() > 2 or (
+        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * tolerance
+    ):
+        raise ValueError(
+            f"the upper left 3x3 block must be a rotation: orthonormal, to {tolerance:g}"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("the upper left 3x3 block is a reflection, not a rotation")
+
+
+def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
+    """Return the transform with its rotation made exact, shape (4, 4).
+
+    Because of rounding in a file a rotation is only nearly orthonormal; the nearest rotation is
+    returned.
+    """
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    exact = matrix.copy()
+    # What is exact but for the rounding of float64 stays as it is, to the last digit.
+    if np.abs(left @ right - matrix[:3, :3]).max() > 1000 * np.finfo(np.float64).eps:
+        exact[:3, :3] = left @ right
+    return exact
 
 
 def matrix_from_quaternion_translation(quaternion_xyzw: Tensor, translation: Tensor) -> Tensor:

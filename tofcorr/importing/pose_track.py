@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from tofcorr.data.recording import nearest_rigid, refuse_unless_rigid
+from tofcorr.data.table import UNIT_LENGTH_TOLERANCE
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 
@@ -76,10 +76,10 @@ class PoseTrack:
             raise CalibrationDataError(f"{source}: expected poses, found none.")
         for place, pose in enumerate(poses):
             try:
-                refuse_unless_rigid(pose)
+                se3.refuse_unless_rigid(pose, UNIT_LENGTH_TOLERANCE)
             except ValueError as error:
                 raise CalibrationDataError(f"{source}: pose {place}: {error}.") from None
-        poses = np.stack([nearest_rigid(pose) for pose in poses])
+        poses = np.stack([se3.nearest_rigid(pose) for pose in poses])
         kept, time = np.arange(len(poses)), None
         if timestamp is not None:
             time = in_seconds(np.asarray(timestamp, dtype=np.float64))

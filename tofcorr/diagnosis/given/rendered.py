@@ -16,7 +16,8 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.recording import Recording, planes_in_tool, refuse_unless_rigid
+from tofcorr.data.recording import Recording, planes_in_tool
+from tofcorr.data.table import UNIT_LENGTH_TOLERANCE
 from tofcorr.data.writing import write_recording
 from tofcorr.diagnosis.given.checks import (
     refuse_mistaken_geometry,
@@ -31,6 +32,7 @@ from tofcorr.diagnosis.sums.noise import PixelNoise, brightness_of, estimate_noi
 from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import scratch_folder
+from tofcorr.geometry.se3 import refuse_unless_rigid
 
 # A frame was rendered at the pose of a recorded one if tool and target differ by no more than this:
 # metres for the position of the tool and the distance of the target's plane, radians for the turn
@@ -258,7 +260,7 @@ def _frames_of(returned: Any, recording: Recording) -> dict[str, Any]:  # noqa: 
             )
     if "tool_from_camera" in checked:
         try:
-            refuse_unless_rigid(checked["tool_from_camera"])
+            refuse_unless_rigid(checked["tool_from_camera"], UNIT_LENGTH_TOLERANCE)
         except ValueError as error:
             raise CalibrationDataError(f"The simulator's tool_from_camera: {error}.") from None
     return checked
