@@ -32,14 +32,18 @@ OTHER_DOMAIN = Domain(
 )
 
 
+def built(*terms: dict[str, Any], domain: Domain = DOMAIN) -> ErrorModel:
+    """Build an untrained model of some terms."""
+    return ErrorModel(ErrorModelOptions.from_mapping({"terms": terms}, "test"), domain)
+
+
 def model_of(kind: str, domain: Domain = DOMAIN, **options: Any) -> ErrorModel:
     """Build an untrained model of one kind of term."""
-    if kind == "residual_network":
-        model = ErrorModel(ErrorModelOptions(), domain)
-        model.residual = ResidualNetwork(ResidualNetworkOptions(**options), domain)
-        return model
-    term = {"kind": kind, **options}
-    return ErrorModel(ErrorModelOptions.from_mapping({"terms": [term]}, kind), domain)
+    if kind != "residual_network":
+        return built({"kind": kind, **options}, domain=domain)
+    model = built(domain=domain)
+    model.residual = ResidualNetwork(ResidualNetworkOptions(**options), domain)
+    return model
 
 
 def randomise(model: torch.nn.Module, generator: torch.Generator) -> None:

@@ -22,7 +22,7 @@ class Condition:
         unit: Unit of the column, for axis labels.
         si_per_unit: Value of one unit of the column in the unit of the attribute.
         words: What it is called in a sentence.
-        covariate: Name in `diagnosis.json`; empty: that of the column.
+        covariate: Name in `diagnosis.json`.
         column_rank: Order of the optional columns in `frames.csv`. It differs from the order of
             `CONDITIONS` because both orders are part of files that exist.
         required: Whether every recording has it.
@@ -33,15 +33,11 @@ class Condition:
     column: str
     unit: str
     words: str
-    covariate: str = ""
+    covariate: str
     si_per_unit: float = 1.0
     column_rank: int = 0
     required: bool = False
     positive: bool = False
-
-    def __post_init__(self) -> None:
-        """Name the covariate as the column where it has no name of its own."""
-        object.__setattr__(self, "covariate", self.covariate or self.column)
 
     @property
     def label(self) -> str:
@@ -76,21 +72,15 @@ class Conditions(Generic[Value]):
         return {name: getattr(self, name) for name in CONDITIONS}
 
 
+_INTEGRATION = ("integration_time", "integration_time_us", "us")
+_ROOM = ("room_temperature", "room_temperature_c", "C", "room temperature", "room_temperature_c")
+_BODY = ("body_temperature", "body_temperature_c", "C", "body temperature", "body_temperature_c")
 _ALL = (
-    Condition("timestamp", "timestamp_s", "s", "time", required=True),
-    Condition(
-        "integration_time",
-        "integration_time_us",
-        "us",
-        "integration time",
-        "integration_time",
-        1e-6,
-        column_rank=1,
-        positive=True,
-    ),
-    Condition("room_temperature", "room_temperature_c", "C", "room temperature", column_rank=3),
-    Condition("body_temperature", "body_temperature_c", "C", "body temperature", column_rank=2),
-    Condition("ambient", "ambient", "counts", "background light", column_rank=4),
+    Condition("timestamp", "timestamp_s", "s", "time", "timestamp_s", required=True),
+    Condition(*_INTEGRATION, "integration time", "integration_time", 1e-6, 1, positive=True),
+    Condition(*_ROOM, column_rank=3),
+    Condition(*_BODY, column_rank=2),
+    Condition("ambient", "ambient", "counts", "background light", "ambient", column_rank=4),
 )
 CONDITIONS: tuple[str, ...] = tuple(condition.name for condition in _ALL)
 """Names of the conditions, in the order of every conditions tensor."""

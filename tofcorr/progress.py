@@ -88,12 +88,8 @@ def stages(what: str, total: int) -> Iterator[Callable[[str], None]]:
     if drawn():
         from tqdm import tqdm
 
-        shown = tqdm(
-            total=total,
-            leave=False,
-            disable=None,
-            bar_format="{desc} {bar} {n_fmt}/{total_fmt} [{elapsed}]",
-        )
+        form = "{desc} {bar} {n_fmt}/{total_fmt} [{elapsed}]"
+        shown = tqdm(total=total, leave=False, disable=None, bar_format=form)
 
     def begin(name: str) -> None:
         LOG.info("%s: %s", what, name)

@@ -69,6 +69,11 @@ def test_a_configuration_is_printed_as_it_is(program: Program, name: str, file: 
         (["select", "--config", "papr", "--recording", "r", "--out", "o"], "Did you mean 'paper'?"),
         (["simulate", "--config", "dmo", "--out", "o"], "Did you mean 'demo'?"),
         (["simulate", "--out", "o"], "Missing option '--config'"),
+        (["no-such-command"], "No such command 'no-such-command'"),
+        (["correct", "--modle", "x"], "No such option"),
+        (["correct", "--model", "a", "--recording", "b", "--out", "c"], "b: there is no such fold"),
+        (["export", "--run", "a", "--format", "lut", "--out", "b"], "state.pt: there is no such"),
+        (["train", "--config", "none.yaml", "--recording", "x", "--out", "y"], "none.yaml"),
         (["diagnose", "--set", "sed=2", "--recording", "r", "--out", "o"], "Did you mean 'seed'?"),
         (
             [
@@ -128,7 +133,7 @@ def test_the_shell_completes_commands_and_configurations() -> None:
 
 
 def test_completion_says_of_a_command_what_the_list_of_commands_says() -> None:
-    assert completed("tofcorr ev", "zsh") == ["plain", "evaluate", COMMANDS["evaluate"]]
+    assert completed("tofcorr ev", "zsh") == ["plain", "evaluate", COMMANDS["evaluate"][1]]
     importer = IMPORTERS["bop"]
     assert completed("tofcorr import bo", "zsh") == ["plain", "bop", importer]
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-import pytest
 import yaml
 from correction.export.states import calibration
 from running import Program
@@ -48,20 +47,6 @@ def test_the_names_of_a_recording_stand_in_report_calibration_and_exports(
     arm = tmp_path / "arm.calib"
     assert program("export", "--run", out, "--format", "easy_handeye", "--out", arm).code == 0
     assert yaml.safe_load(arm.read_text())["parameters"]["calibration_type"] == "eye_on_base"
-
-
-@pytest.mark.parametrize("name", ["urdf", "tf", "easy_handeye"])
-def test_a_run_without_a_robot_is_refused_in_one_sentence(
-    name: str, tmp_path: Path, program: Program
-) -> None:
-    state = calibration(np.eye(4), hand_eye_estimated=False)
-    save_calibration(tmp_path / STATE_FILE, state)
-    out = tmp_path / "camera.yaml"
-    code, _, told = program("export", "--run", tmp_path, "--format", name, "--out", out)
-    assert code == 2
-    assert told.count("\n") == 1
-    assert "has no robot poses" in told
-    assert not out.exists()
 
 
 def test_a_run_that_is_not_to_be_used_is_exported_only_if_it_was_forced(

@@ -40,51 +40,6 @@ def test_a_command_refuses_a_broken_recording(
     assert list(tmp_path.iterdir()) == [recording]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["no-such-command"], "No such command 'no-such-command'"),
-        (["correct"], "Missing option"),
-        (["correct", "--modle", "x"], "No such option"),
-        (
-            ["correct", "--model", "a", "--recording", "b", "--out", "c"],
-            "b: there is no such folder.",
-        ),
-        (["export", "--run", "a", "--format", "lut", "--out", "b"], "state.pt: there is no such"),
-        (["train", "--config", "none.yaml", "--recording", "x", "--out", "y"], "none.yaml"),
-    ],
-)
-def test_a_wrong_command_line_is_explained(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    program: Program,
-    arguments: list[str],
-    message: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    code, _, told = program(*arguments)
-    assert code == 2
-    assert message in told
-    assert "Traceback" not in told
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_installed_program_ends_with_two_and_one_line(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [
-            *(Path(sys.executable).with_name("tofcorr"), "train", "--config", CONFIG),
-            *("--recording", str(tmp_path / "nowhere"), "--out", str(tmp_path / "run")),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert done.stderr == f"Error: {tmp_path / 'nowhere'}: there is no such folder.\n"
-    assert done.stdout == ""
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_full_disk_is_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
 ) -> None:

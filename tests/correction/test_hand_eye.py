@@ -2,17 +2,12 @@
 
 import pytest
 import torch
+from kinds_of_terms import built
+from module.modules import CAMERA
 
 from tofcorr.correction.model import CalibrationModel, HandEye
-from tofcorr.error_terms.base import Domain, Interval
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.geometry import se3
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
-
-CAMERA = CameraIntrinsics(
-    width=4, height=3, matrix=((5.0, 0.0, 1.6), (0.0, 5.0, 1.1), (0.0, 0.0, 1.0))
-)
 
 
 def transform(generator: torch.Generator) -> torch.Tensor:
@@ -20,13 +15,8 @@ def transform(generator: torch.Generator) -> torch.Tensor:
 
 
 def model_of(hand_eye: HandEye) -> CalibrationModel:
-    domain = Domain(
-        height=3, width=4, radial_distance=Interval(0.5, 2.0), amplitude=Interval(10.0, 90.0),
-        normalised_amplitude=Interval(10.0, 90.0),
-    )  # fmt: skip
-    terms = [{"kind": "distance_polynomial"}, {"kind": "amplitude_polynomial"}]
-    options = ErrorModelOptions.from_mapping({"terms": terms}, "test")
-    return CalibrationModel(ErrorModel(options, domain), hand_eye)
+    terms = {"kind": "distance_polynomial"}, {"kind": "amplitude_polynomial"}
+    return CalibrationModel(built(*terms), hand_eye)
 
 
 def test_training_starts_at_the_guess(generator: torch.Generator) -> None:
@@ -47,19 +37,11 @@ def test_a_fixed_transform_is_not_estimated() -> None:
     assert not [p for p in HandEye(fixed=True).parameters() if p.requires_grad]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [torch.zeros(4, 4), 2 * torch.eye(4), torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))],
-    ids=["zero", "scaled", "mirrored"],
-)
-def test_what_is_no_rigid_transform_is_refused(wrong: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="a rotation and a translation"):
-        HandEye(wrong)
-
-
-def test_a_wrong_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"shape \(4, 4\), got \(3, 3\)"):
-        HandEye(torch.eye(3))
+def test_what_is_no_rigid_transform_is_refused() -> None:
+    mirrored = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))
+    for wrong in (torch.zeros(4, 4), 2 * torch.eye(4), mirrored, torch.eye(3)):
+        with pytest.raises(ValueError, match=r"A hand-eye transform: .* (rotation|4x4|0 0 0 1)"):
+            HandEye(wrong)
 
 
 def test_residual_is_the_distance_of_the_corrected_point_to_the_plane(
@@ -70,8 +52,8 @@ def test_residual_is_the_distance_of_the_corrected_point_to_the_plane(
     model = model_of(HandEye(tool_from_camera))
     model.error.set_coefficient_vector(torch.linspace(-0.02, 0.03, 6, dtype=torch.float64))
     rays = ray_directions(CAMERA)
-    distance = 0.5 + torch.rand(2, 3, 4, generator=generator, dtype=torch.float64)
-    amplitude = 10 + 80 * torch.rand(2, 3, 4, generator=generator, dtype=torch.float64)
+    distance = 0.5 + torch.rand(2, 5, 7, generator=generator, dtype=torch.float64)
+    amplitude = 10 + 80 * torch.rand(2, 5, 7, generator=generator, dtype=torch.float64)
     normal = torch.nn.functional.normalize(
         torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1
     )
@@ -85,42 +67,9 @@ def test_residual_is_the_distance_of_the_corrected_point_to_the_plane(
         torch.testing.assert_close(residual[b, row, column], expected)
 
 
-def test_residual_has_exact_derivatives(generator: torch.Generator) -> None:
-    model = model_of(HandEye(transform(generator)))
-    rays = ray_directions(CAMERA)
-    distance = 0.5 + torch.rand(1, 3, 4, generator=generator, dtype=torch.float64)
-    amplitude = 10 + 80 * torch.rand(1, 3, 4, generator=generator, dtype=torch.float64)
-    normal = torch.tensor([[0.0, 0.6, 0.8]], dtype=torch.float64)
-    offset = torch.tensor([0.3], dtype=torch.float64)
-    names = [name for name, _ in model.named_parameters()]
-    values = [0.1 * torch.randn(p.shape, generator=generator).double() for p in model.parameters()]
-
-    def residual(*parameters: torch.Tensor) -> torch.Tensor:
-        given = dict(zip(names, parameters, strict=True))
-        arguments = (distance, amplitude, rays, normal, offset)
-        return torch.func.functional_call(_Residual(model), _prefixed(given), arguments)
-
-    assert torch.autograd.gradcheck(residual, [value.requires_grad_() for value in values])
-
-
 def test_a_model_without_amplitudes_names_what_it_lacks() -> None:
     model = model_of(HandEye())
-    nothing = torch.ones(1, 3, 4, dtype=torch.float64)
+    nothing = torch.ones(1, 5, 7, dtype=torch.float64)
     normal, offset = torch.tensor([[0.0, 0.0, 1.0]]).double(), torch.zeros(1).double()
     with pytest.raises(ValueError, match="expected amplitudes"):
         model.residual(nothing, None, ray_directions(CAMERA), normal, offset)
-
-
-class _Residual(torch.nn.Module):
-    """The residual as a module's forward, which `functional_call` needs."""
-
-    def __init__(self, model: CalibrationModel) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, *arguments: torch.Tensor) -> torch.Tensor:
-        return self.model.residual(*arguments)
-
-
-def _prefixed(parameters: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {f"model.{name}": value for name, value in parameters.items()}

@@ -1,45 +1,17 @@
 """What a look-up table does not read, it refuses in words."""
 
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tofcorr.correction.lookup import FORMAT, LookupTable, interpolate, read_lut
-from tofcorr.errors import CalibrationDataError
+from tofcorr.correction.lookup import LookupTable, interpolate
 
 ARRAYS: dict[str, Any] = {
     "offset": np.zeros((2, 3)),
     "table": np.zeros((4, 1)),
     "radial_of_z": np.ones((1, 1)),
 }
-
-
-def write(path: Path, version: int = 1) -> Path:
-    mark = {"format": FORMAT, "version": version}
-    metadata = json.dumps({"lut": mark, "validity": {"radial_distance_m": [0.5, 2.0]}})
-    np.savez(path, metadata=np.array(metadata), **ARRAYS)
-    return path
-
-
-def test_a_table_that_was_written_is_read(tmp_path: Path) -> None:
-    read = read_lut(write(tmp_path / "corrector.npz"))
-    for name, values in ARRAYS.items():
-        np.testing.assert_array_equal(getattr(read, name), values)
-
-
-def test_other_files_are_refused_by_path_and_reason(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationDataError, match=r"none\.npz: there is no such file"):
-        read_lut(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("not a table")
-    np.savez(tmp_path / "arrays.npz", **ARRAYS)
-    for name in ("text", "arrays"):
-        with pytest.raises(CalibrationDataError, match=rf"{name}\.npz: is not a look-up table"):
-            read_lut(tmp_path / f"{name}.npz")
-    with pytest.raises(CalibrationDataError, match="is a table of another version"):
-        read_lut(write(tmp_path / "old.npz", version=0))
 
 
 def test_a_frame_of_another_size_is_refused_with_both_sizes() -> None:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from kinds_of_terms import DOMAIN, KINDS, OTHER_DOMAIN, inputs, model_of, randomise
+from kinds_of_terms import DOMAIN, inputs, model_of, randomise
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import SignalTerm
@@ -24,26 +24,6 @@ WITHOUT = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_state_loaded_into_other_ranges_gives_identical_output(
-    kind: str, generator: torch.Generator
-) -> None:
-    model, other = model_of(kind), model_of(kind, OTHER_DOMAIN)
-    randomise(model, generator)
-    given = inputs(generator)
-    assert not torch.equal(other(*given), model(*given))
-    other.load_state_dict(model.state_dict())
-    assert torch.equal(other(*given), model(*given))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_state_of_another_model_is_refused_by_a_sentence(kind: str) -> None:
-    for other in KINDS:
-        if other != kind:
-            with pytest.raises(StateError, match="the state is of another model"):
-                model_of(kind).load_state_dict(model_of(other).state_dict())
-
-
 @pytest.mark.parametrize(
     ("kind", "one", "other"),
     [
@@ -56,18 +36,6 @@ def test_a_state_of_another_model_is_refused_by_a_sentence(kind: str) -> None:
 def test_a_state_of_other_functions_is_refused(kind: str, one: dict, other: dict) -> None:
     with pytest.raises(StateError, match="Build the module as the saved one was built"):
         model_of(kind, **one).load_state_dict(model_of(kind, **other).state_dict())
-
-
-def test_a_state_of_another_image_size_is_refused() -> None:
-    with pytest.raises(StateError, match=r"'image size' is \[6, 7\], this module's is \[5, 7\]"):
-        model_of("pixel_polynomial").load_state_dict(
-            model_of("pixel_polynomial", replace(DOMAIN, height=6)).state_dict()
-        )
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_value_of_a_state_is_a_tensor(kind: str) -> None:
-    assert all(isinstance(value, torch.Tensor) for value in model_of(kind).state_dict().values())
 
 
 @pytest.mark.parametrize("kind", TERMS)

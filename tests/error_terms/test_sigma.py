@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from correction.export.c_code.models import state_of
+from correction.export.states import calibration
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.geometry.rays import ray_directions
@@ -33,10 +33,10 @@ def frames(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
 def test_calibration_sigma_is_the_spread_of_models_drawn_from_the_covariance(
     name: str, generator: torch.Generator
 ) -> None:
-    state = state_of(MODELS[name], "radial")
-    size = len(state.coefficients)
+    size = len(calibration(terms=MODELS[name]).coefficients)
     root = 1e-3 * torch.randn(size, size, generator=generator, dtype=torch.float64)
-    state = state_of(MODELS[name], "radial", covariance=root @ root.T)
+    covariance = root @ root.T
+    state = calibration(None, MODELS[name], "radial", covariance=covariance)
     depth, amplitude = frames(generator)
     runtime = torch.jit.script(DepthCorrector.from_state(state))
     _, found = runtime.sigma(depth, amplitude)
@@ -55,13 +55,12 @@ def test_noise_sigma_follows_the_amplitude_and_the_kind_of_depth(
     depth, amplitude = frames(generator)
     depth[0, 0, 0], depth[0, 0, 1] = torch.nan, -1.0
     noise = (1e-6, 1e-4, 2e-3)
-    radial, _ = DepthCorrector.from_state(state_of([], "radial", noise=noise)).sigma(
-        depth, amplitude
-    )
+    state = calibration(None, [], "radial", noise=noise)
+    radial, _ = DepthCorrector.from_state(state).sigma(depth, amplitude)
     expected = (1e-6 + 1e-4 / amplitude + 2e-3 / amplitude.square()).sqrt()
     expected[0, 0, :2] = torch.nan
     torch.testing.assert_close(radial, expected, equal_nan=True)
-    z_state = state_of([], "z", noise=noise)
+    z_state = calibration(None, [], "z", noise=noise)
     in_z, _ = DepthCorrector.from_state(z_state).sigma(depth, amplitude)
     cosine = ray_directions(z_state.camera)[..., 2].float()
     torch.testing.assert_close(in_z, expected * cosine, equal_nan=True)
@@ -69,8 +68,6 @@ def test_noise_sigma_follows_the_amplitude_and_the_kind_of_depth(
 
 def test_what_the_calibration_does_not_tell_is_nan(generator: torch.Generator) -> None:
     depth, amplitude = frames(generator)
-    noise, calibration = DepthCorrector.from_state(state_of(MODELS["EB"], "radial")).sigma(
-        depth, amplitude
-    )
-    assert noise.isnan().all()
-    assert calibration.isnan().all()
+    state = calibration(terms=MODELS["EB"])
+    for unknown in DepthCorrector.from_state(state).sigma(depth, amplitude):
+        assert unknown.isnan().all()

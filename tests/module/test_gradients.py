@@ -175,21 +175,3 @@ def test_unknown_conditions_count_as_the_mean_of_the_calibration() -> None:
     torch.testing.assert_close(found, expected)
     depth, _ = frames()
     assert torch.equal(module(depth, room_temperature_c=torch.nan), module(depth))
-
-
-def test_hooks_run_and_a_custom_training_loop_learns() -> None:
-    module = module_of("distance_polynomial")
-    seen = []
-    module.register_forward_hook(lambda *_: seen.append(1))
-    module(frames()[0])
-    assert seen == [1]
-    batch = wall_batch(module)
-    optimiser = torch.optim.Adam(module.parameters(), lr=1e-2)
-    losses = []
-    for _ in range(20):
-        optimiser.zero_grad()
-        loss = module.point_to_plane_loss(batch)
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < 0.8 * losses[0]

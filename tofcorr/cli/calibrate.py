@@ -5,7 +5,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tofcorr.cli.shared import config_options, force_option, out_option, recordings_option
+from tofcorr.cli.shared import (
+    FOLDER,
+    config_options,
+    force_option,
+    out_option,
+    recording_option,
+    run_option,
+)
 from tofcorr.files import NewPath, ReplacedFile
 
 if TYPE_CHECKING:
@@ -18,7 +25,7 @@ _SELECTION = "comparison.options:SelectionOptions"
 
 
 @click.command()
-@click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("recordings", nargs=-1, required=True, type=FOLDER)
 @click.option("--out", type=NewPath(), help="HTML page with pictures to write.")
 @click.option(
     "--planes",
@@ -45,13 +52,9 @@ def inspect_command(recordings: tuple[Path, ...], out: Path | None, planes: Any)
 
 @click.command()
 @config_options(_TRAINING, "train", "The model and the training", "solver.max_iterations=30", "ea")
-@recordings_option("Folder of a recording; may be given several times for one camera.")
+@recording_option("Folder of a recording; may be given several times.", many=True)
 @out_option("Folder of the run, made anew.")
-@click.option(
-    "--resume",
-    type=click.Path(path_type=Path),
-    help="Folder of an interrupted run; the fit goes on where it stood.",
-)
+@click.option("--resume", type=FOLDER, help="An interrupted run; the fit goes on where it stood.")
 @force_option
 @click.option("--no-figures", is_flag=True, help="Draw no figures for TensorBoard.")
 def train_command(
@@ -78,7 +81,7 @@ def train_command(
 
 @click.command()
 @config_options(_EVALUATION, "evaluate", "The models and how they are compared", "seed=1", "paper")
-@recordings_option("A set of images: one row of the tables; may be given several times.")
+@recording_option("Images: one row of the tables; may be given several times.", many=True)
 @out_option("Folder of the report; must be new.")
 @click.option("--device", default=None, help="Where to compute; overrides the configuration.")
 @force_option
@@ -105,7 +108,7 @@ def evaluate_command(
 
 @click.command()
 @config_options(_SELECTION, "select", "The models and what is held out", "folds=5", "paper")
-@recordings_option("Folder of a recording; several of one camera are taken together.")
+@recording_option("Folder of a recording; several are taken together.", many=True)
 @out_option("New folder.")
 @force_option
 def select_command(
@@ -125,10 +128,8 @@ def select_command(
 
 
 @click.command()
-@click.option(
-    "--run", required=True, type=click.Path(path_type=Path), help="Folder of the training's run."
-)
-@recordings_option("A few frames of any wall.")
+@run_option
+@recording_option("A few frames of any wall.", many=True)
 @click.option(
     "--wall",
     type=click.Choice(["per_image", "one", "recorded"]),

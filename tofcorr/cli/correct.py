@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tofcorr.cli.shared import out_option, recording_option
+from tofcorr.cli.shared import FOLDER, out_option, recording_option, run_option
 from tofcorr.correction.export.registry import FORMATS
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.files import NewPath, ReplacedFile
@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option(
-    "--model", required=True, type=click.Path(path_type=Path), help="The corrector.ts of a run."
-)
+@click.option("--model", required=True, type=FOLDER, help="The corrector.ts of a run.")
 @recording_option("Folder of the recording to correct.")
 @click.option("--out", type=NewPath(), help="Folder of the corrected recording, made anew.")
 @click.option(
@@ -114,9 +112,7 @@ def _last_line(error: Exception) -> str:
 
 
 @click.command()
-@click.option(
-    "--run", required=True, type=click.Path(path_type=Path), help="Folder that tofcorr train made."
-)
+@run_option
 @click.option(
     *("--format", "name"),
     required=True,

@@ -18,28 +18,21 @@ from tofcorr.files import remove_begun
 from tofcorr.version import __version__
 
 COMMANDS = {
-    "poses": "Propose robot poses to record, before any recording exists.",
-    "simulate": "Draw a recording from the sensor simulator.",
-    "import": "Turn recorded images into a recording.",
-    "inspect": "Say what is odd about a recording, before any fit.",
-    "train": "Calibrate a recording: distance, pixel and intensity error, and hand-eye.",
-    "evaluate": "Compare models on held-out images, in the paper's two tables.",
-    "select": "Choose the model that predicts best what it has not seen.",
-    "check": "Say whether a calibration still holds, from a few frames of any wall.",
-    "export": "Write the calibration of a run for robots: corrector, URDF, tf, OpenCV, ...",
-    "correct": "Correct a whole recording with a trained corrector; also as point clouds.",
-    "diagnose": "Say where simulator and recording differ, and which effect is missing.",
-    "degrade": "Give ideal depth frames the errors, noise and gaps of a real camera.",
-    "configs": "List the shipped configurations, or print one.",
+    "poses": ("record", "Propose robot poses to record, before any recording exists."),
+    "simulate": ("simulate", "Draw a recording from the sensor simulator."),
+    "import": ("record", "Turn recorded images into a recording."),
+    "inspect": ("calibrate", "Say what is odd about a recording, before any fit."),
+    "train": ("calibrate", "Calibrate a recording: distance, pixel, intensity error, hand-eye."),
+    "evaluate": ("calibrate", "Compare models on held-out images, in the paper's two tables."),
+    "select": ("calibrate", "Choose the model that predicts best what it has not seen."),
+    "check": ("calibrate", "Say whether a calibration still holds, from a few frames of any wall."),
+    "export": ("correct", "Write the calibration of a run for robots: corrector, URDF, tf, ..."),
+    "correct": ("correct", "Correct a recording with a trained corrector; also as point clouds."),
+    "diagnose": ("simulate", "Say where simulator and recording differ; name the missing effect."),
+    "degrade": ("simulate", "Give ideal depth frames the errors, noise and gaps of a real camera."),
+    "configs": ("main", "List the shipped configurations, or print one."),
 }
-_FILES = {
-    "record": ("poses", "import"),
-    "calibrate": ("inspect", "train", "evaluate", "select", "check"),
-    "correct": ("export", "correct"),
-    "simulate": ("simulate", "diagnose", "degrade"),
-    "main": ("configs",),
-}
-_FILE_OF = {name: file for file, names in _FILES.items() for name in names}
+"""By name: the file here that holds the command, and its line in the list of commands."""
 
 _EPILOG = """\b
 Completion of commands, options and configurations, in the start-up file of your shell:
@@ -51,10 +44,7 @@ Completion of commands, options and configurations, in the start-up file of your
 
 @click.group(
     cls=LazyGroup,
-    lazy={
-        name: (f"cli.{_FILE_OF[name]}:{name}_command", summary)
-        for name, summary in COMMANDS.items()
-    },
+    lazy={name: (f"cli.{file}:{name}_command", said) for name, (file, said) in COMMANDS.items()},
     epilog=_EPILOG,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -129,14 +119,14 @@ def _run() -> None:
         sys.exit(done.exit_code)
     except click.ClickException as error:
         error.show()
-        sys.exit(2)
     except TofcorrError as error:
         click.echo(f"Error: {error}", err=True)
-        sys.exit(2)
     except OSError as error:  # A full disk, a folder without permission: the user's to mend.
         where = "" if error.filename is None else f"{error.filename}: "
         click.echo(printable(f"Error: {where}{error.strerror or error}."), err=True)
-        sys.exit(2)
+    else:
+        return
+    sys.exit(2)
 
 
 @click.command()
@@ -148,27 +138,21 @@ def configs_command(name: str | None) -> None:
     have one of the same name, write FOLDER/NAME, such as train/ea. To edit one, save it to a file:
     tofcorr configs ea > mine.yaml
     """
-    from tofcorr.options import shipped_folders
+    from tofcorr.options import configs_folder, shipped_folders, shipped_names
 
     folders = shipped_folders()
     if name is not None and name not in folders:
         click.echo(_file(name).read_text(encoding="utf-8"), nl=False)
         return
-    wanted = folders if name is None else [name]
-    click.echo("\n\n".join(_listing(folder) for folder in wanted))
-
-
-def _listing(folder: str) -> str:
-    """Return the names of one folder of `configs/`, each with its first comment line."""
-    from tofcorr.options import configs_folder, shipped_names
-
-    names = shipped_names(folder)
-    width = max(map(len, names), default=0)
-    lines = [
-        f"  {name:<{width}}  {_summary(configs_folder() / folder / f'{name}.yaml')}"
-        for name in names
-    ]
-    return "\n".join([f"{folder}:", *lines])
+    listings = []
+    for folder in folders if name is None else [name]:
+        names = shipped_names(folder)
+        width = max(map(len, names), default=0)
+        texts = [(configs_folder() / folder / f"{one}.yaml").read_text("utf-8") for one in names]
+        lines = [text.partition("\n")[0].removeprefix("#").strip() for text in texts]
+        listed = (f"  {one:<{width}}  {line}" for one, line in zip(names, lines, strict=True))
+        listings.append("\n".join([f"{folder}:", *listed]))
+    click.echo("\n\n".join(listings))
 
 
 def _file(name: str) -> Path:
@@ -188,9 +172,3 @@ def _file(name: str) -> Path:
         hint = f" Did you mean '{close[0]}'?" if close else ""
         raise ConfigError(f"no configuration '{name}' is shipped.{hint} List: tofcorr configs")
     return configs_folder() / f"{matches[0]}.yaml"
-
-
-def _summary(path: Path) -> str:
-    """Return the first comment line of a configuration."""
-    with path.open(encoding="utf-8") as file:
-        return file.readline().removeprefix("#").strip()

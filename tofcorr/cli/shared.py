@@ -12,6 +12,7 @@ from click.shell_completion import CompletionItem
 from tofcorr.files import NewPath
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+FOLDER = click.Path(path_type=Path)
 
 
 class LazyGroup(click.Group):
@@ -91,22 +92,21 @@ force_option = click.option(
 """The option of every command that looks at a recording first; the command receives a bool."""
 
 
+run_option = click.option(
+    "--run", required=True, type=FOLDER, help="Folder that tofcorr train made."
+)
+"""The option of every command that uses a calibration; the command receives a path."""
+
+
 def out_option(text: str, kind: click.ParamType | None = None) -> Callable[[Command], Command]:
     """Add `--out`, a name that is new unless another kind is given; the command receives a path."""
     return click.option("--out", required=True, type=kind or NewPath(), help=text)
 
 
-def recordings_option(text: str) -> Callable[[Command], Command]:
-    """Add `--recording`, once or several times; the command receives `recordings`, paths."""
-    named = ("--recording", "recordings")
-    path = click.Path(path_type=Path)
-    return click.option(*named, required=True, multiple=True, type=path, help=text)
-
-
-def recording_option(text: str) -> Callable[[Command], Command]:
-    """Add `--recording`, given once; the command receives `recording_path`."""
-    named = ("--recording", "recording_path")
-    return click.option(*named, required=True, type=click.Path(path_type=Path), help=text)
+def recording_option(text: str, *, many: bool = False) -> Callable[[Command], Command]:
+    """Add `--recording`; the command receives `recording_path`, or, of many, `recordings`."""
+    named = ("--recording", "recordings" if many else "recording_path")
+    return click.option(*named, required=True, multiple=many, type=FOLDER, help=text)
 
 
 def config_options(

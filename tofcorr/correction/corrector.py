@@ -119,9 +119,7 @@ class DepthCorrector(nn.Module):
         if scripted and depth.numel() > self.strip_pixels and not depth.is_cuda:
             self.correct_in_strips(depth, amplitude, corrected, valid)
         else:
-            scale = self.radial_of_z
-            offset, rows = self.error.offset, self.error.rows
-            self.correct(depth, amplitude, offset, scale, rows, corrected, valid)
+            self.correct(depth, amplitude, self.error.offset, 0, corrected, valid)
         if not self.conditions_inside:
             valid.zero_()
         return corrected, valid
@@ -190,32 +188,33 @@ class DepthCorrector(nn.Module):
         """Correct some rows of all frames at a time."""
         strips = (depth.numel() + self.strip_pixels - 1) // self.strip_pixels
         rows = max(1, (self.height + strips - 1) // strips)
-        depths, amplitudes = depth.split(rows, -2), amplitude.split(rows, -2)
-        offsets, row_numbers = self.error.offset.split(rows), self.error.rows.split(rows)
-        scales = self.radial_of_z.split(rows)
-        outputs, masks = corrected.split(rows, -2), valid.split(rows, -2)
-        for k in range(len(depths)):
-            scale = scales[k] if self.is_z else self.radial_of_z
-            given = (depths[k], amplitudes[k], offsets[k], scale, row_numbers[k])
-            self.correct(given[0], given[1], given[2], given[3], given[4], outputs[k], masks[k])
+        parts = [depth.split(rows, -2), amplitude.split(rows, -2)]
+        outputs = [corrected.split(rows, -2), valid.split(rows, -2)]
+        for k, offset in enumerate(self.error.offset.split(rows)):
+            given, own = (parts[0][k], parts[1][k]), (outputs[0][k], outputs[1][k])
+            self.correct(given[0], given[1], offset, k * rows, own[0], own[1])
 
     def correct(
         self,
         depth: Tensor,
         amplitude: Tensor,
         offset: Tensor,
-        radial_of_z: Tensor,
-        rows: Tensor,
+        first: int,
         corrected: Tensor,
         valid: Tensor,
     ) -> None:
-        """Correct rows into `corrected` and `valid` (bool, or any type that holds 0 and 1).
+        """Correct rows, from the number `first` on, into `corrected` and `valid` (bool or number).
 
         Speed depends on the number of arrays that each operation reads and writes. So `corrected`
         also holds intermediate results, and masks are float 0 and 1: comparisons that give bool
         are not vectorised.
         """
-        radial = depth * radial_of_z if self.is_z else depth
+        rows, radial_of_z, radial = self.error.rows, self.radial_of_z, depth
+        if depth.shape[-2] < self.height:
+            rows = rows[first : first + depth.shape[-2]]
+            radial_of_z = radial_of_z[first : first + depth.shape[-2]] if self.is_z else radial_of_z
+        if self.is_z:
+            radial = depth * radial_of_z
         # A missing return becomes NaN here, and stays NaN in all that follows.
         distance = self.radial_range.held(radial)
         error = self.error.distance(offset, distance, corrected)
@@ -361,7 +360,7 @@ class RuntimeErrorModel(nn.Module):
         inside = True
         for term in self.condition_terms:
             error = error + term(conditions)
-            inside = inside and term.inside(conditions)  # type: ignore[operator]
+            inside = inside and bool(term.covers(conditions))  # type: ignore[operator]
         self.offset.copy_(self.offset_at_mean + self.factor * float(error))
         return inside
 

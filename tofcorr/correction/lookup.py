@@ -86,21 +86,14 @@ def read_lut(path: Path | str) -> LookupTable:
     try:
         with np.load(path, allow_pickle=False) as file:
             metadata = json.loads(str(file["metadata"]))
-            arrays = {name: file[name] for name in ("offset", "table", "radial_of_z")}
+            arrays = {n: np.asarray(file[n]) for n in ("offset", "table", "radial_of_z")}
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
     except (*_UNREADABLE, zipfile.BadZipFile):
         raise CalibrationDataError(
             f"{path}: is not a look-up table that tofcorr export wrote."
         ) from None
-    mark = metadata.get("lut") if isinstance(metadata, dict) else None
-    if not isinstance(mark, dict) or mark.get("format") != FORMAT:
-        raise CalibrationDataError(f"{path}: is not a look-up table that tofcorr export wrote.")
-    if mark.get("version") != 1:
-        raise CalibrationDataError(f"{path}: is a table of another version of tofcorr.")
     known = LutMetadata.from_mapping(metadata, f"{path}, metadata", CalibrationDataError)
-    if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-        raise CalibrationDataError(f"{path}: is damaged: one of its arrays is none.")
     _refuse_other_arrays(arrays, known, path)
     return LookupTable(**arrays, metadata=metadata)
 
@@ -119,15 +112,20 @@ def _refuse_other_arrays(
 ) -> None:
     """Refuse arrays that do not fit the metadata, or were changed."""
     shapes = {name: array.shape for name, array in arrays.items()}
-    size, camera = shapes["offset"], metadata.camera
+    size, camera, validity = shapes["offset"], metadata.camera, metadata.validity
     rows, columns = shapes["table"] if len(shapes["table"]) == 2 else (0, 0)
-    fits = len(size) == 2 and min(size) > 0 and shapes["radial_of_z"] in (size, (1, 1))
-    fits = fits and (camera.height or size[0], camera.width or size[1]) == size
-    fits = fits and rows > 1 and columns > 0
-    if columns > 1 or metadata.validity.normalised_amplitude is not None:
-        fits = fits and metadata.validity.amplitude is not None
-    numbers = all(a.dtype.kind == "f" and np.isfinite(a).all() for a in arrays.values())
-    if not fits or not numbers:
+    reads_amplitude = columns > 1 or validity.normalised_amplitude is not None
+    fits = (
+        len(size) == 2
+        and min(size) > 0
+        and (camera.height or size[0], camera.width or size[1]) == size
+        and shapes["radial_of_z"] in (size, (1, 1))
+        and rows > 1
+        and columns > 0
+        and not (reads_amplitude and validity.amplitude is None)
+        and all(one.dtype.kind == "f" and np.isfinite(one).all() for one in arrays.values())
+    )
+    if not fits:
         raise CalibrationDataError(
             f"{path}: is damaged: its arrays do not fit each other and the metadata, or hold "
             f"numbers that are not finite; shapes {shapes}."

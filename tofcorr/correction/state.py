@@ -4,7 +4,6 @@ import io
 import math
 import pickle
 import platform
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -17,7 +16,7 @@ from tofcorr.correction.model import CalibrationModel, FrameCorrection, HandEye
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
-from tofcorr.errors import CalibrationDataError
+from tofcorr.errors import CalibrationDataError, TofcorrError
 from tofcorr.files import refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
 from tofcorr.options import LARGEST_NUMBER, FiniteNumber, Options, PositiveNumber, one_line
@@ -39,18 +38,13 @@ def _float64(values: Tensor) -> Tensor:
         raise ValueError(f"expected a dense tensor of float64, got {values.dtype}")
     if not bool(values.isfinite().all()):
         raise ValueError("expected finite numbers")
-    if values.numel() and float(values.abs().max()) > LARGEST_NUMBER:
+    if bool((values.abs() > LARGEST_NUMBER).any()):
         raise ValueError(f"expected numbers of at most {LARGEST_NUMBER:g}")
-    return values
-
-
-def _square(values: Tensor) -> Tensor:
-    if values.dim() != 2 or values.shape[0] != values.shape[1]:
-        raise ValueError(f"expected shape (K, K), got {tuple(values.shape)}")
-    return values
+    return values.detach().cpu().clone()
 
 
 Float64 = Annotated[InstanceOf[Tensor], AfterValidator(_float64)]
+"""Finite numbers, kept as a copy on the CPU."""
 
 
 class HandEyeAccuracy(Options):
@@ -97,18 +91,15 @@ class CalibrationExtras(Options):
         hand_eye_accuracy: Standard errors of the hand-eye transform; None if unknown.
     """
 
-    covariance: Annotated[Float64, AfterValidator(_square)] | None = None
+    covariance: Float64 | None = None
     noise: _Three | None = None
     frames: FrameNames = FrameNames()
     hand_eye_accuracy: HandEyeAccuracy | None = None
 
-    def extras(self) -> dict[str, Any]:
-        """Return these four by name."""
-        return {name: getattr(self, name) for name in CalibrationExtras.model_fields}
-
-    def file_values(self) -> dict[str, Any]:
-        """Return all fields in types that are read back without a class."""
-        return {name: _plain(getattr(self, name)) for name in type(self).model_fields}
+    def extras(self) -> "CalibrationExtras":
+        """Return these four alone."""
+        own = {name: getattr(self, name) for name in CalibrationExtras.model_fields}
+        return CalibrationExtras(**own)
 
 
 class CalibrationState(CalibrationExtras):
@@ -143,21 +134,44 @@ class CalibrationState(CalibrationExtras):
     residual: ResidualState | None = None
 
     @model_validator(mode="after")
-    def _shapes_agree(self) -> Self:
+    def _numbers_fit(self) -> Self:
+        """Refuse more or fewer numbers than the terms have, and a transform that is not rigid."""
         size = (self.domain.height, self.domain.width)
         if (self.camera.height, self.camera.width) != size:
             raise ValueError("'camera' and 'domain' disagree on the size of the image")
-        number = self.coefficients.numel()
-        for name, shape in (
-            ("coefficients", (number,)),
-            ("tool_from_camera", (4, 4)),
-            ("covariance", (number, number)),
-            ("fixed_pattern", size),
+        model, residual = ErrorModel(self.error_model, self.domain), self.residual
+        number = len(model.symbols())
+        network = residual and ResidualNetwork(residual.options, self.domain)
+        for name, values, shape in (
+            ("coefficients", self.coefficients, (number,)),
+            ("tool_from_camera", self.tool_from_camera, (4, 4)),
+            ("covariance", self.covariance, self.covariance is not None and (number, number)),
+            ("fixed_pattern", self.fixed_pattern, model.fixed_pattern is not None and size),
+            ("residual", residual and residual.weights, network and network.weight_vector().shape),
         ):
-            values = getattr(self, name)
-            if values is not None and tuple(values.shape) != shape:
-                raise ValueError(f"'{name}': expected shape {shape}, got {tuple(values.shape)}")
+            found = None if values is None else tuple(values.shape)
+            if found != (shape or None):
+                raise ValueError(f"'{name}': expected shape {shape or None}, got {found}")
+        HandEye(self.tool_from_camera)
         return self
+
+    @classmethod
+    def of(cls, error: ErrorModel, **known: Any) -> Self:  # noqa: ANN401 - the other fields
+        """Return the numbers of an error model as a calibration, beside what else is known.
+
+        An untrained network adds nothing, and is left out: not every format can hold a network.
+        """
+        pattern, network = error.fixed_pattern, error.residual
+        residual = None
+        if network is not None and bool(network.last.weight.any() or network.last.bias.any()):
+            weights = network.weight_vector().double()
+            residual = ResidualState(options=network.options, weights=weights)
+        return cls(
+            coefficients=error.coefficient_vector().double(),
+            fixed_pattern=None if pattern is None else pattern.offset.double(),
+            residual=residual,
+            **known,
+        )
 
     def model(self) -> CalibrationModel:
         """Build the float64 model with these coefficients."""
@@ -227,10 +241,7 @@ def save_calibration(path: Path | str, state: CalibrationState) -> None:
     Raises:
         CalibrationDataError: The file cannot be written.
     """
-    content = io.BytesIO()
-    torch.save({"format": _FORMAT, "version": 1, **state.file_values()}, content)
-    with staged_file(Path(path), CalibrationDataError) as part:
-        part.write_bytes(sealed(content))
+    save_values(path, _FORMAT, state.model_dump(), CalibrationDataError)
 
 
 def load_calibration(path: Path | str) -> CalibrationState:
@@ -240,28 +251,32 @@ def load_calibration(path: Path | str) -> CalibrationState:
         CalibrationDataError: There is no such file, or it is not a calibration.
     """
     path = Path(path)
-    if not path.is_file():
-        raise CalibrationDataError(
-            f"{path}: there is no such file; a run folder of tofcorr train holds it."
-        )
     refuse_damaged(path, _WHAT)
-    values = read_values(path, _FORMAT, "this package reads version 1")
+    values = read_values(path, _FORMAT)
     if values is None:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
-    state = CalibrationState.from_mapping(values, str(path), CalibrationDataError)
-    _refuse_other_numbers(state, path)
-    try:
-        state.model()
-    except ValueError as error:  # No rotation, for example.
-        raise CalibrationDataError(f"{path}: {error}") from None
-    return state
+    return CalibrationState.from_mapping(values, str(path), CalibrationDataError)
 
 
-def read_values(path: Path, form: str, reads: str) -> dict[str, Any] | None:
-    """Return the values of a file of torch but format and version; None: of another format.
+def save_values(
+    path: Path | str, form: str, values: dict[str, Any], kind: type[TofcorrError]
+) -> None:
+    """Write plain values and tensors for `read_values`, whole or not at all.
 
     Raises:
-        CalibrationDataError: It has another version; the message says which one is read.
+        TofcorrError: Of kind `kind`: the file cannot be written.
+    """
+    content = io.BytesIO()
+    torch.save({"format": form, "version": 1, **values}, content)
+    with staged_file(path, kind) as part:
+        part.write_bytes(sealed(content))
+
+
+def read_values(path: Path, form: str) -> dict[str, Any] | None:
+    """Return the values of a file that `save_values` wrote; None: of another format.
+
+    Raises:
+        CalibrationDataError: It has another version.
     """
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
@@ -271,38 +286,5 @@ def read_values(path: Path, form: str, reads: str) -> dict[str, Any] | None:
         return None
     found = one_line(str(values.get("version")))
     if found != "1":
-        raise CalibrationDataError(f"{path}: has version {found}, {reads}.")
+        raise CalibrationDataError(f"{path}: has version {found}, this package reads 1.")
     return {key: value for key, value in values.items() if key not in ("format", "version")}
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401 - of any field
-    if isinstance(value, Tensor):
-        return value.detach().cpu().clone()
-    if isinstance(value, ResidualState):
-        return {"options": value.options.to_mapping(), "weights": _plain(value.weights)}
-    if isinstance(value, Options):
-        return value.to_mapping()
-    if hasattr(value, "__dataclass_fields__"):
-        return {key: _plain(one) for key, one in asdict(value).items()}
-    return tuple(value) if isinstance(value, tuple) else value  # No named tuple.
-
-
-def _refuse_other_numbers(state: CalibrationState, path: Path) -> None:
-    """Refuse more or fewer numbers than the terms have, which only the terms know."""
-    try:
-        model = ErrorModel(state.error_model, state.domain)
-    except CalibrationDataError as error:
-        raise CalibrationDataError(f"{path}: {error}") from None
-    pattern, residual = model.fixed_pattern, state.residual
-    network = residual and ResidualNetwork(residual.options, state.domain)
-    wanted = {
-        "coefficients": (model.coefficient_vector(), state.coefficients),
-        "fixed_pattern": (pattern and pattern.offset, state.fixed_pattern),
-        "residual": (network and network.weight_vector(), residual and residual.weights),
-    }
-    for name, numbers in wanted.items():
-        own, found = (0 if values is None else values.numel() for values in numbers)
-        if found != own:
-            raise CalibrationDataError(
-                f"{path}: '{name}' has {found} numbers; the terms that it names need {own}."
-            )

@@ -517,10 +517,6 @@ class ConditionTerm(Term):
         """Return where the condition is within its calibrated range, shape (...), bool."""
         return self.value(conditions) == conditions[..., self.index]
 
-    def inside(self, conditions: Tensor) -> bool:
-        """Whether the condition of one frame (C,) is within its calibrated range."""
-        return bool(self.covers(conditions))
-
     @abstractmethod
     def basis(self, conditions: Tensor) -> Tensor:
         """Return the functions h_k, shape (K, ...), of conditions (..., C) as in `CONDITIONS`."""

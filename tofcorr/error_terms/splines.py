@@ -1,6 +1,7 @@
 """Curves and a surface through knots: B-splines of the distance, the amplitude, or both."""
 
 import math
+from abc import abstractmethod
 from typing import ClassVar, Literal
 
 import torch
@@ -40,13 +41,12 @@ def spline_weights(scaled: Tensor, segments: int, degree: int) -> tuple[Tensor, 
     return first, [value / 6 for value in [g * other, inner, mirrored, f * square]]
 
 
-def spline_basis(scaled: Tensor, segments: int, degree: int) -> Tensor:
-    """Return all B-splines, shape (segments + degree, ...), of a variable scaled to [-1, 1]."""
-    first, weights = spline_weights(scaled, segments, degree)
-    basis = torch.zeros([segments + degree] + list(scaled.shape)).to(scaled)  # noqa: RUF005
-    for k in range(degree + 1):
-        basis = basis.scatter(0, (first + k).unsqueeze(0), weights[k].unsqueeze(0))
-    return basis
+def placed(positions: list[Tensor], weights: list[Tensor], size: int) -> Tensor:
+    """Return all functions, shape (size, ...), of which those at some positions are not zero."""
+    functions = torch.zeros([size] + list(weights[0].shape)).to(weights[0])  # noqa: RUF005
+    for k in range(len(positions)):
+        functions = functions.scatter(0, positions[k].unsqueeze(0), weights[k].unsqueeze(0))
+    return functions
 
 
 def with_middle(coefficients: Tensor) -> Tensor:
@@ -128,7 +128,31 @@ class IncidentLightOptions(SplineOptions):
     letter: ClassVar[str] = "a"
 
 
-class SignalSpline(CurveTerm):
+class SplineTerm(SignalTerm):
+    """A sum of splines, or of their products, of which few are not zero at any place."""
+
+    @abstractmethod
+    def nonzero(
+        self, radial_distance: Tensor, amplitude: Tensor
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the numbers of the functions that are not zero, and their values, each (...)."""
+
+    def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+        """Return the functions but the middle one, shape (K, ...)."""
+        positions, weights = self.nonzero(radial_distance, amplitude)
+        return without_middle(placed(positions, weights, self.coefficients.shape[0] + 1))
+
+    def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+        """Return the predicted error, shape (...), metres: from the functions not zero."""
+        full = with_middle(self.coefficients)
+        positions, weights = self.nonzero(radial_distance, amplitude)
+        value = weights[0] * full[positions[0]]
+        for k in range(1, len(weights)):
+            value = value + weights[k] * full[positions[k]]
+        return value
+
+
+class SignalSpline(SplineTerm, CurveTerm):
     r"""Curve over one variable of the signal, made of B-splines.
 
     .. math:: E(u) = \sum_{k \ne m} c_k B_k(u), \quad u = (x - \bar x) / h
@@ -167,19 +191,13 @@ class SignalSpline(CurveTerm):
         self.degree: int = options.degree
         self.segments: int = options.segments
 
-    def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
-        """Return the B-splines but the middle one, shape (K, ...)."""
+    def nonzero(
+        self, radial_distance: Tensor, amplitude: Tensor
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the B-splines that are not zero."""
         scaled = self.scaled(radial_distance, amplitude)
-        return without_middle(spline_basis(scaled, self.segments, self.degree))
-
-    def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
-        """Return the predicted error, shape (...), metres: from the splines that are not zero."""
-        full, scaled = with_middle(self.coefficients), self.scaled(radial_distance, amplitude)
         first, weights = spline_weights(scaled, self.segments, self.degree)
-        value = weights[0] * full[first]
-        for k in range(1, self.degree + 1):
-            value = value + weights[k] * full[first + k]
-        return value
+        return [first + k for k in range(self.degree + 1)], weights
 
     def axes(self) -> tuple[Axis, ...]:
         """Return the variable, with the knots."""
@@ -207,7 +225,7 @@ class TensorSplineOptions(SplineOptions):
     needs: ClassVar[tuple[str, ...]] = ("amplitude",)
 
 
-class TensorSpline(SignalTerm):
+class TensorSpline(SplineTerm):
     r"""Surface over measured distance and amplitude, made of products of cubic B-splines.
 
     .. math:: S(u, w) = \sum_{(j, k) \ne m} t_{jk} B_j(u) B_k(w)
@@ -248,31 +266,20 @@ class TensorSpline(SignalTerm):
             self.register_interval(prefix, domain.interval(variable))  # type: ignore[arg-type]
         self.register_number("floor", domain.amplitude_floor())
 
-    def scaled(self, radial_distance: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the scaled distance u and the scaled amplitude or its logarithm w, (...)."""
+    def nonzero(
+        self, radial_distance: Tensor, amplitude: Tensor
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the products that are not zero."""
         value = variable_of(self.variable, radial_distance, amplitude, self.floor)
         u = (radial_distance - self.centre) / self.half_width
-        return u, (value - self.amplitude_centre) / self.amplitude_half_width
-
-    def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
-        """Return the products but the middle one, shape (K, ...)."""
-        u, w = self.scaled(radial_distance, amplitude)
-        along = spline_basis(u, self.distance_segments, 3)
-        across = spline_basis(w, self.amplitude_segments, 3)
-        return without_middle((along.unsqueeze(1) * across.unsqueeze(0)).flatten(0, 1))
-
-    def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
-        """Return the predicted error, shape (...), metres: from the products that are not zero."""
-        full, columns = with_middle(self.coefficients), self.amplitude_segments + 3
-        u, w = self.scaled(radial_distance, amplitude)
+        w = (value - self.amplitude_centre) / self.amplitude_half_width
         row, along = spline_weights(u, self.distance_segments, 3)
         column, across = spline_weights(w, self.amplitude_segments, 3)
-        total = torch.zeros_like(u)
-        for j in range(4):
-            start = (row + j) * columns + column
-            for k in range(4):
-                total = total + along[j] * across[k] * full[start + k]
-        return total
+        columns, size = self.amplitude_segments + 3, len(across)
+        start = row * columns + column
+        # TorchScript knows no comprehension over two ranges.
+        positions = [start + (columns * (i // size) + i % size) for i in range(size * size)]
+        return positions, [along[i // size] * across[i % size] for i in range(size * size)]
 
     def axes(self) -> tuple[Axis, ...]:
         """Return the distance and the amplitude or its logarithm, with the knots."""

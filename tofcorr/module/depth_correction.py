@@ -1,7 +1,6 @@
 """The correction as an `nn.Module`: error terms, residual network and hand-eye as parameters."""
 
 import copy
-import io
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -20,18 +19,18 @@ from tofcorr.correction.state import (
     STATE_FILE,
     CalibrationExtras,
     CalibrationState,
-    ResidualState,
     load_calibration,
     read_values,
+    save_values,
 )
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.base import Domain, Interval, decode, encode
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.error_terms.residual import ResidualNetwork
-from tofcorr.errors import CalibrationDataError, ConfigError, StateError
+from tofcorr.errors import CalibrationDataError, ConfigError, ExportError, StateError
 from tofcorr.estimation.solvers import Watcher
-from tofcorr.files import refuse_damaged, sealed, staged_file
+from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
 from tofcorr.module.fitting import FitReport, fit_to
 from tofcorr.options import Options, PositiveNumber, load_options, one_line, resolve_options
@@ -259,11 +258,8 @@ class DepthCorrection(FrameCorrection):
         Raises:
             ExportError: The file cannot be written.
         """
-        values = {"format": FORMAT, "version": 1}
-        content = io.BytesIO()
-        torch.save({**values, "state": self.state_dict(), **self.extras.file_values()}, content)
-        with staged_file(file) as staged:
-            staged.write_bytes(sealed(content))
+        values = {"state": self.state_dict(), **self.extras.model_dump()}
+        save_values(file, FORMAT, values, ExportError)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -275,8 +271,6 @@ class DepthCorrection(FrameCorrection):
         path = Path(path)
         if path.is_dir():
             return cls._from_run(path)
-        if not path.is_file():
-            raise CalibrationDataError(f"{path}: there is no such file or run folder.")
         refuse_damaged(path, "a calibration or a module that tofcorr wrote")
         with zipfile.ZipFile(path) as archive:
             is_scripted = any("/code/" in name for name in archive.namelist())
@@ -285,7 +279,7 @@ class DepthCorrection(FrameCorrection):
                 f"{path}: is a corrector in TorchScript, which holds no parameters to fit: use it "
                 "by torch.jit.load, or load the run folder that it was written in."
             )
-        values = read_values(path, FORMAT, "this package reads 1")
+        values = read_values(path, FORMAT)
         if values is None:
             return cls._from_calibration(load_calibration(path), None)
         return cls._from_values(values, path)
@@ -306,31 +300,22 @@ class DepthCorrection(FrameCorrection):
 
     def to_state(self) -> CalibrationState:
         """Return the module as a calibration, which exporters read."""
-        error = self.error_model
-        pattern, network = error.fixed_pattern, error.residual
-        residual = None
-        # An untrained network adds nothing; not every format can hold a network.
-        if network is not None and bool(network.last.weight.any() or network.last.bias.any()):
-            weights = network.weight_vector().double().cpu()
-            residual = ResidualState(options=network.options, weights=weights)
-        return CalibrationState(
+        return CalibrationState.of(
+            self.error_model,
             name=self.options.name,
             error_model=self.terms,
             domain=self.domain,
-            coefficients=error.coefficient_vector().double().cpu(),
-            tool_from_camera=self.hand_eye().detach().double().cpu(),
+            tool_from_camera=self.hand_eye().double(),
             hand_eye_estimated=self.hand_eye_estimated,
             camera=self.camera,
             depth_kind=self.depth_kind,
             saturation_amplitude=self.saturation_amplitude,
-            fixed_pattern=None if pattern is None else pattern.offset.detach().double().cpu(),
-            residual=residual,
-            **self.extras.extras(),
+            **dict(self.extras),
         )
 
     def labels(self) -> Labels:
         """Return what the module says of itself besides its numbers."""
-        return Labels(**{name: getattr(self, name) for name in Labels.model_fields})
+        return Labels.model_validate(self, from_attributes=True)
 
     def description(self) -> dict[str, Any]:
         """Return what a state must agree on to be loaded."""
@@ -387,7 +372,7 @@ class DepthCorrection(FrameCorrection):
         self.hand_eye.rebase(state.tool_from_camera)
         if state.hand_eye_estimated != self.hand_eye_estimated:
             self.hand_eye.twist.requires_grad_(state.hand_eye_estimated)
-        self.extras = CalibrationExtras(**state.extras())
+        self.extras = state.extras()
         named = {name: getattr(state, name) for name in Labels.model_fields if hasattr(state, name)}
         self._set_labels(self.labels().model_copy(update={**named, "terms": state.error_model}))
 
@@ -417,17 +402,20 @@ class DepthCorrection(FrameCorrection):
             entry = _ModuleFile.from_mapping(values, str(path))
             state = entry.state
             labels = Labels.from_mapping(decode(state["_extra_state"])["labels"], str(path))
-            module = cls._of_labels(labels).to(state["error_model.constant"].dtype)
-            _refuse_no_numbers(state)
-            module.load_state_dict(state)
+            # The terms found are those of the options: what was `auto` may differ in size.
+            terms = labels.options.model_copy(update={"model": labels.terms})
+            module = cls(labels.camera, terms, ranges=labels.domain)
+            module.to(state["error_model.constant"].dtype).load_state_dict(state)
             module.hand_eye.twist.requires_grad_(labels.hand_eye_estimated)
+            module.extras = entry.extras()
+            _refuse_no_numbers(state)
+            module.to_state()  # Refuses other numbers than the terms have.
         except (ConfigError, StateError) as error:
             raise CalibrationDataError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
         except (LookupError, ValueError, TypeError, RuntimeError) as error:
             # For example a tensor of another shape than the module's, in load_state_dict.
             why = one_line(" ".join(str(error).split()))
             raise CalibrationDataError(f"{path}: is damaged ({why}).") from None
-        module.extras = CalibrationExtras(**entry.extras())
         return module
 
     @classmethod
@@ -452,30 +440,17 @@ class DepthCorrection(FrameCorrection):
                 model=state.error_model,
                 residual=residual,  # type: ignore[arg-type]
             )
-        named = {name: getattr(state, name) for name in Labels.model_fields if hasattr(state, name)}
-        named |= {"options": options, "terms": state.error_model, "hand_eye_estimated": True}
-        module = cls._of_labels(Labels(**named))
+        terms = options.model_copy(update={"model": state.error_model})
+        module = cls(state.camera, terms, ranges=state.domain)
+        module.options = options
         module._take_over(state)
-        return module
-
-    @classmethod
-    def _of_labels(cls, labels: Labels) -> Self:
-        # The terms found are known to be those of the options: what was `auto` may differ in size.
-        module = cls(
-            labels.camera,
-            labels.options.model_copy(update={"model": labels.terms}),
-            ranges=labels.domain,
-            depth_kind=labels.depth_kind,
-            saturation_amplitude=labels.saturation_amplitude,
-        )
-        module._set_labels(labels)
         return module
 
 
 def _refuse_no_numbers(state: Mapping[str, Tensor]) -> None:
     """Refuse values that no parameter and no buffer can have."""
     for name, values in state.items():
-        if values.is_floating_point() and bool(values.isnan().any()):
+        if bool(values.isnan().any()):
             raise ValueError(f"'{name}' holds what is not a number")
 
 

@@ -1,23 +1,18 @@
 """The fit of a module to recordings, as `tofcorr train` does it, and what it found."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.pixels.dataset import Dataset, resolved_planes, split_frames
-from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.plausibility.examine import vet
-from tofcorr.training import report as reporting
 from tofcorr.training.calibration import TrainingOptions, calibrate
-from tofcorr.training.judgement import against_garbage, frames_left_out, warnings
-from tofcorr.training.report import hand_eye_summary
+from tofcorr.training.judgement import against_garbage, frames_left_out
+from tofcorr.training.report import training_report
 from tofcorr.training.run import calibration_state
-from tofcorr.training.support import recording_support
 
 _HEADINGS = ("before", "hand-eye only", "after")
 
@@ -116,47 +111,30 @@ def fit_to(
     planes = resolved_planes(options.planes, dataset.recordings)
     inspection = vet(dataset, planes, force=force)
     options = against_garbage(options, inspection)
-    left_out = frames_left_out(inspection, [split_frames(dataset, options.split)[0]])
-    dataset = usable_pixels(
-        dataset,
-        options,
-        robust=options.weights.robust != "none",
-        frames=split_frames(dataset, options.split)[0],
-    )
+    frames, _ = split_frames(dataset, options.split)
+    left_out = frames_left_out(inspection, [frames])
+    robust = options.weights.robust != "none"
+    dataset = usable_pixels(dataset, options, robust=robust, frames=frames)
     found = calibrate(dataset, options, watcher, left_out=left_out)
-    result, training, test, errors = found.fit, found.train, found.test, found.errors
-    measured = test if len(test) else training
-    summary = reporting.error_summary(errors, training, test)
-    best = result.solution.parameters
-    support = recording_support(found.data, training, best.tool_from_camera)
-    hand_eye = hand_eye_summary(result, dataset.first.frame_names)
-    noise_mm = 1e3 * inspection.look.noise_rms
+    told = training_report(found, options.model_copy(update={"advice": 0}), inspection)
+    half, hand_eye = "test" if len(found.test) else "train", told["hand_eye"]
+    errors = {stage: _error(halves[half]) for stage, halves in told["error_mm"].items()}
     report = FitReport(
         model=options.name,
-        before=_error(errors, "before", measured),
-        hand_eye_only=_error(errors, "hand_eye_only", measured),
-        after=_error(errors, "after", measured),
-        held_out=bool(len(test)),
-        tool_from_camera=tuple(tuple(row) for row in hand_eye["tool_from_camera"]),
+        **errors,
+        held_out=half == "test",
+        tool_from_camera=tuple(map(tuple, hand_eye["tool_from_camera"])),
         translation_se_mm=tuple(hand_eye["translation_se_mm"]),
         rotation_se_deg=tuple(hand_eye["rotation_se_deg"]),
-        stopped=str(result.solution.stopped),
-        iterations=result.solution.iterations,
-        train_frames=tuple(training.tolist()),
-        test_frames=tuple(test.tolist()),
-        warnings=(
-            *([inspection.headline] if inspection.headline else []),
-            *warnings(result, summary, support, noise_mm, robot_moves=found.data.moves),
-        ),
+        stopped=str(told["stopped"]),
+        iterations=told["iterations"],
+        train_frames=tuple(told["frames"]["train"]),
+        test_frames=tuple(told["frames"]["test"]),
+        warnings=tuple(filter(None, [inspection.headline, *told["warnings"]])),
     )
-    return calibration_state(found.data, options, result), report
+    return calibration_state(found.data, options, found.fit), report
 
 
-def _error(
-    errors: Mapping[str, FrameErrors], stage: str, frames: Sequence[int] | np.ndarray
-) -> ErrorMM:
-    numbers = np.asarray(frames)
-    if not len(numbers):
-        return ErrorMM(mean_abs=math.nan, rms=math.nan)
-    found = errors[stage]
-    return ErrorMM(mean_abs=found.mean_abs_mm(numbers), rms=found.rms_mm(numbers))
+def _error(measured: Mapping[str, float | None]) -> ErrorMM:
+    numbers = {name: math.nan if one is None else one for name, one in measured.items()}
+    return ErrorMM(**numbers)

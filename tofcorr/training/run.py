@@ -17,7 +17,6 @@ from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import (
     STATE_FILE,
     CalibrationState,
-    ResidualState,
     load_calibration,
     save_calibration,
 )
@@ -67,23 +66,17 @@ def run_reference(calibration: Calibration, state: CalibrationState) -> Referenc
 
 def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> CalibrationState:
     """Return the calibration as the numbers that a corrector is built from."""
-    recording, error, parameters = data.first, fit.model.error, fit.solution.parameters
-    network = None
-    if error.residual is not None and options.residual is not None:
-        weights = error.residual.weight_vector()
-        network = ResidualState(options=options.residual.network, weights=weights)
-    return CalibrationState(
+    recording, parameters = data.first, fit.solution.parameters
+    return CalibrationState.of(
+        fit.model.error,
         name=options.name,
         error_model=fit.options,
         domain=fit.domain,
-        coefficients=parameters.coefficients,
         tool_from_camera=parameters.tool_from_camera,
         hand_eye_estimated=parameters.hand_eye_is_free,
         camera=recording.camera,
         depth_kind=recording.depth_kind,
         saturation_amplitude=recording.saturation_amplitude,
-        fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
-        residual=network,
         covariance=fit.covariance.matrix[parameters.twist_size :, parameters.twist_size :],
         noise=None if fit.noise is None else fit.noise.coefficients,
         frames=recording.frame_names,

@@ -1,16 +1,17 @@
 """Calibrations with known hand-eye transforms, for tests of the formats that robots read."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from kinds_of_terms import DOMAIN
 from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
 from tofcorr.correction.state import CalibrationState, HandEyeAccuracy
-from tofcorr.error_terms.base import Domain, Interval
-from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 
 NAMES = FrameNames(world="base_link", tool="tool0", camera="tof_optical_frame")
@@ -27,20 +28,22 @@ TERMS = (
 )
 
 
-def calibration(transform: np.ndarray, **changed: Any) -> CalibrationState:
-    """Return a calibration of EA with a hand-eye transform (4, 4)."""
+def calibration(
+    transform: np.ndarray | None = None,
+    terms: Sequence[Mapping[str, Any]] = TERMS,
+    depth_kind: str = "z",
+    **changed: Any,
+) -> CalibrationState:
+    """Return a calibration with a hand-eye transform (4, 4) and random errors of about 20 mm."""
+    options = ErrorModelOptions.from_mapping({"terms": terms}, "test")
+    model = ErrorModel(options, changed.get("domain", DOMAIN))
+    generator = torch.Generator().manual_seed(3)
     values: dict[str, Any] = {
         "name": "EA",
-        "error_model": ErrorModelOptions.from_mapping({"terms": list(TERMS)}, "test"),
-        "domain": Domain(
-            height=5,
-            width=7,
-            radial_distance=Interval(0.5, 3.0),
-            amplitude=Interval(10.0, 900.0),
-            normalised_amplitude=Interval(10.0, 2000.0),
-        ),
-        "coefficients": torch.linspace(-0.02, 0.03, 10, dtype=torch.float64),
-        "tool_from_camera": torch.from_numpy(transform),
+        "error_model": options,
+        "domain": DOMAIN,
+        "coefficients": 0.02 * torch.randn(len(model.symbols()), generator=generator).double(),
+        "tool_from_camera": torch.eye(4).double() if transform is None else torch.tensor(transform),
         "hand_eye_estimated": True,
         "camera": CameraIntrinsics(
             width=7,
@@ -48,10 +51,13 @@ def calibration(transform: np.ndarray, **changed: Any) -> CalibrationState:
             matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
             distortion=(-0.05, 0.01, 0.001, -0.002),
         ),
-        "depth_kind": "z",
+        "depth_kind": depth_kind,
         "frames": NAMES,
         "hand_eye_accuracy": ACCURACY,
     }
+    if model.fixed_pattern is not None:
+        size = model.fixed_pattern.offset.shape
+        values["fixed_pattern"] = 0.02 * torch.randn(size, generator=generator).double()
     return CalibrationState(**(values | changed))
 
 

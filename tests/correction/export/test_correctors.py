@@ -81,7 +81,7 @@ def test_what_pt2_compiles_corrects_as_the_corrector(name: str, depth_kind: Any)
     # It loads torch's compiler, for seconds: only in the worker that runs this test.
     from tofcorr.correction.export.pt2 import CompilableCorrector
 
-    state = STATES[name](depth_kind)
+    state = calibration(depth_kind=depth_kind, **STATES[name])
     corrector = DepthCorrector.from_state(state)
     compiled = CompilableCorrector(corrector)
     many = corrector(*hard_frames(state, 20, seed=5))

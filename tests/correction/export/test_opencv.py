@@ -10,7 +10,6 @@ import torch
 from correction.export.states import ACCURACY, EYE_TO_HAND, TRANSFORMS, calibration, write
 
 from tofcorr.error_terms.base import Domain, Interval
-from tofcorr.error_terms.model import ErrorModelOptions
 
 
 @pytest.fixture
@@ -88,10 +87,9 @@ def test_the_map_of_a_whole_sensor_is_read_by_opencv(tmp_path: Path) -> None:
     camera = calibration(np.eye(4)).camera
     state = calibration(
         TRANSFORMS["general"],
+        [{"kind": "fixed_pattern"}],
         camera=type(camera)(width=width, height=height, matrix=camera.matrix),
         domain=Domain(height=height, width=width, radial_distance=Interval(0.5, 3.0)),
-        error_model=ErrorModelOptions.from_mapping({"terms": [{"kind": "fixed_pattern"}]}, "test"),
-        coefficients=torch.zeros(1, dtype=torch.float64),
         fixed_pattern=pattern,
     )
     write("opencv", state, tmp_path / "camera.yml")

@@ -40,47 +40,27 @@ def export_easy_handeye(
             ".calib; choose one of the two endings."
         )
     mount = Mount(reference, "easy_handeye")
-    mapping = (_easy_handeye if path.suffix == ".yaml" else _easy_handeye2)(mount, path.stem)
-    write_pose(path, mount.comment() + dump_yaml(mapping), _read, mount)
-
-
-def _easy_handeye(mount: Mount, name: str) -> dict[str, Any]:
-    parameters = {
-        "namespace": f"/{name}/",
-        "move_group_namespace": "/",
-        "move_group": "manipulator",
-        "eye_on_hand": not mount.frames.eye_to_hand,
-        **_frames(mount),
-    }
-    values = (*mount.translation, *mount.quaternion)
-    return {"parameters": parameters, "transformation": dict(zip(_KEYS, values, strict=True))}
-
-
-def _easy_handeye2(mount: Mount, name: str) -> dict[str, Any]:
-    parameters = {
-        "name": name,
-        "calibration_type": "eye_on_base" if mount.frames.eye_to_hand else "eye_in_hand",
-        **_frames(mount),
-        "freehand_robot_movement": True,
-        "move_group_namespace": "/",
-        "move_group": "manipulator",
-    }
-    return {"parameters": parameters, "transform": mount.mapping()}
-
-
-def _frames(mount: Mount) -> dict[str, str]:
-    """Return the names of base, effector, camera and marker."""
-    frames = mount.frames
-    base, effector = frames.world, frames.tool
-    if frames.eye_to_hand:
-        base, effector = effector, base
-    return {
+    frames, still = mount.frames, mount.frames.eye_to_hand
+    base, effector = (frames.tool, frames.world) if still else (frames.world, frames.tool)
+    parameters: dict[str, Any] = {
         "robot_base_frame": base,
         "robot_effector_frame": effector,
         "tracking_base_frame": frames.camera,
         # Both programs ask for the frame of a marker; a calibration from walls has none.
         "tracking_marker_frame": "tracking_marker",
+        "move_group_namespace": "/",
+        "move_group": "manipulator",
     }
+    if path.suffix == ".yaml":
+        parameters |= {"namespace": f"/{path.stem}/", "eye_on_hand": not still}
+        values = zip(_KEYS, (*mount.translation, *mount.quaternion), strict=True)
+        mapping = {"parameters": parameters, "transformation": dict(values)}
+    else:
+        kind = "eye_on_base" if still else "eye_in_hand"
+        parameters |= {"name": path.stem, "calibration_type": kind}
+        parameters |= {"freehand_robot_movement": True}
+        mapping = {"parameters": parameters, "transform": mount.mapping()}
+    write_pose(path, mount.comment() + dump_yaml(mapping), _read, mount)
 
 
 def _read(path: Path) -> np.ndarray:

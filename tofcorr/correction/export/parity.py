@@ -38,15 +38,14 @@ def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def measure_parity(correct: Correct, state: CalibrationState) -> tuple[float, int, int]:
-    """Compare an exported corrector with the float64 model on probing frames.
+def require_parity(correct: Correct, state: CalibrationState, tolerance: float = AGREEMENT) -> None:
+    """Refuse an export that does not agree with the float64 model on probing frames.
 
-    Returns:
-        Largest difference of corrected depths, metres; number of pixels that differ in validity, or
-        in whether they are NaN; pixels compared.
+    Raises:
+        ExportError: Depths differ by more than `tolerance` metres, or pixels in validity or in
+            whether they are NaN.
     """
-    reference = state.correction()
-    frames = probe_frames(state)
+    reference, frames = state.correction(), probe_frames(state)
     depth, amplitude = (frame.double() for frame in frames)
     corrected, valid = correct(*frames)
     expected, expected_valid = reference(depth, amplitude), reference.valid(depth, amplitude)
@@ -54,26 +53,15 @@ def measure_parity(correct: Correct, state: CalibrationState) -> tuple[float, in
     on_edge = torch.zeros_like(expected_valid)
     for d, a in ((1 + _EDGE, 1.0), (1 - _EDGE, 1.0), (1.0, 1 + _EDGE), (1.0, 1 - _EDGE)):
         on_edge |= reference.valid(depth * d, amplitude * a) != expected_valid
-    apart = (corrected.double() - expected).abs()
     lost = corrected.isfinite() != expected.isfinite()
-    wrong = lost | ((valid != expected_valid) & ~on_edge)
-    both = corrected.isfinite() & expected.isfinite()
-    largest = float(apart[both].max()) if bool(both.any()) else 0.0
-    return largest, int(wrong.sum()), depth.numel()
-
-
-def require_parity(correct: Correct, state: CalibrationState, tolerance: float = AGREEMENT) -> None:
-    """Refuse an export that does not agree with the float64 model.
-
-    Raises:
-        ExportError: Depths differ by more than `tolerance` metres, or validity differs.
-    """
-    largest, mistaken, pixels = measure_parity(correct, state)
+    mistaken = int((lost | ((valid != expected_valid) & ~on_edge)).sum())
+    # What is missing on both sides does not differ; what is missing on one was counted.
+    largest = float((corrected.double() - expected).abs().nan_to_num(0.0, 0.0).max())
     if largest > tolerance or mistaken:
         raise ExportError(
             f"The exported corrector differs from the float64 model by {largest:.1e} m "
             f"({tolerance:.0e} m allowed) and in the validity of {mistaken} of "
-            f"{pixels} pixels; nothing was written."
+            f"{depth.numel()} pixels; nothing was written."
         )
 
 

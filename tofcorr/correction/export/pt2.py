@@ -109,9 +109,7 @@ class CompilableCorrector(nn.Module):
         # By way of int32: the generated code converts float32 to uint8 in several times as long.
         valid = torch.empty_like(depth, dtype=torch.int32)
         offset = self.rows + self.columns if self.is_separable else corrector.error.offset
-        corrector.correct(
-            depth, amplitude, offset, corrector.radial_of_z, corrector.error.rows, corrected, valid
-        )
+        corrector.correct(depth, amplitude, offset, 0, corrected, valid)
         return corrected, valid.to(torch.uint8)
 
 

@@ -1,7 +1,6 @@
 """Calibrations of every kind of term, and frames with everything that a camera may send."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,26 +13,10 @@ from torch import Tensor
 
 from tofcorr.correction.state import CalibrationState, ResidualState
 from tofcorr.error_terms.base import EVERYTHING
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 
 _NO_AMPLITUDE = replace(DOMAIN, amplitude=None, normalised_amplitude=None)
-
-
-def state_of(terms: list[dict[str, Any]], depth_kind: str, **changed: Any) -> CalibrationState:
-    """Return a calibration whose coefficients are random, about 20 mm."""
-    options = ErrorModelOptions.from_mapping({"terms": terms}, "test")
-    size = ErrorModel(options, DOMAIN).coefficient_vector().shape
-    generator = torch.Generator().manual_seed(3)
-    values: dict[str, Any] = {
-        "error_model": options,
-        "domain": DOMAIN,
-        "depth_kind": depth_kind,
-        "coefficients": 0.02 * torch.randn(size, generator=generator).double(),
-        "fixed_pattern": 0.02 * torch.randn(5, 7, generator=generator).double(),
-    }
-    return calibration(np.eye(4), **(values | changed))
 
 
 def network(domain: Any = DOMAIN) -> ResidualState:
@@ -49,20 +32,20 @@ _DISTANCE = [{"kind": "distance_polynomial"}]
 _LOG = {"kind": "amplitude_polynomial", "variable": "log_amplitude", "degree": 5}
 _NORMALISED = {"kind": "amplitude_polynomial", "variable": "normalised_amplitude"}
 
-STATES: dict[str, Callable[[str], CalibrationState]] = {
-    **{kind: lambda depth, kind=kind: state_of([{"kind": kind}], depth) for kind in TERMS},
-    "a constant": lambda depth: state_of([], depth),
-    "log amplitude": lambda depth: state_of([_LOG], depth),
-    "normalised amplitude": lambda depth: state_of([*_DISTANCE, _NORMALISED], depth),
-    "saturation": lambda depth: state_of(_DISTANCE, depth, saturation_amplitude=500.0),
-    "saturation in range": lambda depth: state_of(
-        [{"kind": "amplitude_polynomial"}], depth, saturation_amplitude=700.0
-    ),
-    "network": lambda depth: state_of(_DISTANCE, depth, residual=network()),
-    "network of distance": lambda depth: state_of(
-        _DISTANCE, depth, domain=_NO_AMPLITUDE, residual=network(_NO_AMPLITUDE)
-    ),
-}
+STATES: dict[str, dict[str, Any]] = {
+    **{kind: {"terms": [{"kind": kind}]} for kind in TERMS},
+    "a constant": {"terms": []},
+    "log amplitude": {"terms": [_LOG]},
+    "normalised amplitude": {"terms": [*_DISTANCE, _NORMALISED]},
+    "saturation": {"terms": _DISTANCE, "saturation_amplitude": 500.0},
+    "saturation in range": {
+        "terms": [{"kind": "amplitude_polynomial"}], "saturation_amplitude": 700.0
+    },
+    "network": {"terms": _DISTANCE, "residual": network()},
+    "network of distance": {
+        "terms": _DISTANCE, "domain": _NO_AMPLITUDE, "residual": network(_NO_AMPLITUDE)
+    },
+}  # fmt: skip
 """Every kind of term, every variable, both kinds of saturation and of network."""
 
 
@@ -92,6 +75,6 @@ def _neighbours(value: float) -> tuple[float, float, float]:
 
 def exported(name: str, depth_kind: str, folder: Path) -> tuple[CalibrationState, Path]:
     """Return a calibration and the C file that it was exported to."""
-    state = STATES[name](depth_kind)
+    state = calibration(depth_kind=depth_kind, **STATES[name])
     write("c", state, folder / "camera.c")
     return state, folder / "camera.c"
