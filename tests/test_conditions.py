@@ -15,7 +15,7 @@ from tofcorr.data.recording import Recording, frame_conditions
 from tofcorr.data.table import FrameRow, FrameTable
 from tofcorr.error_terms.condition_terms import in_si_units, with_means
 from tofcorr.errors import CalibrationDataError
-from tofcorr.simulation.effects.inputs import FrameFacts
+from tofcorr.simulation.hooks import FrameFacts
 
 OPTIONAL = pytest.mark.parametrize("known", OPTIONAL_CONDITIONS, ids=lambda each: each.name)
 

@@ -4,19 +4,15 @@ from typing import Any
 
 import pytest
 import torch
+from seen_wall import seen_wall
 from sensor.sensors import CAMERA, ERROR, FREQUENCY, NOISE, plane_scene, sensor_file, sensor_values
 
-from tofcorr.conditions import Conditions
+from tofcorr.conditions import condition
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import FrameError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.model import SensorModel, SensorWarning
-from tofcorr.simulation.effects.registry import build_effects
-from tofcorr.simulation.hooks import FrameState
-from tofcorr.simulation.options import SensorOptions
-from tofcorr.simulation.scene import SceneOptions
-from tofcorr.simulation.simulator import SensorPipeline
 
 EFFECTS: dict[str, dict[str, Any]] = {
     "distance": {"legendre_1": 0.02, "legendre_5": -0.01},
@@ -35,42 +31,22 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "row_column_pattern": {"height": 12, "width": 16, "row_rms_m": 0.002, "column_rms_m": 0.001},
     "lens": {"focal_x": 0.01, "centre_y_px": 0.4, "radial_2": 0.02},
 }
-CONDITIONS = {
-    "timestamp_s": 90.0,
-    "integration_time_us": 800.0,
-    "room_temperature_c": 25.0,
+IN_SI = {
+    "timestamp": 90.0,
+    "integration_time": 800e-6,
+    "room_temperature": 25.0,
     "ambient": 300.0,
+}
+CONDITIONS: dict[str, float] = {
+    condition(name).column: condition(name).in_file(value) for name, value in IN_SI.items()
 }
 
 
 def simulated(effects: list[dict[str, Any]], amplitude: torch.Tensor, normal: torch.Tensor) -> Any:
     """Return the built-in simulator's expected measurement of the wall of `plane_scene`."""
-    eye = torch.eye(4, dtype=torch.float64)
-    offset = torch.tensor(1.4, dtype=torch.float64)
-    readout = {"electrons_per_count": 40.0, "converter_bits": 32}
-    sensor = SensorOptions.from_mapping(
-        {"modulation_frequency_hz": FREQUENCY, "readout": readout}, "the test"
-    )
-    state = FrameState(
-        index=0,
-        camera=CAMERA,
-        modulation_frequency=FREQUENCY,
-        electrons_per_count=40.0,
-        conditions=Conditions(
-            timestamp=90.0, integration_time=800e-6, room_temperature=25.0, ambient=300.0
-        ),
-        target="white",
-        world_from_tool_recorded=eye,
-        normal_world_recorded=normal,
-        offset_recorded=offset,
-        amplitude_recorded=amplitude,
-        generator=None,
-        world_from_tool=eye,
-        tool_from_camera=eye,
-        normal_world=normal,
-        offset=offset,
-    )
-    return SensorPipeline(CAMERA, sensor, SceneOptions(), build_effects(effects)).run(state)
+    sensor = {"modulation_frequency_hz": FREQUENCY, "readout": {"converter_bits": 32}}
+    plane = normal, torch.tensor(1.4, dtype=torch.float64)
+    return seen_wall(CAMERA, sensor, plane, effects, IN_SI, amplitude_recorded=amplitude)
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -6,19 +6,16 @@ from typing import Any
 
 import pytest
 import torch
+from seen_wall import seen_wall
 from torch import Tensor
 
-from tofcorr.conditions import Conditions
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.simulation.hooks import FrameState
-from tofcorr.simulation.options import SensorOptions
-from tofcorr.simulation.scene import SceneOptions
 from tofcorr.simulation.signal import (
     ReadoutOptions,
     read_out,
 )
-from tofcorr.simulation.simulator import SensorPipeline
 
 CAMERA = CameraIntrinsics(
     width=40, height=30, matrix=((60.0, 0.0, 19.5), (0.0, 60.0, 14.5), (0.0, 0.0, 1.0))
@@ -34,30 +31,14 @@ def measure() -> Measure:
         distance: float,
         tilt: float = 0.0,
         generator: torch.Generator | None = None,
-        integration_time: float | None = None,
+        integration_time: float = math.nan,
         **sensor: Any,
     ) -> FrameState:
         normal = torch.tensor([0.0, math.sin(tilt), -math.cos(tilt)], dtype=torch.float64)
         offset = torch.tensor(distance * math.cos(tilt), dtype=torch.float64)
-        identity = torch.eye(4, dtype=torch.float64)
-        options = SensorOptions.from_mapping(sensor, "test")
-        state = FrameState(
-            index=0,
-            camera=CAMERA,
-            modulation_frequency=options.modulation_frequency_hz,
-            electrons_per_count=options.readout.electrons_per_count,
-            conditions=Conditions(timestamp=0.0, integration_time=integration_time),
-            target="white",
-            world_from_tool_recorded=identity,
-            normal_world_recorded=normal,
-            offset_recorded=offset,
-            generator=generator,
-            world_from_tool=identity,
-            tool_from_camera=identity,
-            normal_world=normal,
-            offset=offset,
-        )
-        return SensorPipeline(CAMERA, options, SceneOptions()).run(state)
+        times = {"integration_time": integration_time}
+        plane = normal, offset
+        return seen_wall(CAMERA, sensor, plane, conditions=times, generator=generator)
 
     return look
 

@@ -39,7 +39,7 @@ def test_distance_along_the_optical_axis_is_within_its_bounds(small: Small) -> N
         scene={"plane": {"normal": [0.6, 0.0, 0.8], "offset_m": -2.0}},
     )
     for frame in _plan(options):
-        camera = frame.world_from_tool_recorded @ options.hand_eye.tool_from_camera()
+        camera = frame.facts.world_from_tool[-1] @ options.hand_eye.tool_from_camera()
         normal, offset = plane_in_frame(*options.scene.plane.tensors(), camera)
         assert 0.7 <= -offset / normal[2] <= 0.9
 
@@ -50,7 +50,7 @@ def test_distance_along_the_optical_axis_is_within_its_bounds(small: Small) -> N
 )
 def test_tilt_is_restricted_to_its_axes(small: Small, axes: str, tilted: tuple[bool, bool]) -> None:
     options = small(robot={"tilt_axes": axes, "farthest_pixel_m": None})
-    axis = torch.stack([f.world_from_tool_recorded for f in _plan(options)])
+    axis = _plan(options)[-1].facts.world_from_tool
     optical = (axis @ options.hand_eye.tool_from_camera())[:, :3, 2]
     # The wall is z = 0: tilt about x moves the optical axis along y, and the other way round.
     leans = tuple(bool((optical[:, k].abs() > 1e-9).any()) for k in range(2))
@@ -63,7 +63,7 @@ def test_robot_reaches_poses_within_its_repeatability(small: Small) -> None:
         robot={"repeatability_mm": 0.4, "repeatability_mrad": 0.7, "farthest_pixel_m": None},
     )
     frames = _plan(options)
-    recorded = torch.stack([f.world_from_tool_recorded for f in frames])
+    recorded = frames[-1].facts.world_from_tool
     reached = torch.stack([f.world_from_tool for f in frames])
     missed = se3.log(se3.inverse(recorded) @ reached)
     assert missed[:, :3].std().item() == pytest.approx(0.4e-3, rel=0.1)
@@ -79,8 +79,8 @@ def test_repeated_frames_share_their_pose(small: Small) -> None:
     assert [f.pose_id for f in frames] == [0] * 4 + [1] * 4 + [2, 3, 4, 5, 6]
     for frame in frames[1:4]:
         assert torch.equal(frame.world_from_tool, frames[0].world_from_tool)
-        assert frame.conditions.integration_time == frames[0].conditions.integration_time
-        assert frame.conditions.timestamp > frames[0].conditions.timestamp
+        assert frame.recorded("integration_time") == frames[0].recorded("integration_time")
+    assert bool((frames[-1].facts.timestamp.diff() > 0).all())
 
 
 def test_sweep_goes_away_from_the_wall(small: Small) -> None:
@@ -121,13 +121,13 @@ def test_speed_on_a_path_agrees_with_the_poses_before_and_after(small: Small) ->
         conditions={"frame_interval_s": 0.1},
     )
     frames = _plan(options)
-    times = torch.tensor([f.conditions.timestamp for f in frames], dtype=torch.float64)
-    poses = torch.stack([f.world_from_tool_recorded for f in frames])
-    truth = torch.stack([f.tool_twist for f in frames if f.tool_twist is not None])
-    estimate = tool_twists(times, poses)
-    assert estimate[[0, -1]].isnan().all()
-    # Central differences over 0.2 s of a path bent within seconds.
-    assert (estimate[1:-1] - truth[1:-1]).abs().max() < 0.05 * truth.abs().max()
+    facts = frames[-1].facts
+    truth = facts.tool_twist
+    assert truth is not None
+    error = (tool_twists(facts.timestamp, facts.world_from_tool) - truth).abs() / truth.abs().max()
+    # Parabolas over 0.2 s of a path bent within seconds; at its ends they look to one side.
+    assert error[1:-1].max() < 0.05
+    assert error.max() < 0.1
     assert all(f.pose_id is None for f in frames)
 
 
@@ -135,7 +135,7 @@ def test_speed_is_unknown_across_long_gaps() -> None:
     poses = torch.eye(4, dtype=torch.float64).expand(5, 4, 4)
     times = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1], dtype=torch.float64)
     known = ~tool_twists(times, poses).isnan().any(-1)
-    assert known.tolist() == [False, True, False, False, False]
+    assert known.tolist() == [True, True, True, False, False]
 
 
 def test_pose_that_cannot_be_is_said_so(small: Small) -> None:

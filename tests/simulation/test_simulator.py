@@ -151,7 +151,7 @@ def test_effects_act_in_every_stage_in_order(small: Small) -> None:
 
         setattr(effect, f"on_{stage}", act)
     pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (effect,))
-    state = replace(plan[0], world_from_tool=plan[0].world_from_tool_recorded)
+    state = replace(plan[0], world_from_tool=plan[0].facts.world_from_tool[-1])
     pipeline.run(state)
     assert calls == list(STAGES)
     error = state.measured_distance - state.radial_distance

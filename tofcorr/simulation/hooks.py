@@ -17,8 +17,9 @@ Everything is float64 (`signal` is complex128). Without noise the measured dista
 differentiable in every field, if effects assign new tensors and never write into existing ones.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -33,26 +34,46 @@ STAGES = ("pose", "geometry", "light", "delay", "signal", "taps", "readout")
 _NOT_YET = torch.empty(0, dtype=torch.float64)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameFacts(Conditions[Tensor]):
+    """What is recorded of F frames; None or NaN is unknown, never zero.
+
+    The conditions are those of `Conditions`, each of shape (F,), float64.
+
+    Attributes:
+        world_from_tool: Poses that the robot reports, shape (F, 4, 4).
+        normal_world: Unit normals of the target, shape (F, 3).
+        offset: d of n . x + d = 0, shape (F,), metres.
+        tool_twist: Velocity of the tool in its own frame, translation first, shape (F, 6), m/s and
+            rad/s: world_from_tool(t + dt) = world_from_tool(t) exp(twist dt).
+        approach: From which side the tool came: see `sides_of_approach`, shape (F, 3).
+    """
+
+    world_from_tool: Tensor
+    normal_world: Tensor
+    offset: Tensor
+    tool_twist: Tensor | None = None
+    approach: Tensor | None = None
+
+    def at(self, frames: slice | Sequence[int]) -> Self:
+        """Return the facts of some of the frames."""
+        known = {each.name: getattr(self, each.name) for each in fields(self)}
+        chosen: dict[str, Any] = {k: None if v is None else v[frames] for k, v in known.items()}
+        return type(self)(**chosen)
+
+
 @dataclass(kw_only=True)
 class FrameState:
     """One frame between pose and measurement; mutable, one object per frame.
 
     Known from the start:
         index: Number of the frame; frames come in the order of the recording.
-        camera: Intrinsics as recorded (the true rays may differ).
-        modulation_frequency: Hz, as recorded (the true one may differ).
-        electrons_per_count: Electrons for one count of amplitude, offset or raw sample.
-        conditions: The conditions of the frame, recorded or not; `ambient` is in counts per tap, as
-            the amplitude.
+        facts: What is recorded of this frame, the last one, and of those simulated before it;
+            `ambient` is in counts per tap, as the amplitude.
         target: Name of the target.
+        world_from_tool: True pose of the tool, shape (4, 4).
+        tool_from_camera: True hand-eye transform, shape (4, 4).
         pose_id: Frames with the same id are taken without moving; None if the robot never stops.
-        world_from_tool_recorded: The pose the robot reports, shape (4, 4).
-        normal_world_recorded: The plane's unit normal in the recording, shape (3,).
-        offset_recorded: The plane's d in n . x + d = 0 in the recording, shape (), metres.
-        tool_twist: Velocity of the tool in its own frame, translation first, shape (6,), m/s and
-            rad/s: world_from_tool(t + dt) = world_from_tool(t) exp(twist dt). None if unknown.
-        approach: Signs of the tool's last motion along the axes of the world, shape (3,), zero
-            before any; None if unknown.
         generator: Source of randomness; None: the expected measurement, nothing is drawn.
         amplitude_recorded: Counts, shape (H, W), if the brightness of the target is taken from a
             recording; None: from the target's pattern.
@@ -61,9 +82,10 @@ class FrameState:
             image.
 
     Stage pose:
+        camera: Intrinsics as recorded (the true rays may differ).
+        modulation_frequency: Hz, as recorded (the true one may differ).
+        electrons_per_count: Electrons for one count of amplitude, offset or raw sample.
         ray_directions: True unit viewing rays in the camera frame, shape (H, W, 3).
-        world_from_tool: True pose of the tool, shape (4, 4).
-        tool_from_camera: True hand-eye transform, shape (4, 4).
         normal_world: True unit normal of the target, on the camera's side, shape (3,).
         offset: True d in n . x + d = 0, shape (), metres.
 
@@ -100,24 +122,19 @@ class FrameState:
     """
 
     index: int
-    camera: CameraIntrinsics
-    modulation_frequency: float
-    electrons_per_count: float
-    conditions: Conditions[float]
+    facts: FrameFacts
     target: str
-    world_from_tool_recorded: Tensor
-    normal_world_recorded: Tensor
-    offset_recorded: Tensor
-    generator: torch.Generator | None = None
+    world_from_tool: Tensor
+    tool_from_camera: Tensor
     pose_id: int | None = None
-    tool_twist: Tensor | None = None
-    approach: Tensor | None = None
+    generator: torch.Generator | None = None
     amplitude_recorded: Tensor | None = None
     surroundings: tuple[Tensor, Tensor] | None = None
 
+    camera: CameraIntrinsics = field(init=False)
+    modulation_frequency: float = field(init=False)
+    electrons_per_count: float = field(init=False)
     ray_directions: Tensor = _NOT_YET
-    world_from_tool: Tensor = _NOT_YET
-    tool_from_camera: Tensor = _NOT_YET
     normal_world: Tensor = _NOT_YET
     offset: Tensor = _NOT_YET
 
@@ -142,6 +159,11 @@ class FrameState:
     measured_amplitude: Tensor = _NOT_YET
     measured_offset: Tensor = _NOT_YET
     raw: Tensor = _NOT_YET
+
+    def recorded(self, name: str) -> float | None:
+        """Return what is recorded of a condition of the frame; None: it is unknown."""
+        values = getattr(self.facts, name)
+        return None if values is None or values[-1].isnan() else float(values[-1])
 
     @property
     def world_from_camera(self) -> Tensor:

@@ -8,12 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.conditions import Conditions
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
-from tofcorr.simulation.hooks import FrameState
+from tofcorr.simulation.hooks import FrameFacts, FrameState
 from tofcorr.simulation.options import (
     CameraMountOptions,
     ConditionOptions,
@@ -76,25 +75,23 @@ def draw_plan(
             f"{num_frames} frames are asked for, but the options plan {len(stops)}; "
             "raise 'poses' under 'shots'."
         )
-    approach = sides_of_approach(torch.stack([commanded[stop] for stop in stops]))
+    recorded = torch.stack(commanded)[stops]
+    facts = FrameFacts(
+        world_from_tool=recorded,
+        normal_world=normal.expand(len(stops), 3),
+        offset=offset.expand(len(stops)),
+        tool_twist=torch.stack([_of_tool(twist, mount) for twist in twists])[stops],
+        approach=sides_of_approach(recorded),
+        **conditions,
+    )
     return [
         FrameState(
             index=index,
-            camera=options.camera.intrinsics(),
-            modulation_frequency=options.sensor.modulation_frequency_hz,
-            electrons_per_count=options.sensor.readout.electrons_per_count,
-            conditions=conditions[index],
+            facts=facts.at(slice(index + 1)),
             target=targets[stop],
-            pose_id=None if robot.motion == "continuous" else stop,
-            world_from_tool_recorded=commanded[stop],
-            normal_world_recorded=normal,
-            offset_recorded=offset,
-            tool_twist=_of_tool(twists[stop], mount),
-            approach=approach[index],
             world_from_tool=reached[stop],
             tool_from_camera=mount,
-            normal_world=normal,
-            offset=offset,
+            pose_id=None if robot.motion == "continuous" else stop,
         )
         for index, stop in enumerate(stops[:num_frames])
     ]
@@ -122,26 +119,32 @@ def draw_slip(robot: RobotOptions, generator: torch.Generator) -> Tensor:
     return scale * torch.randn(6, generator=generator, dtype=torch.float64)
 
 
-def tool_twists(timestamps: Tensor, world_from_tool: Tensor, longest_gap: float = 1.0) -> Tensor:
-    """Estimate the velocity of the tool from the poses before and after each frame.
+def tool_twists(timestamp: Tensor, world_from_tool: Tensor, *, longest_gap: float = 1.0) -> Tensor:
+    """Return the tool's velocity in every frame, from a parabola through it and two near it.
+
+    At the ends of a stroke both neighbours lie on one side.
 
     Args:
-        timestamps: Shape (N,), seconds, increasing.
-        world_from_tool: Shape (N, 4, 4).
-        longest_gap: Frames farther apart than this, seconds, are not used: the robot may have
-            stopped in between. One second was set by hand.
+        timestamp: Of the frames, shape (F,), seconds.
+        world_from_tool: Poses of the tool, shape (F, 4, 4).
+        longest_gap: Poses farther apart in time, seconds, do not determine the velocity between
+            them. Chosen: a robot starts and stops within a second.
 
     Returns:
-        Central differences in the tool's own frame, translation first, shape (N, 6), m/s and
-        rad/s; NaN (unknown) at both ends and where a neighbour is too far away.
+        Twists in the tool's own frame, translation first, shape (F, 6), m/s and rad/s; NaN where a
+        frame has no two others within reach, and everywhere if time does not increase.
     """
-    twists = torch.full((len(timestamps), 6), torch.nan, dtype=torch.float64)
-    gaps = timestamps.diff()
-    near = (gaps > 0) & (gaps <= longest_gap)
-    known = near[:-1] & near[1:]
-    moved = se3.inverse(world_from_tool[:-2]) @ world_from_tool[2:]
-    elapsed = timestamps[2:] - timestamps[:-2]
-    twists[1:-1][known] = se3.log(moved[known]) / elapsed[known, None]
+    count, gaps = len(timestamp), timestamp.diff()
+    twists = timestamp.new_full((count, 6), torch.nan)
+    stroke = torch.cat([gaps.new_zeros(1), (gaps > longest_gap).cumsum(0)])
+    for frame in range(count) if bool((gaps > 0).all()) else ():
+        around = (frame - 1, frame + 1, frame - 2, frame + 2)
+        near = [k for k in around if 0 <= k < count and stroke[k] == stroke[frame]][:2]
+        if len(near) == 2:
+            first, second = (timestamp[near] - timestamp[frame]).tolist()
+            moved = se3.log(se3.inverse(world_from_tool[frame]) @ world_from_tool[near])
+            twist = second / first * moved[0] - first / second * moved[1]
+            twists[frame] = twist / (second - first)
     return twists
 
 
@@ -166,29 +169,27 @@ def _draw_conditions(
     timestamps: list[float],
     stops: list[int],
     generator: torch.Generator,
-) -> list[Conditions[float]]:
-    """Return the conditions of each frame; frames of one pose have the same exposure and light."""
+) -> dict[str, Tensor]:
+    """Return the conditions of the frames, each (F,); frames of a pose share exposure and light."""
     num_poses = max(stops) + 1
     levels = torch.tensor(options.integration_time_us, dtype=torch.float64)
     level = torch.randint(len(levels), (num_poses,), generator=generator)
     low, high = options.ambient_counts
     share = torch.rand(num_poses, generator=generator, dtype=torch.float64)
     ambient = (low + (high - low) * share) * (levels[level] / levels[0])
-    conditions = []
-    for time, stop in zip(timestamps, stops, strict=True):
+    rooms, bodies = [], []
+    for time in timestamps:
         turn = 2 * math.pi * time / options.room_period_s
-        room = options.room_temperature_c + options.room_drift_c * math.sin(turn)
+        rooms.append(options.room_temperature_c + options.room_drift_c * math.sin(turn))
         warmed = (time + options.power_on_s) / options.body_time_constant_s
-        conditions.append(
-            Conditions(
-                timestamp=time,
-                integration_time=float(levels[level[stop]]) * 1e-6,
-                ambient=float(ambient[stop]),
-                room_temperature=room,
-                body_temperature=room - options.body_rise_c * math.expm1(-warmed),
-            )
-        )
-    return conditions
+        bodies.append(rooms[-1] - options.body_rise_c * math.expm1(-warmed))
+    return {
+        "timestamp": levels.new_tensor(timestamps),
+        "integration_time": levels[level[stops]] * 1e-6,
+        "ambient": ambient[stops],
+        "room_temperature": levels.new_tensor(rooms),
+        "body_temperature": levels.new_tensor(bodies),
+    }
 
 
 def _fills_image(options: SimulatorOptions) -> FillsImage:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.conditions import Conditions
+from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import DepthKind, Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
@@ -26,7 +26,7 @@ from tofcorr.options import resolve_options
 from tofcorr.progress import bar
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
-from tofcorr.simulation.hooks import STAGES, Effect, FrameState
+from tofcorr.simulation.hooks import STAGES, Effect, FrameFacts, FrameState
 from tofcorr.simulation.options import SensorOptions, SimulatorOptions
 from tofcorr.simulation.robot import draw_plan, draw_slip, hand_eye_guess, tool_twists
 from tofcorr.simulation.scene import SceneOptions, seen_reflectivity, target_named, world_from_plane
@@ -64,7 +64,7 @@ class SensorPipeline:
         scene: SceneOptions,
         effects: Sequence[Effect] = (),
     ) -> None:
-        self._rays = ray_directions(camera)
+        self._camera, self._rays = camera, ray_directions(camera)
         self._sensor = sensor
         self._scene = scene
         self._effects = tuple(effects)
@@ -75,8 +75,7 @@ class SensorPipeline:
         """Fill `state`, stage by stage.
 
         Args:
-            state: Its fields known from the start, `world_from_tool`, `tool_from_camera`,
-                `normal_world` and `offset` are set.
+            state: Its fields known from the start are set.
 
         Returns:
             The same state, measured. A pixel without a distance has NaN.
@@ -91,7 +90,10 @@ class SensorPipeline:
         return state
 
     def _pose(self, state: FrameState) -> None:
-        state.ray_directions = self._rays
+        state.camera, state.ray_directions = self._camera, self._rays
+        state.modulation_frequency = self._sensor.modulation_frequency_hz
+        state.electrons_per_count = self._sensor.readout.electrons_per_count
+        state.normal_world, state.offset = state.facts.normal_world[-1], state.facts.offset[-1]
 
     def _geometry(self, state: FrameState) -> None:
         world_from_camera = state.world_from_camera
@@ -114,7 +116,7 @@ class SensorPipeline:
             state.radial_distance,
             state.incidence_cosine,
             state.ray_directions,
-            state.conditions.integration_time,
+            state.recorded("integration_time"),
         )
         if state.amplitude_recorded is None:
             target = target_named(self._scene.targets, state.target)
@@ -126,7 +128,7 @@ class SensorPipeline:
             state.amplitude = torch.where(seen, electrons, torch.nan)
             state.reflectivity = state.amplitude / full
         # If background light is unknown, zero is assumed.
-        ambient = (state.conditions.ambient or 0.0) * electrons_per_count
+        ambient = (state.recorded("ambient") or 0.0) * electrons_per_count
         state.background = state.amplitude / light.demodulation_contrast + ambient
 
     def _delay(self, state: FrameState) -> None:
@@ -235,7 +237,9 @@ def take_frames(
     camera, effects = options.camera.intrinsics(), build_effects(options.effects)
     pipeline = SensorPipeline(camera, options.sensor, options.scene, effects)
     for planned in plan:
-        reached = planned.world_from_tool_recorded if generator is None else planned.world_from_tool
+        reached = planned.world_from_tool
+        if generator is None:
+            reached = planned.facts.world_from_tool[-1]
         yield pipeline.run(replace(planned, generator=generator, world_from_tool=reached))
 
 
@@ -246,12 +250,14 @@ def seeded(options: SimulatorOptions) -> torch.Generator:
 
 def row_of(state: FrameState, recorded: Sequence[str]) -> FrameRow:
     """Return what the recording says of a frame; `recorded` names the optional columns it has."""
-    known = {name: value for name, value in state.conditions.by_name().items() if name in recorded}
+    known: dict[str, Any] = {
+        name: state.recorded(name) for name in CONDITIONS if name in (*recorded, "timestamp")
+    }
     return FrameRow(
-        **known | {"timestamp": state.conditions.timestamp},
-        world_from_tool=state.world_from_tool_recorded.numpy(),
-        normal_world=state.normal_world_recorded.numpy(),
-        offset=float(state.offset_recorded),
+        **known,
+        world_from_tool=state.facts.world_from_tool[-1].numpy(),
+        normal_world=state.facts.normal_world[-1].numpy(),
+        offset=float(state.facts.offset[-1]),
         target=state.target,
         pose_id=state.pose_id if "pose_id" in recorded else None,
     )
@@ -322,42 +328,47 @@ def twin_frames(
     known = reflectivity == "from_recording"
     if known:
         recording.require("amplitude", "a twin that takes the reflectivity from the recording")
-    pipeline = SensorPipeline(
-        recording.camera, options.sensor, options.scene, build_effects(options.effects)
-    )
-    table = recording.frames
-    poses, nominal = torch.from_numpy(table.world_from_tool), options.sensor.modulation_frequency_hz
-    twists = tool_twists(torch.from_numpy(table.timestamp), poses)
-    approach = sides_of_approach(poses)
+    own = options.sensor.modulation_frequency_hz
+    frequency = {"modulation_frequency_hz": recording.modulation_frequency or own}
+    sensor, effects = options.sensor.model_copy(update=frequency), build_effects(options.effects)
+    pipeline = SensorPipeline(recording.camera, sensor, options.scene, effects)
+    chosen = list(range(recording.num_frames)) if indices is None else list(indices)
+    facts = facts_of(recording).at(chosen)
     reached = _reached_poses(options, recording, generator)
 
-    def simulated(index: int) -> FrameState:
-        row = table.row(index)
-        normal = torch.from_numpy(row.normal_world)
-        offset = torch.tensor(row.offset, dtype=torch.float64)
+    def simulated(place: int) -> FrameState:
+        index = chosen[place]
         state = FrameState(
             index=index,
-            camera=recording.camera,
-            modulation_frequency=recording.modulation_frequency or nominal,
-            electrons_per_count=options.sensor.readout.electrons_per_count,
-            conditions=Conditions(**row.by_name()),
-            target=row.target,
-            world_from_tool_recorded=poses[index],
-            normal_world_recorded=normal,
-            offset_recorded=offset,
-            tool_twist=None if twists[index].isnan().any() else twists[index],
-            approach=approach[index],
-            amplitude_recorded=_image(recording, "amplitude", index) if known else None,
-            surroundings=_surroundings(recording, index) if known else None,
-            generator=generator,
+            facts=facts.at(slice(place + 1)),
+            target=str(recording.frames.target[index]),
             world_from_tool=reached[index],
             tool_from_camera=tool_from_camera.to(torch.float64),
-            normal_world=normal,
-            offset=offset,
+            generator=generator,
+            amplitude_recorded=_image(recording, "amplitude", index) if known else None,
+            surroundings=_surroundings(recording, index) if known else None,
         )
         return pipeline.run(state)
 
-    return map(simulated, range(recording.num_frames) if indices is None else indices)
+    return map(simulated, range(len(chosen)))
+
+
+def facts_of(recording: Recording) -> FrameFacts:
+    """Return what a recording says of its frames; the tool's velocity follows from its poses."""
+    table = recording.frames
+    poses, known = torch.from_numpy(table.world_from_tool), table.by_name()
+    conditions: dict[str, Any] = {
+        name: None if values is None else torch.from_numpy(np.asarray(values, dtype=np.float64))
+        for name, values in known.items()
+    }
+    return FrameFacts(
+        world_from_tool=poses,
+        normal_world=torch.from_numpy(table.normal_world),
+        offset=torch.from_numpy(table.offset),
+        tool_twist=tool_twists(conditions["timestamp"], poses) if recording.moves else None,
+        approach=sides_of_approach(poses),
+        **conditions,
+    )
 
 
 def default_hand_eye(options: SimulatorOptions, recording: Recording) -> Tensor:

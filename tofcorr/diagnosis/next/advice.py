@@ -22,7 +22,8 @@ from tofcorr.diagnosis.sums.observations import (
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
-from tofcorr.simulation.effects.inputs import FrameFacts, is_clock
+from tofcorr.simulation.effects.inputs import is_clock
+from tofcorr.simulation.hooks import FrameFacts
 
 Change = tuple[str, str, Tensor]
 """A description, what of the frames' facts it changes, and that of each changed frame."""

@@ -48,8 +48,9 @@ from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.fit.walls import name_walls
 from tofcorr.geometry.rays import tangents
 from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
-from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
+from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
+from tofcorr.simulation.hooks import FrameFacts
 
 PER_WALL = 3
 """Parameters of a wall: two turns, radians, and a shift, metres."""

@@ -7,7 +7,6 @@ and the hand-eye transform.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,12 +15,12 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
-from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
+from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
-from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
+from tofcorr.simulation.hooks import FrameFacts
 from tofcorr.simulation.scene import planes_from_world
+from tofcorr.simulation.simulator import facts_of
 
 
 def even_order(height: int, width: int) -> Tensor:
@@ -189,7 +188,7 @@ def observe(recording: Recording, most_pixels: int, *, least_per_frame: int = 64
     none = torch.empty(0, dtype=torch.int64)
     every = Observations(
         recording=recording,
-        facts=_facts(recording),
+        facts=facts_of(recording),
         frame=none,
         pixel=none,
         measured=torch.empty(0, dtype=torch.float64),
@@ -200,51 +199,6 @@ def observe(recording: Recording, most_pixels: int, *, least_per_frame: int = 64
         unit=torch.from_numpy(pose_numbers(recording)),
     )
     return every.choosing(torch.arange(len(chosen)).repeat_interleave(counts), torch.cat(chosen))
-
-
-def _facts(recording: Recording) -> FrameFacts:
-    table = recording.frames
-    known: dict[str, Any] = {
-        name: None if values is None else torch.from_numpy(np.asarray(values, dtype=np.float64))
-        for name, values in table.by_name().items()
-    }
-    poses = torch.from_numpy(table.world_from_tool)
-    return FrameFacts(
-        world_from_tool=poses,
-        normal_world=torch.from_numpy(table.normal_world),
-        offset=torch.from_numpy(table.offset),
-        tool_twist=_twists(known["timestamp"], poses) if recording.moves else None,
-        approach=sides_of_approach(poses),
-        **known,
-    )
-
-
-def _twists(timestamp: Tensor, poses: Tensor, *, longest_gap: float = 1.0) -> Tensor | None:
-    """Return the tool's velocity in every frame, from a parabola through it and two near it.
-
-    At the ends of a stroke both neighbours lie on one side. None if a frame has no two others
-    within reach: then its velocity is unknown.
-
-    Args:
-        timestamp: Of the frames, shape (F,), seconds.
-        poses: Of the tool, shape (F, 4, 4).
-        longest_gap: Poses farther apart in time, seconds, do not determine the velocity between
-            them. Chosen: a robot starts and stops within a second.
-    """
-    count, gaps = len(timestamp), timestamp.diff()
-    if bool((gaps <= 0).any()):
-        return None
-    stroke = torch.cat([gaps.new_zeros(1), (gaps > longest_gap).cumsum(0)])
-    twists = torch.empty(count, 6, dtype=torch.float64)
-    for frame in range(count):
-        around = (frame - 1, frame + 1, frame - 2, frame + 2)
-        near = [k for k in around if 0 <= k < count and stroke[k] == stroke[frame]][:2]
-        if len(near) < 2:
-            return None
-        first, second = (timestamp[near] - timestamp[frame]).tolist()
-        moved = se3.log(se3.inverse(poses[frame]) @ poses[near])
-        twists[frame] = (second / first * moved[0] - first / second * moved[1]) / (second - first)
-    return twists
 
 
 def same_exposure(observations: Observations) -> list[np.ndarray]:

@@ -18,16 +18,9 @@ from torch import Tensor
 
 from tofcorr.geometry.rays import distance_along_rays, plane_in_frame
 from tofcorr.options import FiniteNumber, Options
-from tofcorr.simulation.effects.inputs import (
-    EffectInputs,
-    FrameFacts,
-    Need,
-    facts_from_state,
-    inputs_from_state,
-    joined,
-)
+from tofcorr.simulation.effects.inputs import EffectInputs, Need, inputs_from_state
 from tofcorr.simulation.effects.numerics import by_frame, by_parameters
-from tofcorr.simulation.hooks import Effect, FrameState
+from tofcorr.simulation.hooks import Effect, FrameFacts, FrameState
 
 
 class Coefficient(NamedTuple):
@@ -95,10 +88,10 @@ class CatalogueEffect(Effect, ABC):
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
         self.shape: Any = shape
-        names = [coefficient.name for coefficient in self.terms(shape)]
-        given = coefficients if coefficients is not None else torch.zeros(len(names))
-        if given.shape != (len(names),):
-            raise ValueError(f"{self.name}: expected {len(names)} coefficients: {names}.")
+        count = len(self.terms(shape))
+        given = torch.zeros(count) if coefficients is None else coefficients
+        if given.shape != (count,):
+            raise ValueError(f"{self.name}: expected {count} coefficients: {self.terms(shape)}.")
         self.coefficients = given.detach().double()
 
     @classmethod
@@ -110,10 +103,9 @@ class CatalogueEffect(Effect, ABC):
         """
         known = cls.shape_type.model_fields.keys()
         shape = cls.shape_type.from_mapping({k: values[k] for k in values.keys() & known}, where)
-        names = [coefficient.name for coefficient in cls.terms(shape)]
-        fields: dict[str, Any] = dict.fromkeys(names, (FiniteNumber, 0.0))
+        fields: dict[str, Any] = {term.name: (FiniteNumber, 0.0) for term in cls.terms(shape)}
         entry = create_model("Entry", __base__=cls.shape_type, **fields).from_mapping(values, where)
-        given = [getattr(entry, name) for name in names]
+        given = [getattr(entry, name) for name in fields]
         return cls(shape, torch.tensor(given, dtype=torch.float64))
 
     @classmethod
@@ -151,9 +143,8 @@ class CatalogueEffect(Effect, ABC):
 
     def prior_sd(self) -> Tensor:
         """Return the standard deviations of the coefficients' priors, shape (K,)."""
-        return torch.tensor(
-            [coefficient.prior_sd for coefficient in self.terms(self.shape)], dtype=torch.float64
-        )
+        deviations = [term.prior_sd for term in self.terms(self.shape)]
+        return torch.tensor(deviations, dtype=torch.float64)
 
     def with_coefficients(self, coefficients: Tensor) -> Self:
         """Return the same effect with other coefficients."""
@@ -168,7 +159,7 @@ class CatalogueEffect(Effect, ABC):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return name, constants and coefficients: an entry of a simulator's YAML."""
-        names = [coefficient.name for coefficient in self.terms(self.shape)]
+        names = [term.name for term in self.terms(self.shape)]
         values = dict(zip(names, self.coefficients.tolist(), strict=True))
         return {"name": self.name, **self.shape.to_mapping(), **values}
 
@@ -210,10 +201,6 @@ class FrameEffect(CatalogueEffect):
 
     of_frame = True
 
-    def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
-        super().__init__(shape, coefficients)
-        self._seen: list[FrameFacts] = []
-
     @abstractmethod
     def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
         """Return the shift of each frame, shape (F,), metres."""
@@ -228,8 +215,7 @@ class FrameEffect(CatalogueEffect):
 
     def on_delay(self, state: FrameState) -> None:
         """Delay the frame, given those before it."""
-        self._seen.append(facts_from_state(state))
-        add_delay(state, self.shifts(joined(self._seen), self.coefficients)[-1])
+        add_delay(state, self.shifts(state.facts, self.coefficients)[-1])
 
 
 class GeometryEffect(CatalogueEffect):
@@ -247,7 +233,7 @@ class GeometryEffect(CatalogueEffect):
         if not bool(self.coefficients.any()):
             return
         here = replace(
-            facts_from_state(state),
+            state.facts.at(slice(-1, None)),
             world_from_tool=state.world_from_tool[None],
             normal_world=state.normal_world[None],
             offset=state.offset[None],

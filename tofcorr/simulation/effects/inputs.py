@@ -1,46 +1,24 @@
 """What an effect may use of a recording or of a frame being simulated, and what it needs."""
 
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcorr.conditions import Conditions, condition
+from tofcorr.conditions import condition
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import phase_from_radial_distance, unambiguous_range
 from tofcorr.simulation.effects.image_filters import blur
-from tofcorr.simulation.hooks import FrameState
+from tofcorr.simulation.hooks import FrameFacts, FrameState
 
 # Brightness varies where its squared second differences exceed this many times the variance of its
 # noise. Chosen: four standard deviations.
 _VARIES = 16.0
 # Largest number of pixels in one batch of images. Set by hand: bounds the memory to some 100 MB.
 _CHUNK_PIXELS = 500_000
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FrameFacts(Conditions[Tensor]):
-    """What is known of F frames; None is unknown, never zero.
-
-    The conditions are those of `Conditions`, each of shape (F,), float64.
-
-    Attributes:
-        world_from_tool: Recorded poses, shape (F, 4, 4).
-        normal_world: Recorded unit normals of the target, shape (F, 3).
-        offset: Recorded d of n . x + d = 0, shape (F,), metres.
-        tool_twist: Velocity of the tool in its own frame, translation first, shape (F, 6), m/s
-            and rad/s.
-        approach: From which side the tool came: see `sides_of_approach`, shape (F, 3).
-    """
-
-    world_from_tool: Tensor
-    normal_world: Tensor
-    offset: Tensor
-    tool_twist: Tensor | None = None
-    approach: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,17 +158,13 @@ class EffectInputs:
         if key not in self._remembered:
             whole = [known(self, "amplitude_images"), known(self, "distance_images")]
             whole += [] if of_frames is None else [of_frames]
-            step = max(1, _CHUNK_PIXELS // whole[0][0].numel())
-            values = []
+            size = whole[0][0].numel()
+            step, values = max(1, _CHUNK_PIXELS // size), []
             for start in range(0, len(whole[0]), step):
-                some = (each[start : start + step] for each in whole)
-                images = function(*some, *arguments).flatten(0, 2)
-                inside = slice(None)
-                if step < len(whole[0]):
-                    inside = (self.frame >= start) & (self.frame < start + step)
-                place = (self.frame[inside] - start) * whole[0][0].numel() + self.pixel[inside]
-                every = torch.equal(place, torch.arange(len(images)))
-                values.append(images if every else images[place])
+                images = function(*(each[start : start + step] for each in whole), *arguments)
+                inside = (self.frame >= start) & (self.frame < start + step)
+                place = (self.frame[inside] - start) * size + self.pixel[inside]
+                values.append(images.flatten(0, 2)[place])
             self._remembered[key] = torch.cat(values)
         return self._remembered[key]
 
@@ -252,7 +226,7 @@ def inputs_from_state(state: FrameState) -> EffectInputs:
         camera=state.camera,
         modulation_frequency=state.modulation_frequency,
         tool_from_camera=state.tool_from_camera,
-        facts=facts_from_state(state),
+        facts=state.facts.at(slice(-1, None)),
         frame=torch.zeros(count, dtype=torch.int64),
         pixel=torch.arange(count),
         rays=state.ray_directions.reshape(-1, 3),
@@ -264,31 +238,6 @@ def inputs_from_state(state: FrameState) -> EffectInputs:
         amplitude_images=None if counts is None else counts.nan_to_num(0.0)[None],
         distance_images=state.radial_distance.nan_to_num(0.0)[None],
     )
-
-
-def facts_from_state(state: FrameState) -> FrameFacts:
-    """Return what is recorded of one simulated frame, F = 1."""
-    conditions: dict[str, Any] = {
-        name: None if value is None else torch.tensor([value], dtype=torch.float64)
-        for name, value in state.conditions.by_name().items()
-    }
-    return FrameFacts(
-        world_from_tool=state.world_from_tool_recorded[None],
-        normal_world=state.normal_world_recorded[None],
-        offset=state.offset_recorded.reshape(1),
-        tool_twist=None if state.tool_twist is None else state.tool_twist[None],
-        approach=None if state.approach is None else state.approach[None],
-        **conditions,
-    )
-
-
-def joined(facts: Sequence[FrameFacts]) -> FrameFacts:
-    """Return the facts of successive frames as those of all of them."""
-    known: dict[str, Any] = {}
-    for name in (each.name for each in fields(FrameFacts)):
-        values = [getattr(one, name) for one in facts]
-        known[name] = None if values[0] is None else torch.cat(values)
-    return FrameFacts(**known)
 
 
 # What an effect can need to know before it can be tested, and whether it is known.

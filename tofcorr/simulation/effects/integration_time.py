@@ -7,7 +7,8 @@ from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, FrameEffect
-from tofcorr.simulation.effects.inputs import INTEGRATION_TIME, EffectInputs, FrameFacts, known
+from tofcorr.simulation.effects.inputs import INTEGRATION_TIME, EffectInputs, known
+from tofcorr.simulation.hooks import FrameFacts
 
 # Integration times whose logarithms differ by less (no unit) are one setting. Set by hand: settings
 # differ by far more than 0.1 %, rounding in a file by far less.

@@ -55,7 +55,8 @@ class MotionEffect(CatalogueEffect):
 
     def on_signal(self, state: FrameState) -> None:
         """Give each sample its own distance."""
-        if state.tool_twist is None:
+        twist = state.facts.tool_twist
+        if twist is None or bool(twist[-1].isnan().any()):
             return
         inputs, number = inputs_from_state(state), torch.arange(4, dtype=torch.float64)[:, None]
         late = number * self.coefficients[0] + _first(inputs, self.coefficients)

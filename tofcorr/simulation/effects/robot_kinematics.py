@@ -9,7 +9,8 @@ from torch import Tensor
 from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
-from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs, FrameFacts
+from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs
+from tofcorr.simulation.hooks import FrameFacts
 
 # A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:
 # above what the encoders of a robot at rest report, below the play that matters.

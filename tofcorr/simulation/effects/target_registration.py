@@ -13,8 +13,8 @@ from tofcorr.simulation.effects.inputs import (
     FIXED_TARGET,
     MEASURED_PLANES,
     EffectInputs,
-    FrameFacts,
 )
+from tofcorr.simulation.hooks import FrameFacts
 
 # Planes whose entries (n, d) differ by less (no unit, metres) are one plane. Set by hand: far above
 # rounding in a file, far below any accuracy of a plane.

@@ -13,9 +13,9 @@ from tofcorr.simulation.effects.inputs import (
     ROOM_TEMPERATURE,
     TIMESTAMP,
     EffectInputs,
-    FrameFacts,
     known,
 )
+from tofcorr.simulation.hooks import FrameFacts
 
 # A pause of more mean intervals between frames than this counts as one that the camera was off in,
 # beyond them. Chosen: stations of a robot differ less, and a camera between them is left on.

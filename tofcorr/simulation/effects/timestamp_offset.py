@@ -9,7 +9,8 @@ from torch import Tensor
 from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
-from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs, FrameFacts
+from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs, known
+from tofcorr.simulation.hooks import FrameFacts
 
 
 class TimestampOffsetShape(Options):
@@ -56,8 +57,8 @@ class TimestampOffsetEffect(GeometryEffect):
     @classmethod
     def terms(cls, shape: TimestampOffsetShape) -> tuple[Coefficient, ...]:
         """Return the delay of the images, its drift, and its share of the exposure if known."""
-        known = (Coefficient("exposures", "1", 12.0),) if shape.knows_exposure else ()
-        return (Coefficient("offset_s", "s", 0.2), Coefficient("half_of_drift_s", "s", 0.1), *known)
+        times = Coefficient("offset_s", "s", 0.2), Coefficient("half_of_drift_s", "s", 0.1)
+        return (*times, Coefficient("exposures", "1", 12.0)) if shape.knows_exposure else times
 
     def in_other_recordings(self) -> Self:
         """Return the effect without the drift, which belongs to the hours of one recording."""
@@ -69,13 +70,11 @@ class TimestampOffsetEffect(GeometryEffect):
         """Move the tool to its pose at the time of the image."""
         if facts.tool_twist is None:
             return facts
-        shape, c = self.shape, coefficients
+        shape, c, twist = self.shape, coefficients, facts.tool_twist.nan_to_num(0.0)
         late = c[0] + c[1] * (facts.timestamp - shape.middle_s) / shape.half_s
         if shape.knows_exposure:
-            if facts.integration_time is None:
-                raise ValueError("timestamp_offset was fitted with integration times: unknown.")
-            late = late + c[2] * facts.integration_time
-        later = facts.world_from_tool @ _small_motion(facts.tool_twist * late[:, None])
+            late = late + c[2] * known(facts, "integration_time")
+        later = facts.world_from_tool @ _small_motion(twist * late[:, None])
         return replace(facts, world_from_tool=later)
 
 
