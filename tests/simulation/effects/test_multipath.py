@@ -10,9 +10,7 @@ from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.multipath import (
     MultipathEffect,
     MultipathShape,
-    Seen,
     camera_over_target,
-    in_every_pixel,
     light_by_surfaces,
 )
 
@@ -40,13 +38,10 @@ def test_light_by_a_floor_is_the_sum_over_its_patches() -> None:
             arriving *= -seen[2] / second
             late = np.exp(1j * turn * (first + second - distance) / 2)
             total += arriving * late / (cosine / distance**2)
-    seen_point = Seen(
-        torch.tensor(point[None, None, :2]),
-        torch.tensor([[distance]], dtype=torch.float64),
-        torch.tensor([[cosine]], dtype=torch.float64),
-        torch.tensor(camera[None]),
+    xy, place, far, slant = (
+        torch.from_numpy(np.array([v], dtype=float)) for v in (point[:2], camera, distance, cosine)
     )
-    found = light_by_surfaces(seen_point, ((-1.0, -1.0), (1.0, 1.0)), turn)[0, 0]
+    found = light_by_surfaces(xy, place, far, slant, ((-1.0, -1.0), (1.0, 1.0)), turn)[0]
     names = [term.name for term in MultipathEffect.terms(MultipathShape())]
     below = found[names.index("below_near")]
     # The first surface is 0.05 of the width beyond the edge.
@@ -71,48 +66,20 @@ def test_light_of_an_even_room_grows_as_the_direct_light_falls(inputs: EffectInp
 def test_light_by_other_ways_does_not_know_the_scale_of_the_scene(inputs: EffectInputs) -> None:
     effect = MultipathEffect.for_recording(inputs)
     low, high = effect.shape.low_xy_m, effect.shape.high_xy_m
-    camera = camera_over_target(inputs)[inputs.frame]
+    places = inputs.target_xy, camera_over_target(inputs), inputs.radial_distance
 
     def light(factor: float) -> torch.Tensor:
-        seen = Seen(
-            factor * inputs.target_xy[:, None],
-            factor * inputs.radial_distance[:, None],
-            inputs.incidence_cosine[:, None],
-            factor * camera,
-        )
+        xy, camera, distance = (factor * place for place in places)
         area = (factor * low[0], factor * low[1]), (factor * high[0], factor * high[1])
-        return light_by_surfaces(seen, area, 0.8 / factor)
+        cosine = inputs.incidence_cosine
+        return light_by_surfaces(xy, camera, distance, cosine, area, 0.8 / factor)
 
     torch.testing.assert_close(light(3.0), light(1.0), rtol=1e-9, atol=0.0)
-
-
-def test_polynomials_over_the_target_are_near_what_they_replace(inputs: EffectInputs) -> None:
-    """Every surface by itself, in every pixel, to a thousandth of its size."""
-    camera = camera_over_target(inputs)[inputs.frame]
-    pixels = Seen(
-        inputs.target_xy[:, None],
-        inputs.radial_distance[:, None],
-        inputs.incidence_cosine[:, None],
-        camera,
-    )
-    low, high = inputs.target_xy.amin(0).tolist(), inputs.target_xy.amax(0).tolist()
-    area = (low[0], low[1]), (high[0], high[1])
-
-    def light(seen: Seen) -> torch.Tensor:
-        return light_by_surfaces(seen, area, 0.8).imag
-
-    exact = light(pixels)[:, 0]
-    error = (in_every_pixel(light, inputs, 8) - exact).square().mean(0).sqrt()
-    assert bool((error < 1e-3 * exact.square().mean(0).sqrt()).all())
 
 
 def test_pixels_that_do_not_see_the_target_get_no_light_by_the_walls(inputs: EffectInputs) -> None:
     beside = inputs.target_xy.clone()
     beside[::7] = torch.nan
-    partly = replace(inputs, target_xy=beside)
-
-    def one(seen: Seen) -> torch.Tensor:
-        return torch.ones_like(seen.distance)[..., None]
-
-    found = in_every_pixel(one, partly, 1)[:, 0]
-    torch.testing.assert_close(found, torch.where(beside[:, 0].isnan(), 0.0, 1.0).double())
+    effect = MultipathEffect.for_recording(inputs)
+    light = effect.shares(replace(inputs, target_xy=beside))[:, :8]
+    assert torch.equal((light == 0).all(1), beside[:, 0].isnan())

@@ -1,12 +1,7 @@
-"""Light that reaches the target by a wall or the floor.
-
-Its ratio to the direct light is smooth over the target, so it is evaluated at few nodes of each
-frame: a polynomial through them replaces the evaluation in every pixel.
-"""
+"""Light that reaches the target by a wall or the floor."""
 
 import itertools
-from collections.abc import Callable
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -23,86 +18,6 @@ from tofcorr.simulation.effects.inputs import (
 from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.scene import planes_from_world
-
-# Nodes in each direction of a frame. Chosen: on simulated walls seen from 0.5 to 1.8 m the
-# polynomial is right to a thousandth of the light of each surface, RMS (tests).
-_NODES = 13
-
-
-class Seen(NamedTuple):
-    """Points of the target that cameras see, N of each of F cameras.
-
-    Attributes:
-        xy: In the target's coordinates, shape (F, N, 2), metres.
-        distance: From the camera, shape (F, N), metres.
-        cosine: Of the angle of incidence, shape (F, N).
-        camera: The camera in the target's coordinates, height positive, shape (F, 3), metres.
-    """
-
-    xy: Tensor
-    distance: Tensor
-    cosine: Tensor
-    camera: Tensor
-
-
-def in_every_pixel(function: Callable[[Seen], Tensor], inputs: EffectInputs, size: int) -> Tensor:
-    """Return a smooth function of the points seen in every pixel, shape (M, K); 0 off the target.
-
-    Each frame gets a polynomial through the function's values at the Chebyshev nodes of what it
-    shows. Frames of no more pixels than nodes are computed pixel by pixel.
-
-    Args:
-        function: Takes F times N points and returns real values (F, N, K).
-        inputs: The pixels.
-        size: K.
-    """
-    camera, xy = camera_over_target(inputs), inputs.target_xy
-    values = inputs.radial_distance.new_zeros(len(xy), size)
-    known = xy.isfinite().all(1) & inputs.radial_distance.isfinite()
-    on_target = known.nonzero()[:, 0]
-    frame = inputs.frame[on_target]
-    counts = torch.bincount(frame, minlength=len(camera)).tolist()
-    for number, own in enumerate(on_target[frame.argsort(stable=True)].split(counts)):
-        if 0 < len(own) <= _NODES**2:
-            distance, cosine = inputs.radial_distance[own], inputs.incidence_cosine[own]
-            seen = Seen(xy[own][None], distance[None], cosine[None], camera[number][None])
-            values[own] = function(seen)[0]
-        elif len(own):
-            values[own] = _on_polynomial(function, xy[own], camera[number])
-    return values
-
-
-def _on_polynomial(function: Callable[[Seen], Tensor], xy: Tensor, camera: Tensor) -> Tensor:
-    """Return a function of one frame's points (P, 2) by a polynomial, shape (P, K)."""
-    low, high = xy.amin(0), xy.amax(0)
-    # Points on a line have no extent across it; any finite one serves.
-    middle, half = (low + high) / 2, torch.where(high > low, (high - low) / 2, 1.0)
-    angle = torch.pi * (torch.arange(_NODES, dtype=xy.dtype) + 0.5) / _NODES
-    nodes = torch.cos(angle)
-    at = middle + half * torch.cartesian_prod(nodes, nodes)
-    distance = ((at - camera[:2]).square().sum(-1) + camera[2] ** 2).sqrt()
-    seen = Seen(at[None], distance[None], (camera[2] / distance)[None], camera[None])
-    inverse = torch.linalg.inv(_chebyshev(nodes))
-    coefficients = torch.kron(inverse, inverse) @ function(seen)[0]
-    of_x, of_y = (_chebyshev(part) for part in ((xy - middle) / half).unbind(1))
-    return (of_x[:, :, None] * of_y[:, None, :]).flatten(1) @ coefficients
-
-
-def _chebyshev(scaled: Tensor) -> Tensor:
-    """Return the first Chebyshev polynomials of values (M,), shape (M, n)."""
-    return torch.cos(torch.arange(_NODES) * torch.acos(scaled.clamp(-1.0, 1.0))[:, None])
-
-
-def camera_over_target(inputs: EffectInputs) -> Tensor:
-    """Return the camera's position in the target's coordinates, height positive, (F, 3), metres."""
-    facts = inputs.facts
-    camera = (facts.world_from_tool @ inputs.tool_from_camera)[:, :, 3]
-    place = (planes_from_world(facts.normal_world, facts.offset) @ camera[:, :, None])[:, :3, 0]
-    return torch.cat([place[:, :2], place[:, 2:].abs()], dim=1)
-
-
-# Light by diffuse surfaces beside the target, relative to the direct light.
-
 
 SIDES = (("left", 0, -1.0), ("right", 0, 1.0), ("below", 1, -1.0), ("above", 1, 1.0))
 """Where surfaces stand: name, axis of the target, and sign."""
@@ -121,56 +36,56 @@ _NEAREST = 0.05
 # the direct light finite.
 _LEAST_COSINE = 0.05
 
+# Pixels evaluated at once. Chosen: what is computed of them stays in a processor's cache.
+_AT_ONCE = 10_000
+
 Area = tuple[tuple[float, float], tuple[float, float]]
 
 
-def light_by_surfaces(seen: Seen, area: Area, turn: float) -> Tensor:
+def light_by_surfaces(
+    xy: Tensor, camera: Tensor, distance: Tensor, cosine: Tensor, area: Area, turn: float
+) -> Tensor:
     """Return the light by each surface at reflectivity one, relative to the direct light.
 
     Args:
-        seen: Points of the target.
+        xy: Points of the target in its coordinates, shape (M, 2), metres.
+        camera: The camera that sees each point, height positive, shape (M, 3), metres.
+        distance: From the camera, shape (M,), metres.
+        cosine: Of the angle of incidence, shape (M,).
         area: Lowest and highest coordinates of the target that were seen, metres.
         turn: Radians a metre of distance.
 
     Returns:
-        Complex, shape (F, N, 8), in the order of `SIDES` and `BEYOND`.
+        Complex, shape (M, 8), in the order of `SIDES` and `BEYOND`.
     """
     low, high = area
     extent = max(high[0] - low[0], high[1] - low[1])
+    # Along the last axes: where a patch lies along the edge, and how high.
+    up, depth, aside = (extent * xy.new_tensor(row) for row in (_BEFORE, _DEPTH, _ASIDE))
+    aside, height = aside[:, None], camera[:, 2, None, None] - up
+    direct = (distance**2 / cosine.clamp(min=_LEAST_COSINE))[:, None, None]
     surfaces = []
     for (_, axis, sign), beyond in itertools.product(SIDES, BEYOND.values()):
-        edge = high[axis] if sign > 0 else -low[axis]
-        # Points and cameras across the surface, along it, and up.
-        order, flip = [axis, 1 - axis], seen.xy.new_tensor([sign, 1.0])
-        camera = torch.cat([seen.camera[:, order] * flip, seen.camera[:, 2:]], dim=1)
-        turned = seen._replace(xy=seen.xy[..., order] * flip, camera=camera)
-        surfaces.append(_light(turned, extent, edge + beyond * extent, turn))
+        wall = (high[axis] if sign > 0 else -low[axis]) + beyond * extent
+        lit = (wall - sign * camera[:, axis]).clamp(min=0.0)[:, None, None]
+        away = (wall - sign * xy[:, axis])[:, None, None]
+        along = (xy - camera[:, :2])[:, 1 - axis, None, None] + aside
+        first = (lit**2 + along**2 + height**2).sqrt().clamp(min=_NEAREST)
+        second = (away**2 + aside**2 + up**2).sqrt().clamp(min=_NEAREST)
+        # Three cosines, and the fall of the light on both parts of the path.
+        cosines = depth * up * lit * away
+        strength = (_WIDTH * extent / torch.pi) * cosines / (first**3 * second.square().square())
+        extra = first + second - distance[:, None, None]
+        surfaces.append(torch.polar(strength * direct, turn / 2 * extra).sum((-1, -2)))
     return torch.stack(surfaces, dim=-1)
 
 
-def _light(seen: Seen, extent: float, wall: float, turn: float) -> Tensor:
-    """Return the light by a surface at right angles to the target, complex, shape (F, N).
-
-    Args:
-        seen: Points and cameras across it, along it, and up.
-        extent: Width of the field of view on the target, metres.
-        wall: Its position across, metres.
-        turn: Radians a metre of distance.
-    """
-    up, depth, aside = (extent * seen.xy.new_tensor(row) for row in (_BEFORE, _DEPTH, _ASIDE))
-    lit = (wall - seen.camera[:, 0]).clamp(min=0.0)[:, None, None, None]
-    away = (wall - seen.xy[..., 0])[..., None, None]
-    along = seen.xy[..., 1, None] + aside - seen.camera[:, 1, None, None]
-    height = (seen.camera[:, 2, None] - up)[:, None, None]
-    first = (lit**2 + along[..., None] ** 2 + height**2).sqrt().clamp(min=_NEAREST)
-    second = (away**2 + aside[:, None] ** 2 + up**2).sqrt().clamp(min=_NEAREST)
-    # Three cosines, and the fall of the light on both parts of the path.
-    cosines = depth * up * lit * away
-    strength = (_WIDTH * extent / torch.pi) * cosines / (first**3 * second.square().square())
-    direct = seen.distance**2 / seen.cosine.clamp(min=_LEAST_COSINE)
-    extra = first + second - seen.distance[..., None, None]
-    light = torch.polar(strength * direct[..., None, None], turn / 2 * extra)
-    return light.sum((-1, -2))
+def camera_over_target(inputs: EffectInputs) -> Tensor:
+    """Return the camera of each pixel in the target's coordinates, height positive, (M, 3)."""
+    facts = inputs.facts
+    target_from_world = planes_from_world(facts.normal_world, facts.offset)
+    place = (target_from_world @ facts.world_from_tool @ inputs.tool_from_camera)[:, :3, 3]
+    return inputs.of_frame(torch.cat([place[:, :2], place[:, 2:].abs()], dim=1))
 
 
 # The effect.
@@ -259,18 +174,20 @@ def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor
     """Return each coefficient's light over the direct light, shape (M, K), complex."""
     area = shape.low_xy_m, shape.high_xy_m
     turn = order * 4 * torch.pi * inputs.known_frequency / SPEED_OF_LIGHT
-
-    def surfaces(seen: Seen) -> Tensor:
-        return torch.view_as_real(light_by_surfaces(seen, area, turn)).flatten(-2)
-
-    parts = in_every_pixel(surfaces, inputs, 2 * len(SIDES) * len(BEYOND)).unflatten(-1, (-1, 2))
-    light = torch.view_as_complex(parts.contiguous())
-    far = inputs.radial_distance / shape.distance_m
-    flange = torch.polar(inputs.incidence_cosine / far**2, turn * inputs.radial_distance)
+    camera = camera_over_target(inputs)
+    distance, cosine = inputs.radial_distance, inputs.incidence_cosine
+    parts = [
+        light_by_surfaces(inputs.target_xy[k], camera[k], distance[k], cosine[k], area, turn)
+        for k in torch.arange(len(distance)).split(_AT_ONCE)
+    ]
+    light = torch.cat(parts)
+    light = light.masked_fill(light.isnan(), 0.0)  # Beside the target.
+    far = distance / shape.distance_m
+    flange = torch.polar(cosine / far**2, turn * distance)
     # What bounced more often lights the target evenly; its error grows as the direct light falls.
     low, high = (inputs.target_xy.new_tensor(v) for v in area)
     x, y = (2 * (inputs.target_xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
-    strength = far**2 / inputs.incidence_cosine.clamp(min=_LEAST_COSINE)
+    strength = far**2 / cosine.clamp(min=_LEAST_COSINE)
     smooth = strength[:, None] * side_by_side(products(x, y, 0, _ROOM_DEGREE))
     room = 1j * turn * torch.cat([smooth, (far - 1)[:, None] * smooth], dim=1)
     return torch.cat([light, room, flange[:, None]], dim=1)
