@@ -137,17 +137,12 @@ def taken(
     robot = options.robot
     scale = torch.tensor([robot.repeatability_mm] * 3 + [robot.repeatability_mrad] * 3) / 1e3
     slips = scale.double() * torch.randn(len(targets), 6, generator=generator, dtype=torch.float64)
+    times = torch.arange(len(targets), dtype=torch.float64)
+    facts = replace(plan[-1].facts, timestamp=times, world_from_tool=world_from_tool)
+    reached = world_from_tool @ se3.exp(slips)
     frames = [
-        replace(
-            frame,
-            target=target,
-            world_from_tool_recorded=pose,
-            world_from_tool=pose @ se3.exp(slip),
-            conditions=replace(frame.conditions, timestamp=float(time)),
-        )
-        for time, (frame, target, pose, slip) in enumerate(
-            zip(plan, targets, world_from_tool, slips, strict=True)
-        )
+        replace(frame, facts=facts.at(slice(k + 1)), target=targets[k], world_from_tool=reached[k])
+        for k, frame in enumerate(plan)
     ]
     with RecordingWriter(
         folder,
