@@ -56,23 +56,20 @@ def degrade(
     *,
     seed: int = 0,
     amplitude_is: AmplitudeMeaning = "amplitude",
-    chunk_pixels: int = 1_000_000,
     progress: Callable[[int], object] = lambda frames: None,
 ) -> Degraded:
     """Write what a camera would have measured where an ideal one recorded.
 
     Poses, planes and all other columns are copied. `true_depth.npy` keeps the ideal depth: that of
-    the recording, or its `depth.npy` if it has no other. Memory is bounded by `chunk_pixels`.
+    the recording, or its `depth.npy` if it has no other.
 
     Args:
         sensor: The camera: a model, its file, a shipped name such as `"kinect_v2"`.
         recording: The ideal recording, or its folder, of any scene, rendered with the camera's
             intrinsics. Its amplitude may be missing: the sensor's usual reflectivity is then used.
         out: The folder to write; it must not exist yet.
-        seed: Of all draws. Each frame has its own, so that the result does not depend on
-            `chunk_pixels`.
+        seed: Of all draws; each frame has its own.
         amplitude_is: What the amplitude of the recording holds.
-        chunk_pixels: Pixels measured at once, but at least one frame.
         progress: Called with the number of frames written since the last call.
 
     Raises:
@@ -96,42 +93,39 @@ def degrade(
     )
     slant = ray_directions(recording.camera)[..., 2].float()
     kinds = {"z": slant, "radial": torch.ones_like(slant)}
+    scale = kinds[file.depth_kind] / kinds[recording.depth_kind]
     source = "depth" if recording.true_depth is None else "true_depth"
     counts = np.zeros(3, dtype=np.int64)
     with RecordingWriter.like(out, header) as writer, torch.inference_mode():
         shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
-        step = max(1, chunk_pixels // slant.numel())
-        for start in range(0, recording.num_frames, step):
-            chunk = np.arange(start, min(start + step, recording.num_frames))
+        for number in range(recording.num_frames):
             depth, light, mask = (
-                recording.read(name, chunk) for name in (source, "amplitude", "mask")
+                recording.read(name, np.array([number])) for name in (source, "amplitude", "mask")
             )
             assert depth is not None
-            for place, number in enumerate(chunk.tolist()):
-                true_depth = torch.from_numpy(depth[place])
-                true_depth = true_depth * (kinds[file.depth_kind] / kinds[recording.depth_kind])
-                lit = None if light is None else torch.from_numpy(light[place])
-                if amplitude_is == "reflectivity" and lit is not None:
-                    _refuse_no_share(recording, lit, number)
-                # A seed of one frame, independent of those of all other frames and seeds.
-                own = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
-                measured = model(
-                    true_depth,
-                    **{amplitude_is: lit},
-                    generator=torch.Generator().manual_seed(int(own >> 1)),
-                    frame_shift=shift[number],
-                    **conditions_of_frames(recording, number),
-                )
-                writer.append(
-                    measured.depth.numpy(),
-                    amplitude=None if measured.amplitude is None else measured.amplitude.numpy(),
-                    mask=None if mask is None else mask[place],
-                    true_depth=true_depth.numpy(),
-                )
-                there = torch.isfinite(true_depth) & (true_depth > 0)
-                covered = model.covers(true_depth) & there
-                counts += [int(each.sum()) for each in (there, measured.valid, covered)]
-            progress(len(chunk))
+            true_depth = torch.from_numpy(depth[0]) * scale
+            lit = None if light is None else torch.from_numpy(light[0])
+            if amplitude_is == "reflectivity" and lit is not None:
+                _refuse_no_share(recording, lit, number)
+            # A seed of one frame, independent of those of all other frames and seeds.
+            own = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
+            measured = model(
+                true_depth,
+                **{amplitude_is: lit},
+                generator=torch.Generator().manual_seed(int(own >> 1)),
+                frame_shift=shift[number],
+                **conditions_of_frames(recording, number),
+            )
+            writer.append(
+                measured.depth.numpy(),
+                amplitude=None if measured.amplitude is None else measured.amplitude.numpy(),
+                mask=None if mask is None else mask[0],
+                true_depth=true_depth.numpy(),
+            )
+            there = torch.isfinite(true_depth) & (true_depth > 0)
+            covered = model.covers(true_depth) & there
+            counts += [int(each.sum()) for each in (there, measured.valid, covered)]
+            progress(1)
     valid_share, covered_share = (counts[1:] / max(counts[0], 1)).tolist()
     # Then most of the result rests on errors at the edge of a range, or the unit is wrong.
     if counts[0] and covered_share < 0.5:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv1d
 
-from tofcorr.error_terms.base import Domain, Interval, SignalTerm
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.noise import NoiseModel
@@ -42,9 +42,6 @@ class BaseError(nn.Module):
         self.reads_measured = section.reads == "measured_distance"
         self.model = error_model_of(section, domain)
         self.model_options = ErrorModelOptions(terms=section.terms)
-        terms = [term for term in self.model.signal_terms if isinstance(term, SignalTerm)]
-        self._at_distance = [term for term in terms if _reads_distance(term)]
-        self._at_amplitude = [term for term in terms if not _reads_distance(term)]
         self.domain = domain
         self.limits = self.model.limits(domain)
         if not self.reads_measured:
@@ -80,26 +77,16 @@ class BaseError(nn.Module):
         if conditions is not None and len(self.model.condition_terms):
             fixed = fixed + self.model.condition_error(conditions)[..., None, None]
         held = amplitude.clamp(*(self.limits.amplitude or _ANY))
-        # However the distance is iterated, the terms that do not read it stay.
-        fixed = fixed + sum((term(true, held) for term in self._at_amplitude), 0.0)
-        error = self._signal_error(true, held, fixed)
-        if self.reads_measured:
-            for _ in range(_ITERATIONS):
-                error = self._signal_error(true + error, held, fixed)
+        error = torch.zeros_like(true)
+        for _ in range(1 + _ITERATIONS if self.reads_measured else 1):
+            distance = (true + error).clamp(*self.limits.radial_distance)
+            square = distance.square()
+            normalised = (held * square).clamp(*(self.limits.normalised_amplitude or _ANY)) / square
+            error = fixed
+            for term in self.model.signal_terms:
+                strength = normalised if term.uses_normalised_amplitude else held
+                error = error + term(distance, strength)
         return error.expand(true.shape)
-
-    def _signal_error(self, distance: Tensor, amplitude: Tensor, fixed: Tensor) -> Tensor:
-        """Return `fixed` and the error of the terms that read the distance."""
-        error = fixed
-        distance = distance.clamp(*self.limits.radial_distance)
-        for term in self._at_distance:
-            strength = amplitude
-            if term.uses_normalised_amplitude:
-                square = distance.square()
-                held = self.limits.normalised_amplitude or _ANY
-                strength = (strength * square).clamp(*held) / square
-            error = error + term(distance, strength)
-        return error
 
     def covers(self, distance: Tensor, amplitude: Tensor | None) -> Tensor:
         """Return where distance, and amplitude if given, are within their measured ranges, bool."""
@@ -109,13 +96,6 @@ class BaseError(nn.Module):
             return inside
         dark, bright = self.limits.amplitude or _ANY
         return inside & (amplitude >= dark) & (amplitude <= bright)
-
-
-def _reads_distance(term: SignalTerm) -> bool:
-    polynomial, axes = term.polynomial(), term.axes()
-    if polynomial is not None:
-        return polynomial.variable != "amplitude"
-    return axes is None or any(axis.variable == "distance" for axis in axes)
 
 
 def error_model_of(section: ErrorSection, domain: Domain) -> ErrorModel:
