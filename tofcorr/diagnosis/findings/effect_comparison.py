@@ -270,7 +270,7 @@ def compare_effects(
             closed[name] = squares.squares - _squares_without(study, chosen, fitted.values)
             null = [] if left_out is None else [fitted.null(left_out)]
             gains[name] = torch.cat([fitted.gain().sum()[None], *null])
-            sizes[name] = effect.num_cells(effect.shape)
+            sizes[name] = len(effect.coefficients)
     tests = {
         name: EffectTest(
             name=name,

@@ -413,8 +413,8 @@ def _of_all_pixels(
     )
     x, y, _ = ray_directions(camera).reshape(-1, 3).T
     surface = torch.stack([torch.ones_like(x), x, y], dim=1)
-    cells = effect.cells_of_image(camera.height, camera.width)
-    sums, total = torch.zeros(2, effect.num_cells(effect.shape), dtype=torch.float64)
+    cells = effect.cells_of(torch.arange(camera.height * camera.width))
+    sums, total = torch.zeros(2, len(effect.coefficients), dtype=torch.float64)
     for frame, state in zip(frames, states, strict=True):
         measured = observations.distance_images[frame].double()
         left = (measured - state.measured_distance).flatten()

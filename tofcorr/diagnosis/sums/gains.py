@@ -315,7 +315,7 @@ class FittedMap:
     ) -> None:
         self._study, self._effect = study, effect
         # Of large images few cells hold a chosen pixel.
-        self._used, self._cells = effect.cells_of(study.inputs).unique(return_inverse=True)
+        self._used, self._cells = effect.cells_of(study.inputs.pixel).unique(return_inverse=True)
         self._observed = _without_pose(study, residual)
         self._sums = self._per_pose(self._cells, study.fit.weight * self._observed)
         self.prior_sd = max(self._agreed(), least_sd) if prior_sd is None else prior_sd
@@ -374,7 +374,7 @@ class FittedMap:
     def whole(self) -> Tensor:
         """Return the map's values estimated from all poses, shape (cells,), metres."""
         found = self._solved(self._systems.sum(0), self._sums.sum(0)[:, None])[:, 0]
-        every = torch.zeros(self._effect.num_cells(self._effect.shape), dtype=torch.float64)
+        every = torch.zeros(len(self._effect.coefficients), dtype=torch.float64)
         return every.index_copy(0, self._used, found)
 
     @cached_property

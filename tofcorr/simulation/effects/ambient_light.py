@@ -47,8 +47,7 @@ class AmbientLightEffect(LinearDelay):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "AmbientLightEffect":
         """Take the strongest background as unit."""
-        ambient = inputs.facts.ambient
-        strongest = 0.0 if ambient is None else float(ambient.max())
+        strongest = float(known(inputs.facts, "ambient").max())
         return cls(AmbientLightShape(reference_counts=strongest or 1.0))
 
     def columns(self, inputs: EffectInputs) -> Tensor:

@@ -43,9 +43,7 @@ class IntegrationTimeEffect(FrameEffect):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "IntegrationTimeEffect":
         """Take the median setting as reference, and as many terms as the settings allow."""
-        times = inputs.facts.integration_time
-        if times is None:
-            return cls(IntegrationTimeShape())
+        times = known(inputs.facts, "integration_time")
         levels = torch.unique((times.log() / _LEVEL_TOLERANCE).round())
         degree = max(1, min(3, len(levels) - 1))
         reference = float(times.median()) * 1e6

@@ -43,15 +43,9 @@ class MapEffect(CatalogueEffect):
     def sizes(cls, shape: Any) -> list[tuple[int, ...]]:  # noqa: ANN401 - each its own shape
         """Return the size of each table."""
 
-    @classmethod
-    def num_cells(cls, shape: Any) -> int:  # noqa: ANN401 - each its own shape
-        """Return the number of values."""
-        return sum(map(math.prod, cls.sizes(shape)))
-
-    @classmethod
     @abstractmethod
-    def cells(cls, shape: Any, rows: Tensor, columns: Tensor) -> Tensor:  # noqa: ANN401
-        """Return the cells that pixels (M,) lie in, shape (M, G), int64."""
+    def cells_of(self, pixel: Tensor) -> Tensor:
+        """Return the cells of pixels, flat indices (M,), shape (M, G), int64."""
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
@@ -94,34 +88,22 @@ class MapEffect(CatalogueEffect):
     @classmethod
     def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
         """Return one coefficient per cell; 10 mm is the size that Kahlmann et al. (2006) report."""
-        return _cell_terms(cls.num_cells(shape))
-
-    def cells_of(self, inputs: EffectInputs) -> Tensor:
-        """Return the cells of the chosen pixels, shape (M, G), int64."""
-        return self._cells_at(inputs.pixel, inputs.camera.width)
-
-    def cells_of_image(self, height: int, width: int) -> Tensor:
-        """Return the cells of all pixels of an image, shape (H W, G), int64."""
-        return self._cells_at(torch.arange(height * width), width)
-
-    def _cells_at(self, pixel: Tensor, width: int) -> Tensor:
-        row = torch.div(pixel, width, rounding_mode="floor")
-        return self.cells(self.shape, row, torch.remainder(pixel, width))
+        return _cell_terms(sum(map(math.prod, cls.sizes(shape))))
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the sum of the values of a pixel's cells, shape (M,), metres."""
-        return coefficients[self.cells_of(inputs)].sum(-1)
+        return coefficients[self.cells_of(inputs.pixel)].sum(-1)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return how often each pixel lies in each cell, shape (M, number of cells): large."""
-        cells = self.cells_of(inputs)
-        one_hot = torch.zeros(len(cells), self.num_cells(self.shape), dtype=torch.float64)
+        cells = self.cells_of(inputs.pixel)
+        one_hot = torch.zeros(len(cells), len(self.coefficients), dtype=torch.float64)
         return one_hot.scatter_add_(1, cells, torch.ones_like(cells, dtype=torch.float64))
 
     def on_delay(self, state: FrameState) -> None:
         """Delay every pixel by its values."""
-        height, width = state.radial_distance.shape
-        add_delay(state, self.coefficients[self.cells_of_image(height, width)].sum(-1))
+        pixel = torch.arange(state.radial_distance.numel())
+        add_delay(state, self.coefficients[self.cells_of(pixel)].sum(-1))
 
 
 def drawn_values(count: int, rms: float, seed: int) -> Tensor:
@@ -136,11 +118,16 @@ def _cell_terms(count: int) -> tuple[Coefficient, ...]:
     return tuple(Coefficient(f"cell_{number}", "m", 0.01) for number in range(count))
 
 
-class FixedPatternShape(Options):
-    """Image size, and the side of the square blocks of pixels that share one value."""
+class ImageShape(Options):
+    """Image size."""
 
     height: int = 50
     width: int = 64
+
+
+class FixedPatternShape(ImageShape):
+    """Image size, and the side of the square blocks of pixels that share one value."""
+
     block_px: int = 1
 
 
@@ -158,9 +145,8 @@ class FixedPatternEffect(MapEffect):
     source = "Kahlmann et al. 2006 (fixed pattern noise matrix)"
     remedy = "twenty poses or more with the wall in all pixels"
     shape_type: ClassVar[type[Options]] = FixedPatternShape
-    contains = (
-        "row_column_pattern",
-    )  # A per-pixel offset already contains row and column offsets.
+    # A per-pixel offset already contains row and column offsets.
+    contains = ("row_column_pattern",)
     tables = {"values_m": ("rms_m", tuple[tuple[float, ...], ...])}  # noqa: RUF012 - typed above
 
     @classmethod
@@ -181,18 +167,11 @@ class FixedPatternEffect(MapEffect):
         side = shape.block_px
         return [(math.ceil(shape.height / side), math.ceil(shape.width / side))]
 
-    @classmethod
-    def cells(cls, shape: FixedPatternShape, rows: Tensor, columns: Tensor) -> Tensor:
+    def cells_of(self, pixel: Tensor) -> Tensor:
         """Return the block of each pixel, shape (M, 1)."""
-        across = cls.sizes(shape)[0][1]
-        return (rows // shape.block_px * across + columns // shape.block_px)[:, None]
-
-
-class RowColumnPatternShape(Options):
-    """Image size."""
-
-    height: int = 50
-    width: int = 64
+        (_, across), side = self.sizes(self.shape)[0], self.shape.block_px
+        row, column = pixel // self.shape.width, pixel % self.shape.width
+        return (row // side * across + column // side)[:, None]
 
 
 class RowColumnPatternEffect(MapEffect):
@@ -208,7 +187,7 @@ class RowColumnPatternEffect(MapEffect):
     summary = "a constant offset of every row and every column"
     source = "row addressing and column converters of area sensors (EMVA 1288)"
     remedy = "twenty poses or more with the wall in all pixels"
-    shape_type: ClassVar[type[Options]] = RowColumnPatternShape
+    shape_type: ClassVar[type[Options]] = ImageShape
     tables = {  # noqa: RUF012 - typed above
         "rows_m": ("row_rms_m", tuple[float, ...]),
         "columns_m": ("column_rms_m", tuple[float, ...]),
@@ -217,15 +196,14 @@ class RowColumnPatternEffect(MapEffect):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the recording's image size."""
-        camera = inputs.camera
-        return cls(RowColumnPatternShape(height=camera.height, width=camera.width))
+        return cls(ImageShape(height=inputs.camera.height, width=inputs.camera.width))
 
     @classmethod
-    def sizes(cls, shape: RowColumnPatternShape) -> list[tuple[int, ...]]:
+    def sizes(cls, shape: ImageShape) -> list[tuple[int, ...]]:
         """Return the number of rows and columns."""
         return [(shape.height,), (shape.width,)]
 
-    @classmethod
-    def cells(cls, shape: RowColumnPatternShape, rows: Tensor, columns: Tensor) -> Tensor:
+    def cells_of(self, pixel: Tensor) -> Tensor:
         """Return row and column of each pixel, shape (M, 2)."""
-        return torch.stack([rows, shape.height + columns], dim=-1)
+        height, width = self.shape.height, self.shape.width
+        return torch.stack([pixel // width, height + pixel % width], dim=-1)

@@ -64,19 +64,16 @@ class WarmUpEffect(FrameEffect):
         times, body = inputs.facts.timestamp, _excess(inputs.facts)
         interval = float(times.max() - times.min()) / max(len(times) - 1, 1)
         reference = None
-        if body is not None and bool(torch.isfinite(body).all()):
+        if body is not None and bool(body.isfinite().all()):
             reference = float(body.mean())
-        shape = WarmUpShape(frame_interval_s=interval or 1.0, body_reference_c=reference)
-        return cls(shape)
+        return cls(WarmUpShape(frame_interval_s=interval or 1.0, body_reference_c=reference))
 
     @classmethod
     def terms(cls, shape: WarmUpShape) -> tuple[Coefficient, ...]:
         """Return one coefficient per time constant, and one of the body temperature if known."""
-        rise = [Coefficient(f"rise_{t:g}s", "m", cls.prior) for t in shape.rise_s]
-        heat = [Coefficient(f"heat_{t:g}s", "m", cls.prior) for t in shape.heat_s]
-        known = shape.body_reference_c is not None
-        body = [Coefficient("body_10k", "m", cls.prior)] if known else []
-        return (*rise, *heat, *body)
+        names = [f"rise_{t:g}s" for t in shape.rise_s] + [f"heat_{t:g}s" for t in shape.heat_s]
+        names += [] if shape.body_reference_c is None else ["body_10k"]
+        return tuple(Coefficient(name, "m", cls.prior) for name in names)
 
     def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
         """Return the drift of each frame, shape (F,), metres."""
@@ -93,12 +90,8 @@ def heats(times: Tensor, shape: WarmUpShape) -> list[Tensor]:
     """Return the heat at the times (F,) of frames for each time constant, 0 cold to 1 warm."""
     age = times[:, None] - times[None, :]
     past = age >= 0
-    order = times.argsort(stable=True)
-    since = (
-        times[order]
-        .diff(prepend=times[order][:1])
-        .clamp(max=_ON_INTERVALS * shape.frame_interval_s)
-    )
+    ordered, order = times.sort(stable=True)
+    since = ordered.diff(prepend=ordered[:1]).clamp(max=_ON_INTERVALS * shape.frame_interval_s)
     ran = torch.empty_like(times).index_copy(0, order, since)
     return [
         (torch.exp(-age.clamp(min=0) / constant) * past) @ -torch.expm1(-ran / constant)
@@ -145,30 +138,22 @@ class RoomTemperatureEffect(FrameEffect):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the mean temperature as reference, and the times after the longest pauses."""
-        room, times = inputs.facts.room_temperature, inputs.facts.timestamp.sort().values
-        shape = RoomTemperatureShape()
-        if room is not None:
-            shape = shape.model_copy(update={"reference_c": float(room.mean())})
-        pauses = times.diff()
+        room, times = known(inputs.facts, "room_temperature"), inputs.facts.timestamp.sort().values
+        pauses, least = times.diff(), min(RoomTemperatureShape().lags_s)
         longest = pauses.argsort(descending=True)[:_MOST_PAUSES].sort().values
-        after = [times[i + 1] for i in longest if pauses[i] > min(shape.lags_s)]
-        starts = tuple(float(time) for time in [times[0], *after])
-        return cls(shape.model_copy(update={"starts_s": starts}))
+        after = [float(times[i + 1]) for i in longest if pauses[i] > least]
+        starts = (float(times[0]), *after)
+        return cls(RoomTemperatureShape(reference_c=float(room.mean()), starts_s=starts))
 
     @classmethod
     def terms(cls, shape: RoomTemperatureShape) -> tuple[Coefficient, ...]:
         """Return the coefficients of immediate, lagged, squared and earlier temperature."""
-        lagged = [
-            Coefficient(f"lagged_{lag:g}s_per_degree", "m/K", cls.prior) for lag in shape.lags_s
-        ]
+        slopes = ["per_degree", *(f"lagged_{lag:g}s_per_degree" for lag in shape.lags_s)]
+        starts = [f"start_{i}" for i in range(len(shape.starts_s))]
         return (
-            Coefficient("per_degree", "m/K", cls.prior),
-            *lagged,
+            *(Coefficient(name, "m/K", cls.prior) for name in slopes),
             Coefficient("square", "m/K^2", cls.prior / 8),
-            *(
-                Coefficient(f"start_{i}", "K", cls.prior_start)
-                for i, _ in enumerate(shape.starts_s)
-            ),
+            *(Coefficient(name, "K", cls.prior_start) for name in starts),
         )
 
     def in_other_recordings(self) -> Self:
@@ -176,9 +161,8 @@ class RoomTemperatureEffect(FrameEffect):
 
         At those moments of another recording they once added 30 mm.
         """
-        count = len(self.shape.starts_s)
         shape = self.shape.model_copy(update={"starts_s": ()})
-        return type(self)(shape, self.coefficients[: len(self.coefficients) - count])
+        return type(self)(shape, self.coefficients[: len(self.terms(shape))])
 
     def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
         """Return the shift of each frame, shape (F,), metres."""
