@@ -13,11 +13,12 @@ from tofcorr.data.recording import Recording
 from tofcorr.observables.dropouts import DropoutMeasurement, border_of, dropouts_of
 from tofcorr.observables.noise import NoiseMeasurement, noise_of, noise_source
 from tofcorr.observables.pairs import (
+    LEAST_POSES,
     Matched,
     Random,
-    bootstrap,
     matched,
     permutation_p,
+    reach,
     sign_flip_p,
 )
 from tofcorr.observables.read import Observed, observe, quotient
@@ -230,7 +231,7 @@ def _compare_dropouts(
     (lost, lost_by_sim), full = np.nan_to_num([missing.means(), saturated.means()]).tolist()
     p_value, saturated_p = missing.difference_p(random), saturated.difference_p(random)
     cause = _cause_of_missing(real if lost > lost_by_sim else sim)
-    ends = missing.difference_interval(random)
+    ends = missing.difference_interval()
     return {
         "real_share": round(lost, 5),
         "sim_share": round(lost_by_sim, 5),
@@ -294,13 +295,15 @@ def _compare_amplitude(
     if not all(map(len, sums.total)):
         return None
     means = sums.means()
-    interval = sums.difference_interval(random)
+    interval = sums.difference_interval()
     slope = ends = border = border_p = None
     if both.paired:
         products = _products(logs[0], logs[1], both.real.pose)
-        poses = len(products)
-        slope = _slope(products)
-        ends = bootstrap(lambda r: _slope(products[r.integers(poses, size=poses)]), poses, random)
+        slope = _slope(products.sum(0))
+        if len(products) >= LEAST_POSES:
+            without = np.array([_slope(products.sum(0) - own) for own in products])
+            half = reach([(without, products[:, 0])])
+            ends = slope - half, slope + half
         contrast = _border_contrast(both, logs[0] - logs[1], border_of(real.map.shape))
         if len(contrast):
             border, border_p = float(np.exp(contrast.mean())), sign_flip_p(contrast, random)
@@ -334,9 +337,9 @@ def _products(real: np.ndarray, sim: np.ndarray, pose: np.ndarray) -> np.ndarray
     return np.stack([np.bincount(row, column) for column in columns], axis=1)
 
 
-def _slope(products: np.ndarray) -> float:
+def _slope(sums: np.ndarray) -> float:
     """Return the standard deviation of the real over that of the simulated ln amplitude."""
-    count, x, y, xx, yy = products.sum(0)
+    count, x, y, xx, yy = sums
     real, sim = xx / count - (x / count) ** 2, yy / count - (y / count) ** 2
     return float(max(real / sim, 0.0) ** 0.5) if sim > 0 else float("nan")
 

@@ -3,7 +3,7 @@
 Poses are the unit of every interval and p-value: pixels of an image are no independent samples.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,33 +25,32 @@ _LEAST_SHARED = 0.8
 # Groups of brightness, of equal count in both recordings together, and the fewest pixels of one in
 # either. Chosen: noise changes by less than a tenth within one; fewer say too little of its mean.
 _GROUPS, _FEWEST = 20, 50
-# Resamples of the poses for an interval, and permutations for a p-value: they resolve 1/1000. As
-# many as are usual.
+# Flips or permutations for a p-value: they resolve 1/1000. As many as are usual.
 _DRAWS = 999
 LEAST_P = 1 / (_DRAWS + 1)
 """The smallest p-value that the draws can give. Derived: the data count as one draw more."""
-# Fewest poses for which anything is tested: five signs allow 32 flips, p-values of 0.06.
-_LEAST_POSES = 6
+LEAST_POSES = 6
+"""Fewest poses for which anything is tested: five signs allow 32 flips, p-values of 0.06."""
 
 
-def bootstrap(draw: Callable[[Random], float], num_poses: int, random: Random) -> Interval | None:
-    """Return the 95 % percentile interval of a statistic of resampled poses.
+def reach(parts: Iterable[Pair]) -> float:
+    """Return half of the 95 % interval of a statistic, by a jackknife over poses.
+
+    Few of many poses may hold most of a sum. The degrees of freedom are those of Satterthwaite
+    (1946), for poses whose parts of the statistic are as uncertain as their shares w of the sum are
+    large, (sum w^2)^2 / sum w^4 - 1. A percentile of resampled poses was too narrow there.
 
     Args:
-        draw: Resamples the poses and returns the statistic.
-        num_poses: Number of poses of the smaller recording.
-        random: Source of the resamples.
-
-    Returns:
-        None with fewer than six poses, or where the statistic is not finite in most resamples.
+        parts: Of each set of poses: the statistic without each of them, and their shares of the
+            sum, of any scale, both (P,).
     """
-    if num_poses < _LEAST_POSES:
-        return None
-    drawn = np.array([draw(random) for _ in range(_DRAWS)])
-    if np.isfinite(drawn).mean() < 0.5:
-        return None
-    low, high = np.quantile(drawn[np.isfinite(drawn)], (0.025, 0.975)).tolist()
-    return low, high
+    variance = below = 0.0
+    for values, shares in parts:
+        part = (len(values) - 1) * float(values.var())
+        freedom = (shares**2).sum() ** 2 / max((shares**4).sum(), np.finfo(float).tiny) - 1.0
+        variance, below = variance + part, below + part**2 / max(freedom, 1.0)
+    freedom = variance**2 / below if below > 0 else np.inf
+    return student_quantile(0.975, freedom) * variance**0.5
 
 
 def sign_flip_p(differences: np.ndarray, random: Random) -> float | None:
@@ -64,7 +63,7 @@ def sign_flip_p(differences: np.ndarray, random: Random) -> float | None:
         random: Source of the signs.
     """
     known = differences[np.isfinite(differences)]
-    if len(known) < _LEAST_POSES:
+    if len(known) < LEAST_POSES:
         return None
     signs = random.choice((-1.0, 1.0), size=(_DRAWS, len(known)))
     return _share_beyond(signs @ known, known.sum())
@@ -79,7 +78,7 @@ def permutation_p(real: np.ndarray, sim: np.ndarray, random: Random) -> float | 
         random: Source of the permutations.
     """
     real, sim = real[np.isfinite(real)], sim[np.isfinite(sim)]
-    if min(len(real), len(sim)) < _LEAST_POSES:
+    if min(len(real), len(sim)) < LEAST_POSES:
         return None
     # Weights of both samples whose sum is the difference of the means.
     weights = np.repeat([1 / len(real), -1 / len(sim)], [len(real), len(sim)])
@@ -129,67 +128,46 @@ class PoseSums:
         ratios = real[both] / in_real[both], sim[both] / in_sim[both]
         return float(weight @ ratios[0]), float(weight @ ratios[1])
 
-    @property
-    def _num_poses(self) -> int:
-        return min(map(len, self.total))
-
     def ratio_interval(self) -> Interval | None:
-        """Return the 95 % interval of the ratio of the means.
-
-        A jackknife over poses of the logarithm. Dark poses hold most of the variance, so that few
-        of many poses count: the degrees of freedom are those of Satterthwaite (1946), for poses
-        whose parts of the logarithm are as uncertain as their shares w of the sum are large,
-        (sum w^2)^2 / sum w^4 - 1. A percentile of resampled poses was too narrow there.
-
-        Returns:
-            None with fewer than six poses, or where the sum without one pose is not positive.
-        """
-        if self._num_poses < _LEAST_POSES:
+        """Return the 95 % interval of the ratio of the means, None where one is not positive."""
+        if not min(self.means()) > 0:
             return None
-        variance = below = 0.0
-        for sides in ([0, 1],) if self.paired else ([0], [1]):
-            logs, shares = self._without_each(sides)
-            part = (len(logs) - 1) * float(logs.var())
-            freedom = float((shares**2).sum() ** 2 / (shares**4).sum()) - 1.0
-            variance, below = variance + part, below + part**2 / max(freedom, 1.0)
-        real, sim = self.means()
-        if not (np.isfinite(variance) and real > 0 and sim > 0):
-            return None
-        freedom = variance**2 / below if below > 0 else np.inf
-        reach = np.exp(student_quantile(0.975, freedom) * variance**0.5)
-        return float(real / sim / reach), float(real / sim * reach)
+        ends = self._interval(
+            lambda real, sim: np.log(real / sim) if min(real, sim) > 0 else np.nan
+        )
+        return ends and (float(np.exp(ends[0])), float(np.exp(ends[1])))
 
-    def _without_each(self, sides: list[int]) -> Pair:
-        """Return the log ratio without each pose, and the poses' shares of the sum, both (P,).
+    def difference_interval(self) -> Interval | None:
+        """Return the 95 % interval of the difference of the means, real less simulated."""
+        return self._interval(lambda real, sim: real - sim)
+
+    def _interval(self, statistic: Callable[[float, float], float]) -> Interval | None:
+        """Return the 95 % interval of a statistic of both means; None with fewer than six poses."""
+        if min(map(len, self.total)) < LEAST_POSES:
+            return None
+        sides = ([0, 1],) if self.paired else ([0], [1])
+        middle, half = statistic(*self.means()), reach(self._without(s, statistic) for s in sides)
+        return (middle - half, middle + half) if np.isfinite(half) else None
+
+    def _without(self, sides: list[int], statistic: Callable[[float, float], float]) -> Pair:
+        """Return the statistic without each pose, and the poses' shares of the sum, both (P,).
 
         Args:
             sides: Which poses are left out: real ones, 0, simulated ones, 1, or both at once.
+            statistic: Of the real and the simulated mean.
         """
         count = len(self.total[sides[0]])
-        logs = np.full(count, np.nan)
+        values, shares = np.zeros((2, count))
+        changes = [(k, np.broadcast_to(each, count)) for k, each in enumerate(self.left_out)]
         for pose in range(count):
             rest = np.delete(np.arange(count), pose)
             means = self.means(*(rest if side in sides else slice(None) for side in (0, 1)))
-            if min(means) > 0:
-                logs[pose] = np.log(means[0] / means[1])
-        own = np.zeros(count)
+            changed = [np.exp(change[pose]) if k in sides else 1.0 for k, change in changes]
+            values[pose] = statistic(means[0] * changed[0], means[1] * changed[1])
         for side in sides:
-            logs += (1 - 2 * side) * np.asarray(self.left_out[side])
-            own += self.total[side].sum(1).clip(min=0) / self.total[side].sum()
-        return logs, own / own.sum()
-
-    def difference_interval(self, random: Random) -> Interval | None:
-        """Return the 95 % interval of the difference of the means, real less simulated."""
-
-        def difference(random: Random) -> float:
-            counts = list(map(len, self.total))
-            chosen = other = random.integers(counts[0], size=counts[0])
-            if not self.paired:
-                other = random.integers(counts[1], size=counts[1])
-            real, sim = self.means(chosen, other)
-            return real - sim
-
-        return bootstrap(difference, self._num_poses, random)
+            own = self.total[side].sum(1).clip(min=0)
+            shares += own / max(own.sum(), np.finfo(float).tiny)
+        return values, shares
 
     def ratio_p(self, random: Random) -> float | None:
         """Return the p-value of the poses' ratios to what is expected being alike."""
