@@ -41,7 +41,7 @@ def test_light_by_a_floor_is_the_sum_over_its_patches() -> None:
     xy, place, far, slant = (
         torch.from_numpy(np.array([v], dtype=float)) for v in (point[:2], camera, distance, cosine)
     )
-    found = light_by_surfaces(xy, place, far, slant, ((-1.0, -1.0), (1.0, 1.0)), turn)[0]
+    found = light_by_surfaces(xy, place, far, slant, MultipathShape(), turn)[0]
     names = [term.name for term in MultipathEffect.terms(MultipathShape())]
     below = found[names.index("below_near")]
     # The first surface is 0.05 of the width beyond the edge.
@@ -64,13 +64,11 @@ def test_light_of_an_even_room_grows_as_the_direct_light_falls(inputs: EffectInp
 
 
 def test_light_by_other_ways_does_not_know_the_scale_of_the_scene(inputs: EffectInputs) -> None:
-    effect = MultipathEffect.for_recording(inputs)
-    low, high = effect.shape.low_xy_m, effect.shape.high_xy_m
     places = inputs.target_xy, camera_over_target(inputs), inputs.radial_distance
 
     def light(factor: float) -> torch.Tensor:
         xy, camera, distance = (factor * place for place in places)
-        area = (factor * low[0], factor * low[1]), (factor * high[0], factor * high[1])
+        area = MultipathShape(low_xy_m=(-factor, -factor), high_xy_m=(factor, factor))
         cosine = inputs.incidence_cosine
         return light_by_surfaces(xy, camera, distance, cosine, area, 0.8 / factor)
 

@@ -1,13 +1,12 @@
 """Light that reaches the target by a wall or the floor."""
 
 import itertools
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from tofcorr.geometry.rays import SPEED_OF_LIGHT
-from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.inputs import (
     FIXED_TARGET,
@@ -16,6 +15,7 @@ from tofcorr.simulation.effects.inputs import (
     inputs_from_state,
 )
 from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
+from tofcorr.simulation.effects.target_shape import AreaShape
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.scene import planes_from_world
 
@@ -39,11 +39,9 @@ _LEAST_COSINE = 0.05
 # Pixels evaluated at once. Chosen: what is computed of them stays in a processor's cache.
 _AT_ONCE = 10_000
 
-Area = tuple[tuple[float, float], tuple[float, float]]
-
 
 def light_by_surfaces(
-    xy: Tensor, camera: Tensor, distance: Tensor, cosine: Tensor, area: Area, turn: float
+    xy: Tensor, camera: Tensor, distance: Tensor, cosine: Tensor, area: AreaShape, turn: float
 ) -> Tensor:
     """Return the light by each surface at reflectivity one, relative to the direct light.
 
@@ -52,13 +50,13 @@ def light_by_surfaces(
         camera: The camera that sees each point, height positive, shape (M, 3), metres.
         distance: From the camera, shape (M,), metres.
         cosine: Of the angle of incidence, shape (M,).
-        area: Lowest and highest coordinates of the target that were seen, metres.
+        area: Of the target that was seen.
         turn: Radians a metre of distance.
 
     Returns:
         Complex, shape (M, 8), in the order of `SIDES` and `BEYOND`.
     """
-    low, high = area
+    low, high = area.low_xy_m, area.high_xy_m
     extent = max(high[0] - low[0], high[1] - low[1])
     # Along the last axes: where a patch lies along the edge, and how high.
     up, depth, aside = (extent * xy.new_tensor(row) for row in (_BEFORE, _DEPTH, _ASIDE))
@@ -95,11 +93,9 @@ def camera_over_target(inputs: EffectInputs) -> Tensor:
 _ROOM_DEGREE = 2
 
 
-class MultipathShape(Options):
+class MultipathShape(AreaShape):
     """The area of the target that the camera saw, and the distance from which it did."""
 
-    low_xy_m: tuple[float, float] = (-1.0, -1.0)
-    high_xy_m: tuple[float, float] = (1.0, 1.0)
     distance_m: float = 1.0
 
 
@@ -144,17 +140,13 @@ class MultipathEffect(SignalEffect):
         Coefficient("flange", "1", 0.05),
     )
     form_error = 1.0
-    shape_type: ClassVar[type[Options]] = MultipathShape
+    shape_type = MultipathShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Place the surfaces at the edges of the area that the camera saw."""
-        low, high = inputs.target_xy.amin(0).tolist(), inputs.target_xy.amax(0).tolist()
         distance = float(inputs.radial_distance.mean())
-        shape = MultipathShape(
-            low_xy_m=(low[0], low[1]), high_xy_m=(high[0], high[1]), distance_m=distance
-        )
-        return cls(shape)
+        return cls(MultipathShape.seen(inputs, distance_m=distance))
 
     def on_signal(self, state: FrameState) -> None:
         """Add the light of the other ways to every harmonic."""
@@ -172,12 +164,11 @@ class MultipathEffect(SignalEffect):
 
 def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor:
     """Return each coefficient's light over the direct light, shape (M, K), complex."""
-    area = shape.low_xy_m, shape.high_xy_m
     turn = order * 4 * torch.pi * inputs.known_frequency / SPEED_OF_LIGHT
     camera = camera_over_target(inputs)
     distance, cosine = inputs.radial_distance, inputs.incidence_cosine
     parts = [
-        light_by_surfaces(inputs.target_xy[k], camera[k], distance[k], cosine[k], area, turn)
+        light_by_surfaces(inputs.target_xy[k], camera[k], distance[k], cosine[k], shape, turn)
         for k in torch.arange(len(distance)).split(_AT_ONCE)
     ]
     light = torch.cat(parts)
@@ -185,8 +176,7 @@ def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor
     far = distance / shape.distance_m
     flange = torch.polar(cosine / far**2, turn * distance)
     # What bounced more often lights the target evenly; its error grows as the direct light falls.
-    low, high = (inputs.target_xy.new_tensor(v) for v in area)
-    x, y = (2 * (inputs.target_xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
+    x, y = shape.scaled(inputs.target_xy)
     strength = far**2 / cosine.clamp(min=_LEAST_COSINE)
     smooth = strength[:, None] * side_by_side(products(x, y, 0, _ROOM_DEGREE))
     room = 1j * turn * torch.cat([smooth, (far - 1)[:, None] * smooth], dim=1)

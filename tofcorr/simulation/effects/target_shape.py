@@ -11,11 +11,29 @@ from tofcorr.simulation.effects.numerics import exponents, products, side_by_sid
 from tofcorr.simulation.hooks import FrameState
 
 
-class TargetShapeShape(Options):
-    """The area that is described, and the degree; beyond it the height is that of its edge."""
+class AreaShape(Options):
+    """The area of the target that the camera saw."""
 
     low_xy_m: tuple[float, float] = (-1.0, -1.0)
     high_xy_m: tuple[float, float] = (1.0, 1.0)
+
+    @classmethod
+    def seen(cls, inputs: EffectInputs, **others: float) -> Self:
+        """Return the area that the camera saw, and other constants."""
+        xy = inputs.target_xy
+        ends = {"low_xy_m": xy.amin(0).tolist(), "high_xy_m": xy.amax(0).tolist()}
+        return cls.model_validate({**ends, **others})
+
+    def scaled(self, xy: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x and y of points (M, 2), -1 to 1 within the area; beyond it that of its edge."""
+        low, high = xy.new_tensor(self.low_xy_m), xy.new_tensor(self.high_xy_m)
+        x, y = (2 * (xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
+        return x, y
+
+
+class TargetShapeShape(AreaShape):
+    """The area that is described, and the degree; beyond it the height is that of its edge."""
+
     degree: int = 6
 
 
@@ -40,8 +58,7 @@ class TargetShapeEffect(LinearEffect):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Describe the area that the camera saw."""
-        low, high = inputs.target_xy.amin(0).tolist(), inputs.target_xy.amax(0).tolist()
-        return cls(TargetShapeShape(low_xy_m=(low[0], low[1]), high_xy_m=(high[0], high[1])))
+        return cls(TargetShapeShape.seen(inputs))
 
     @classmethod
     def terms(cls, shape: TargetShapeShape) -> tuple[Coefficient, ...]:
@@ -53,10 +70,9 @@ class TargetShapeEffect(LinearEffect):
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return how much earlier the ray meets the surface per unit of each height, (M, K)."""
-        shape, xy = self.shape, inputs.target_xy
-        low, high = xy.new_tensor(shape.low_xy_m), xy.new_tensor(shape.high_xy_m)
-        x, y = (2 * (xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
-        return -side_by_side(products(x, y, 2, shape.degree)) / inputs.incidence_cosine[:, None]
+        x, y = self.shape.scaled(inputs.target_xy)
+        heights = side_by_side(products(x, y, 2, self.shape.degree))
+        return -heights / inputs.incidence_cosine[:, None]
 
     def on_geometry(self, state: FrameState) -> None:
         """Raise the surface."""
