@@ -1,17 +1,14 @@
 """Delays become distance errors one to one."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from simulation.small import expected_frames, small
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.simulation.hooks import FrameState
-from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.robot import draw_plan
 from tofcorr.simulation.signal import (
     AmplitudeDelayOptions,
     Curve,
@@ -19,23 +16,16 @@ from tofcorr.simulation.signal import (
     image_from_lattice,
     pixel_delay,
 )
-from tofcorr.simulation.simulator import seeded, take_frames
-
-Small = Callable[..., SimulatorOptions]
 
 
-def _expected_frames(options: SimulatorOptions) -> list[FrameState]:
-    return list(take_frames(options, draw_plan(options, seeded(options)), None))
-
-
-def test_constant_delay_and_fast_clock_read_too_far(small: Small) -> None:
+def test_constant_delay_and_fast_clock_read_too_far() -> None:
     options = small(sensor={"delays": {"constant_mm": 12.0, "clock_deviation": 0.004}})
-    for state in _expected_frames(options):
+    for state in expected_frames(options):
         error = state.measured_distance - state.radial_distance
         torch.testing.assert_close(error, 0.012 + 0.004 * state.radial_distance)
 
 
-def test_measured_tables_come_out_as_they_went_in(small: Small) -> None:
+def test_measured_tables_come_out_as_they_went_in() -> None:
     def cubic(x: np.ndarray) -> np.ndarray:
         return 0.02 - 0.03 * x + 0.02 * x**2 - 0.004 * x**3
 
@@ -49,7 +39,7 @@ def test_measured_tables_come_out_as_they_went_in(small: Small) -> None:
         "pixel": {"values_m": lattice.tolist()},
         "amplitude": {"knots": counts.tolist(), "values_m": (1e-7 * counts).tolist()},
     }
-    for state in _expected_frames(small(sensor={"delays": {"measured": measured}})):
+    for state in expected_frames(small(sensor={"delays": {"measured": measured}})):
         true, amplitude = state.radial_distance, state.measured_amplitude
         assert amplitude.max() < counts[-1]
         height, width = true.shape
@@ -60,10 +50,10 @@ def test_measured_tables_come_out_as_they_went_in(small: Small) -> None:
         torch.testing.assert_close(state.measured_distance - true, expected, rtol=0, atol=1e-9)
 
 
-def test_normalised_amplitude_table_sees_amplitude_times_squared_distance(small: Small) -> None:
+def test_normalised_amplitude_table_sees_amplitude_times_squared_distance() -> None:
     table = {"knots": [0.0, 1e6], "values_m": [0.0, 1.0], "variable": "normalised_amplitude"}
     options = small(sensor={"delays": {"measured": {"amplitude": table}}})
-    for state in _expected_frames(options):
+    for state in expected_frames(options):
         expected = 1e-6 * state.measured_amplitude * state.radial_distance**2
         error = state.measured_distance - state.radial_distance
         torch.testing.assert_close(error, expected, rtol=1e-6, atol=1e-9)
@@ -78,7 +68,7 @@ def test_latency_grows_with_amplitude(law: str) -> None:
     assert (delay.diff().diff() < 0).all()
 
 
-def test_cameras_of_one_kind_differ_in_the_irregular_part_alone(small: Small) -> None:
+def test_cameras_of_one_kind_differ_in_the_irregular_part_alone() -> None:
     rays = ray_directions(small().camera.intrinsics())
     regular = pixel_delay(PixelDelayOptions(row_line_mm=5.0, bowl_mm=3.0), rays)
     units = [
@@ -112,6 +102,6 @@ def test_lattice_of_one_point_is_flat() -> None:
         ({"knots": [0, 2, 1], "values_m": [0, 1, 2]}, "the knots must increase"),
     ],
 )
-def test_broken_table_is_refused(small: Small, table: dict[str, Any], message: str) -> None:
+def test_broken_table_is_refused(table: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         small(sensor={"delays": {"measured": {"distance": table}}})

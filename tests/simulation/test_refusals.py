@@ -1,37 +1,30 @@
 """What the simulator refuses leaves nothing behind."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from simulation.written_files import files_in
+from simulation.small import files_in, small
 
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects.registry import build_effects
-from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.robot import draw_plan
-from tofcorr.simulation.simulator import seeded, simulate
-
-Small = Callable[..., SimulatorOptions]
+from tofcorr.simulation.simulator import simulate
 
 
-def test_unknown_effect_is_named_with_its_nearest(small: Small) -> None:
+def test_unknown_effect_is_named_with_its_nearest() -> None:
     with pytest.raises(ConfigError, match=r"effects\[0\]: there is no effect 'wigglin'"):
         build_effects([{"name": "wigglin"}])
     with pytest.raises(ConfigError, match=r"effects\[0\]: 'name' is missing"):
         build_effects([{"amplitude_mm": 3}])
 
 
-def test_simulation_with_an_unknown_effect_leaves_nothing_behind(
-    small: Small, tmp_path: Path
-) -> None:
+def test_simulation_with_an_unknown_effect_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="there is no effect"):
         simulate(small(effects=[{"name": "gremlins"}]), tmp_path / "deep/r")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_recording_that_exists_is_not_overwritten(small: Small, tmp_path: Path) -> None:
+def test_recording_that_exists_is_not_overwritten(tmp_path: Path) -> None:
     simulate(small(), tmp_path / "r", num_frames=1)
     before = files_in(tmp_path / "r")
     with pytest.raises(CalibrationDataError, match="exists already"):
@@ -39,10 +32,9 @@ def test_recording_that_exists_is_not_overwritten(small: Small, tmp_path: Path) 
     assert files_in(tmp_path / "r") == before
 
 
-def test_more_frames_than_planned_are_refused(small: Small) -> None:
-    options = small()
+def test_more_frames_than_planned_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="8 frames are asked for, but the options plan 7"):
-        draw_plan(options, seeded(options), num_frames=8)
+        simulate(small(), tmp_path / "r", num_frames=8)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +55,7 @@ def test_more_frames_than_planned_are_refused(small: Small) -> None:
     ids=["distances", "motion", "normal", "harmonics", "map"],
 )
 def test_options_that_contradict_themselves_are_refused(
-    small: Small, sections: dict[str, Any], message: str
+    sections: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         small(**sections)

@@ -1,44 +1,36 @@
 """Poses before the wall."""
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
+from simulation.small import expected_frames, planned, small
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.simulation.hooks import FrameState
-from tofcorr.simulation.options import CameraMountOptions, MountGuessOptions, SimulatorOptions
-from tofcorr.simulation.robot import draw_plan, hand_eye_guess, tool_twists
-from tofcorr.simulation.simulator import seeded, take_frames
-
-Small = Callable[..., SimulatorOptions]
+from tofcorr.simulation.options import CameraMountOptions, MountGuessOptions
+from tofcorr.simulation.robot import hand_eye_guess, tool_twists
 
 
-def _plan(options: SimulatorOptions) -> list[FrameState]:
-    return draw_plan(options, seeded(options))
-
-
-def test_wall_fills_every_frame_within_the_limits(small: Small) -> None:
+def test_wall_fills_every_frame_within_the_limits() -> None:
     options = small(
         shots=[{"target": "white", "poses": 25}],
         robot={"tilt_deg": 45.0, "farthest_pixel_m": 2.0, "steepest_incidence_deg": 70.0},
     )
-    for state in take_frames(options, _plan(options), None):
+    for state in expected_frames(options):
         assert state.radial_distance.isfinite().all()
         assert state.radial_distance.max() <= 2.0
         assert state.incidence_cosine.min() >= math.cos(math.radians(70.0)) - 1e-12
 
 
-def test_distance_along_the_optical_axis_is_within_its_bounds(small: Small) -> None:
+def test_distance_along_the_optical_axis_is_within_its_bounds() -> None:
     options = small(
         shots=[{"target": "white", "poses": 25}],
         robot={"distance_m": [0.7, 0.9], "farthest_pixel_m": None},
         scene={"plane": {"normal": [0.6, 0.0, 0.8], "offset_m": -2.0}},
     )
-    for frame in _plan(options):
+    for frame in planned(options):
         camera = frame.facts.world_from_tool[-1] @ options.hand_eye.tool_from_camera()
         normal, offset = plane_in_frame(*options.scene.plane.tensors(), camera)
         assert 0.7 <= -offset / normal[2] <= 0.9
@@ -48,21 +40,21 @@ def test_distance_along_the_optical_axis_is_within_its_bounds(small: Small) -> N
     ("axes", "tilted"),
     [("none", (False, False)), ("x", (False, True)), ("y", (True, False)), ("both", (True, True))],
 )
-def test_tilt_is_restricted_to_its_axes(small: Small, axes: str, tilted: tuple[bool, bool]) -> None:
+def test_tilt_is_restricted_to_its_axes(axes: str, tilted: tuple[bool, bool]) -> None:
     options = small(robot={"tilt_axes": axes, "farthest_pixel_m": None})
-    axis = _plan(options)[-1].facts.world_from_tool
+    axis = planned(options)[-1].facts.world_from_tool
     optical = (axis @ options.hand_eye.tool_from_camera())[:, :3, 2]
     # The wall is z = 0: tilt about x moves the optical axis along y, and the other way round.
     leans = tuple(bool((optical[:, k].abs() > 1e-9).any()) for k in range(2))
     assert leans == tilted
 
 
-def test_robot_reaches_poses_within_its_repeatability(small: Small) -> None:
+def test_robot_reaches_poses_within_its_repeatability() -> None:
     options = small(
         shots=[{"target": "white", "poses": 300}],
         robot={"repeatability_mm": 0.4, "repeatability_mrad": 0.7, "farthest_pixel_m": None},
     )
-    frames = _plan(options)
+    frames = planned(options)
     recorded = frames[-1].facts.world_from_tool
     reached = torch.stack([f.world_from_tool for f in frames])
     missed = se3.log(se3.inverse(recorded) @ reached)
@@ -70,12 +62,12 @@ def test_robot_reaches_poses_within_its_repeatability(small: Small) -> None:
     assert missed[:, 3:].std().item() == pytest.approx(0.7e-3, rel=0.1)
 
 
-def test_repeated_frames_share_their_pose(small: Small) -> None:
+def test_repeated_frames_share_their_pose() -> None:
     options = small(
         robot={"repeat_poses": 2, "repeat_frames": 4, "farthest_pixel_m": None},
         conditions={"integration_time_us": [250.0, 500.0, 1000.0], "ambient_counts": [10, 20]},
     )
-    frames = _plan(options)
+    frames = planned(options)
     assert [f.pose_id for f in frames] == [0] * 4 + [1] * 4 + [2, 3, 4, 5, 6]
     for frame in frames[1:4]:
         assert torch.equal(frame.world_from_tool, frames[0].world_from_tool)
@@ -83,9 +75,9 @@ def test_repeated_frames_share_their_pose(small: Small) -> None:
     assert bool((frames[-1].facts.timestamp.diff() > 0).all())
 
 
-def test_sweep_goes_away_from_the_wall(small: Small) -> None:
+def test_sweep_goes_away_from_the_wall() -> None:
     options = small(robot={"order": "by_distance", "tilt_axes": "none", "farthest_pixel_m": None})
-    frames = take_frames(options, _plan(options), None)
+    frames = expected_frames(options)
     nearest = [state.radial_distance.min().item() for state in frames]
     assert nearest == sorted(nearest)
 
@@ -106,7 +98,7 @@ def test_hand_eye_options_hold_any_transform(generator: torch.Generator) -> None
     torch.testing.assert_close(found, transform, rtol=0, atol=1e-12)
 
 
-def test_speed_on_a_path_agrees_with_the_poses_before_and_after(small: Small) -> None:
+def test_speed_on_a_path_agrees_with_the_poses_before_and_after() -> None:
     options = small(
         shots=[{"target": "white", "poses": 40}],
         robot={
@@ -120,7 +112,7 @@ def test_speed_on_a_path_agrees_with_the_poses_before_and_after(small: Small) ->
         },
         conditions={"frame_interval_s": 0.1},
     )
-    frames = _plan(options)
+    frames = planned(options)
     facts = frames[-1].facts
     truth = facts.tool_twist
     assert truth is not None
@@ -138,6 +130,6 @@ def test_speed_is_unknown_across_long_gaps() -> None:
     assert known.tolist() == [True, True, True, False, False]
 
 
-def test_pose_that_cannot_be_is_said_so(small: Small) -> None:
+def test_pose_that_cannot_be_is_said_so() -> None:
     with pytest.raises(ConfigError, match="no pose found where the wall fills the image"):
-        _plan(small(robot={"distance_m": [3.0, 4.0], "farthest_pixel_m": 2.0}))
+        planned(small(robot={"distance_m": [3.0, 4.0], "farthest_pixel_m": 2.0}))

@@ -1,43 +1,33 @@
 """Whole recordings, their twins, and the truth beside them."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from simulation.written_files import files_in
+from simulation.small import IMPERFECT, expected_frames, files_in, planned, small
 
 from tofcorr.data.recording import Recording, iterate_frames
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.options import load_options
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.robot import draw_plan
 from tofcorr.simulation.signal import demodulate, distance_from_phase
-from tofcorr.simulation.simulator import SensorPipeline, seeded, simulate, take_frames
-
-Small = Callable[..., SimulatorOptions]
+from tofcorr.simulation.simulator import SensorPipeline, simulate
 
 
-def test_same_seed_gives_the_same_bytes(
-    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
-) -> None:
+def test_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     for name, seed in (("a", 7), ("b", 7), ("c", 8)):
-        simulate(small(sensor=imperfect_sensor, seed=seed, write_raw=True), tmp_path / name)
+        simulate(small(sensor=IMPERFECT, seed=seed, write_raw=True), tmp_path / name)
     first = files_in(tmp_path / "a")
     assert first == files_in(tmp_path / "b")
     other = files_in(tmp_path / "c")
     assert all(first[name] != other[name] for name in ("depth.npy", "frames.csv", "raw.npy"))
 
 
-def test_truth_is_kept_apart(
-    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
-) -> None:
-    options = small(
-        sensor=imperfect_sensor, hand_eye={"guess": {"translation_mm": 30, "rotation_deg": 5}}
-    )
+def test_truth_is_kept_apart(tmp_path: Path) -> None:
+    options = small(sensor=IMPERFECT, hand_eye={"guess": {"translation_mm": 30, "rotation_deg": 5}})
     simulate(options, tmp_path / "r")
     names = set(files_in(tmp_path / "r"))
     truth = {name for name in names if name.startswith("truth/")}
@@ -53,14 +43,14 @@ def test_truth_is_kept_apart(
     assert true.shape == (7, 12, 16)
 
 
-def test_options_in_truth_run_again_to_the_same_bytes(small: Small, tmp_path: Path) -> None:
+def test_options_in_truth_run_again_to_the_same_bytes(tmp_path: Path) -> None:
     simulate(small(seed=5), tmp_path / "a")
     again = load_options(SimulatorOptions, tmp_path / "a/truth/options.yaml")
     simulate(again, tmp_path / "b")
     assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
 
 
-def test_recorded_geometry_predicts_the_expected_measurement(small: Small, tmp_path: Path) -> None:
+def test_recorded_geometry_predicts_the_expected_measurement(tmp_path: Path) -> None:
     options = small(scene={"plane": {"normal": [0.0, 0.6, 0.8], "offset_m": 0.7}})
     simulate(options, tmp_path / "r", noise=False)
     recording = Recording.open(tmp_path / "r")
@@ -73,7 +63,7 @@ def test_recorded_geometry_predicts_the_expected_measurement(small: Small, tmp_p
         assert (height + batch.offset_tool[:, None, None]).abs().max() < 5e-7
 
 
-def test_z_depth_is_the_radial_distance_along_the_axis(small: Small, tmp_path: Path) -> None:
+def test_z_depth_is_the_radial_distance_along_the_axis(tmp_path: Path) -> None:
     simulate(small(), tmp_path / "radial", noise=False)
     simulate(small(depth_kind="z"), tmp_path / "z", noise=False)
     radial, z = (Recording.open(tmp_path / name) for name in ("radial", "z"))
@@ -83,10 +73,8 @@ def test_z_depth_is_the_radial_distance_along_the_axis(small: Small, tmp_path: P
     assert z.depth_kind == "z"
 
 
-def test_raw_samples_demodulate_to_depth_and_amplitude(
-    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
-) -> None:
-    simulate(small(write_raw=True, sensor=imperfect_sensor), tmp_path / "r")
+def test_raw_samples_demodulate_to_depth_and_amplitude(tmp_path: Path) -> None:
+    simulate(small(write_raw=True, sensor=IMPERFECT), tmp_path / "r")
     recording = Recording.open(tmp_path / "r")
     assert recording.raw is not None
     assert recording.amplitude is not None
@@ -96,7 +84,7 @@ def test_raw_samples_demodulate_to_depth_and_amplitude(
     np.testing.assert_allclose(recording.amplitude, amplitude, rtol=1e-6)
 
 
-def test_conditions_reach_the_recording_or_stay_unknown(small: Small, tmp_path: Path) -> None:
+def test_conditions_reach_the_recording_or_stay_unknown(tmp_path: Path) -> None:
     conditions = {
         "integration_time_us": [400.0],
         "ambient_counts": [30.0, 30.0],
@@ -138,11 +126,10 @@ def _changed(stage: str, state: FrameState) -> dict[str, Any]:
     return changes.get(stage, dict)()
 
 
-def test_effects_act_in_every_stage_in_order(small: Small) -> None:
-    options = small()
-    plan = draw_plan(options, seeded(options), num_frames=1)
-    plain = next(take_frames(options, plan, None))
-    effect, calls = Effect(), []
+def test_effects_act_in_every_stage_in_order() -> None:
+    exact = {"farthest_pixel_m": None, "repeatability_mm": 0.0, "repeatability_mrad": 0.0}
+    options = small(robot=exact, shots=[{"target": "white", "poses": 1}])
+    (plain,), effect, calls = expected_frames(options), Effect(), []
     for stage in STAGES:
 
         def act(state: FrameState, stage: str = stage) -> None:
@@ -151,33 +138,25 @@ def test_effects_act_in_every_stage_in_order(small: Small) -> None:
 
         setattr(effect, f"on_{stage}", act)
     pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (effect,))
-    state = replace(plan[0], world_from_tool=plan[0].facts.world_from_tool[-1])
-    pipeline.run(state)
+    state = pipeline.run(planned(options)[0])
     assert calls == list(STAGES)
     error = state.measured_distance - state.radial_distance
     torch.testing.assert_close(error, torch.full_like(error, 0.02 + 0.03 + 0.04 + 0.05))
     # The wall came nearer by 0.1 m, and of the light that this gives half arrived.
     gained = (plain.radial_distance / state.radial_distance) ** 2
-    if plain.target == "white":
-        torch.testing.assert_close(
-            state.measured_amplitude, 0.5 * gained * plain.measured_amplitude
-        )
+    torch.testing.assert_close(state.measured_amplitude, 0.5 * gained * plain.measured_amplitude)
 
 
-def test_measurement_is_differentiable_in_what_effects_change(small: Small) -> None:
-    options = small(shots=[{"target": "white", "poses": 1}])
-    plan = draw_plan(options, seeded(options))
-
-    class _Shift(Effect):
-        def __init__(self, by: torch.Tensor) -> None:
-            self.by = by
-
-        def on_delay(self, state: FrameState) -> None:
-            state.delay = state.delay + self.by * state.radial_distance
-
+def test_measurement_is_differentiable_in_what_effects_change() -> None:
+    options, effect = small(shots=[{"target": "white", "poses": 1}]), Effect()
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    plain = next(take_frames(options, plan, None))
-    pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (_Shift(by),))
+
+    def act(state: FrameState) -> None:
+        state.delay = state.delay + by * state.radial_distance
+
+    effect.on_delay = act
+    (plain,) = expected_frames(options)
+    pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (effect,))
     state = pipeline.run(plain)
     (gradient,) = torch.autograd.grad(state.measured_distance.sum(), by)
     torch.testing.assert_close(gradient, state.radial_distance.sum())

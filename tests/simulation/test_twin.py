@@ -1,26 +1,20 @@
 """The simulator run again at recorded poses, as a twin of a recording."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from simulation.small import IMPERFECT, small
 
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate, twin_frames
 
-Small = Callable[..., SimulatorOptions]
 
-
-def test_twin_at_recorded_poses_equals_the_simulation(
-    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
-) -> None:
+def test_twin_at_recorded_poses_equals_the_simulation(tmp_path: Path) -> None:
     options = small(
-        sensor=imperfect_sensor,
+        sensor=IMPERFECT,
         conditions={"integration_time_us": [300.0, 600.0], "ambient_counts": [50.0, 400.0]},
     )
     simulate(options, tmp_path / "r", noise=False)
@@ -33,13 +27,11 @@ def test_twin_at_recorded_poses_equals_the_simulation(
         np.testing.assert_allclose(amplitude, state.measured_amplitude, rtol=1e-6)
 
 
-def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(
-    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
-) -> None:
-    simulate(small(sensor=imperfect_sensor), tmp_path / "r", noise=False)
+def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(tmp_path: Path) -> None:
+    simulate(small(sensor=IMPERFECT), tmp_path / "r", noise=False)
     recording = Recording.open(tmp_path / "r")
     assert recording.amplitude is not None
-    blind = small(scene={"targets": {}}, sensor={"delays": imperfect_sensor["delays"]})
+    blind = small(scene={"targets": {}}, sensor={"delays": IMPERFECT["delays"]})
     with pytest.raises(ConfigError, match=r"no target '(white|checkerboard)'"):
         list(twin_frames(blind, recording))
     for state in twin_frames(blind, recording, reflectivity="from_recording"):
@@ -47,7 +39,7 @@ def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(
         np.testing.assert_allclose(state.measured_amplitude, amplitude, rtol=1e-6)
 
 
-def test_twin_without_recorded_amplitude_says_what_is_missing(small: Small, tmp_path: Path) -> None:
+def test_twin_without_recorded_amplitude_says_what_is_missing(tmp_path: Path) -> None:
     simulate(small(), tmp_path / "r")
     (tmp_path / "r/amplitude.npy").unlink()
     recording = Recording.open(tmp_path / "r")
@@ -55,7 +47,7 @@ def test_twin_without_recorded_amplitude_says_what_is_missing(small: Small, tmp_
         list(twin_frames(small(), recording, reflectivity="from_recording"))
 
 
-def test_twin_uses_the_hand_eye_transform_it_is_given(small: Small, tmp_path: Path) -> None:
+def test_twin_uses_the_hand_eye_transform_it_is_given(tmp_path: Path) -> None:
     options = small()
     simulate(options, tmp_path / "r", noise=False)
     recording = Recording.open(tmp_path / "r")
