@@ -2,17 +2,14 @@
 
 import pytest
 import torch
-from sensor.sensors import sensor_file, sensor_values
+from sensor.sensors import CAMERA, sensor
 
 from tofcorr.estimation.noise import neighbour_correlation
 from tofcorr.sensor.model import SensorModel
-from tofcorr.sensor.sensor_file import SensorFile
 
 
 def big(**changes: object) -> SensorModel:
-    values = sensor_values(**changes)
-    values["camera"] = values["camera"] | {"width": 200, "height": 150}
-    return SensorModel(SensorFile.from_mapping(values, "the test"), torch.float64)
+    return sensor(camera=CAMERA.section() | {"width": 200, "height": 150}, **changes)
 
 
 @torch.no_grad()
@@ -50,7 +47,7 @@ def test_a_generator_decides_every_draw_and_no_noise_draws_nothing() -> None:
 
 @torch.no_grad()
 def test_a_saturated_pixel_states_the_largest_amplitude_and_is_not_valid() -> None:
-    model = SensorModel(sensor_file(dropouts={"saturation_amplitude": 500.0}), torch.float64)
+    model = sensor(dropouts={"saturation_amplitude": 500.0})
     depth = torch.ones(12, 16, dtype=torch.float64)
     amplitude = torch.full_like(depth, 300.0)
     amplitude[3, 4] = 700.0
@@ -63,8 +60,7 @@ def test_a_saturated_pixel_states_the_largest_amplitude_and_is_not_valid() -> No
 
 def test_a_distance_that_its_error_exceeds_is_none() -> None:
     """Light brighter than any measured once turned the phase by half a turn: -2 m were written."""
-    effects = [{"name": "integration_time", "reference_us": 1000.0, "log_1": -1.0}]
-    model = SensorModel(sensor_file(effects=effects), torch.float64)
+    model = sensor(effects=[{"name": "integration_time", "reference_us": 1000.0, "log_1": -1.0}])
     far = torch.arange(16).expand(12, 16) > 7
     light = torch.full((12, 16), 800.0, dtype=torch.float64)
     found = model(torch.where(far, 5.0, 0.4).double(), light, integration_time_us=10_000.0)

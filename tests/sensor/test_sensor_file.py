@@ -5,27 +5,33 @@ from typing import Any
 
 import pytest
 import torch
-from sensor.sensors import ERROR, NOISE, plane_scene, sensor_file, sensor_values
-from sensor.test_forward import CONDITIONS, EFFECTS
+from sensor.sensors import (
+    CAMERA,
+    CONDITIONS,
+    EFFECTS,
+    ERROR,
+    NOISE,
+    entries,
+    plane_scene,
+    sensor,
+    sensor_file,
+    sensor_values,
+)
 
 from tofcorr.errors import ConfigError, ExportError, StateError
 from tofcorr.sensor.model import SensorModel
-from tofcorr.sensor.sensor_file import SensorFile
-
-ALL = [{"name": name, **EFFECTS[name]} for name in EFFECTS]
 
 
 def test_a_saved_model_measures_what_it_did(tmp_path: Path) -> None:
-    given = sensor_file(
+    model = sensor(
         error=ERROR | {"reads": "measured_distance"},
-        effects=ALL,
+        effects=entries(*EFFECTS),
         noise=NOISE | {"fixed_share": 0.3, "correlation_px": 0.7},
         dropouts={"base_share": 0.1, "amplitude_at_half": 700.0, "saturation_amplitude": 900.0},
         light={"amplitude_at_1m": 2000.0},
         title="A camera\nof tests.",
         measured_from=["Twelve images."],
     )
-    model = SensorModel(given, torch.float64)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.002 * torch.rand(parameter.shape, dtype=torch.float64))
@@ -46,17 +52,13 @@ def test_a_saved_model_measures_what_it_did(tmp_path: Path) -> None:
 
 
 def test_a_state_of_another_sensor_is_refused() -> None:
-    model = SensorModel(sensor_file(error=ERROR))
-    same, other = SensorModel(sensor_file(error=ERROR)), SensorModel(sensor_file(effects=ALL))
-    same.load_state_dict(model.state_dict())
+    state = sensor(error=ERROR).state_dict()
+    sensor(error=ERROR).load_state_dict(state)
     with pytest.raises(StateError, match="the state is of another model"):
-        other.load_state_dict(model.state_dict(), strict=False)
-    farther = sensor_values(error=ERROR)
-    farther["validity"] = farther["validity"] | {"radial_distance_m": [0.4, 9.0]}
+        sensor(effects=entries(*EFFECTS)).load_state_dict(state, strict=False)
+    farther = sensor_values()["validity"] | {"radial_distance_m": [0.4, 9.0]}
     with pytest.raises(StateError, match="validity"):
-        SensorModel(SensorFile.from_mapping(farther, "the test")).load_state_dict(
-            model.state_dict()
-        )
+        sensor(error=ERROR, validity=farther).load_state_dict(state)
 
 
 @pytest.mark.parametrize(
@@ -78,29 +80,26 @@ def test_a_file_that_breaks_the_format_is_refused(changes: dict[str, Any], messa
 
 def test_a_camera_of_more_pixels_than_any_is_refused_before_maps_of_its_size_are_made() -> None:
     # Found by fuzzing: an image of 12 x 1,000,000 pixels took 20 s.
-    values = sensor_values()
-    values["camera"] = values["camera"] | {"width": 12, "height": 1_000_000}
     with pytest.raises(ConfigError, match="12 x 1000000 pixels is larger than any"):
-        SensorFile.from_mapping(values, "the test")
+        sensor_file(camera=CAMERA.section() | {"width": 12, "height": 1_000_000})
 
 
-def test_a_camera_of_a_single_row_is_refused() -> None:
-    values = sensor_values()
-    values["camera"] = values["camera"] | {"height": 1}
-    with pytest.raises(ConfigError, match="needs 2 x 2 at least"):
-        SensorModel(SensorFile.from_mapping(values, "the test"))
-
-
-def test_missing_coefficients_and_unknown_effects_are_refused() -> None:
-    lacking = ERROR | {"coefficients": {"distance": {"c0": 0.01}}}
-    with pytest.raises(ConfigError, match="lack 'c1'"):
-        SensorModel(sensor_file(error=lacking))
-    with pytest.raises(ConfigError, match="Did you mean 'wiggling'"):
-        SensorModel(sensor_file(effects=[{"name": "wigling"}]))
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"camera": CAMERA.section() | {"height": 1}}, "needs 2 x 2 at least"),
+        ({"error": ERROR | {"coefficients": {"distance": {"c0": 0.01}}}}, "lack 'c1'"),
+        ({"effects": [{"name": "wigling"}]}, "Did you mean 'wiggling'"),
+    ],
+)
+def test_a_file_of_which_no_model_can_be_built_is_refused(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        sensor(**changes)
 
 
 def test_a_file_that_cannot_be_written_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
-    model = SensorModel(sensor_file(error=ERROR))
     with pytest.raises(ExportError, match="folder does not exist"):
-        model.save(tmp_path / "nowhere" / "sensor.yaml")
+        sensor(error=ERROR).save(tmp_path / "nowhere" / "sensor.yaml")
     assert list(tmp_path.iterdir()) == []
