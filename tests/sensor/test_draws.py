@@ -1,5 +1,7 @@
 """Noise and missing pixels have the statistics that the file states."""
 
+from typing import Any
+
 import pytest
 import torch
 from sensor.sensors import CAMERA, sensor
@@ -8,7 +10,7 @@ from tofcorr.estimation.noise import neighbour_correlation
 from tofcorr.sensor.model import SensorModel
 
 
-def big(**changes: object) -> SensorModel:
+def big(**changes: Any) -> SensorModel:
     return sensor(camera=CAMERA.section() | {"width": 200, "height": 150}, **changes)
 
 

@@ -99,7 +99,8 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
     amplitude, recorded = _amplitude_everywhere(observed)
     saturation, stated = _saturation(observed, amplitude)
     table, pixels = observed.table, max(observed.map_frames.sum(), 1)
-    beyond = amplitude >= (np.inf if saturation is None else saturation)
+    model = _fitted(observed, amplitude, saturation)
+    beyond = model.saturated(amplitude)
     saturated = observed.saturated / pixels
     if not stated:
         saturated = table.frames[beyond].sum() / max(table.frames.sum(), 1)
@@ -109,7 +110,7 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
         for where in (border, ~border)
     )
     return DropoutMeasurement(
-        model=_fitted(observed, amplitude, saturation),
+        model=model,
         share=float(observed.map_missing.sum() / pixels),
         saturated_share=float(saturated),
         saturated_missing=float(table.missing[beyond].sum() / max(table.frames.sum(), 1)),
@@ -147,13 +148,11 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
     from scipy.optimize import minimize  # Slow to import; only recordings with gaps need them.
     from scipy.special import expit, logit
 
-    table, level = observed.table, np.inf if saturation is None else saturation
-    other = np.nan_to_num(amplitude) < level  # Saturated pixels are missing for another reason.
+    table, plain = observed.table, DropoutModel(saturation_amplitude=saturation)
+    other = ~plain.saturated(amplitude)  # Saturated pixels are missing for another reason.
     total = table.frames[other].sum()
-    plain = DropoutModel(
-        base_share=float(table.missing[other].sum() / total) if total else 0.0,
-        saturation_amplitude=saturation,
-    )
+    share = float(table.missing[other].sum() / max(total, 1))
+    plain = plain.model_copy(update={"base_share": share})
     use = other & (np.nan_to_num(amplitude) > 0)
     missing, frames, at = table.missing[use], table.frames[use], np.log(amplitude[use])
     if not missing.sum():

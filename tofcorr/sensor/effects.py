@@ -17,8 +17,9 @@ from tofcorr.simulation.hooks import Effect
 
 
 class Group(Enum):
-    """Stages of the simulator in groups, in their order."""
+    """Stages of the simulator in groups, in their order; and what delays whole frames."""
 
+    FRAME = ()
     GEOMETRY = ("pose", "geometry")
     DELAY = ("delay",)
     SIGNAL = ("signal", "taps", "readout")
@@ -31,7 +32,7 @@ class ImageEffect(nn.Module):
         effect: The effect with its coefficients.
 
     Attributes:
-        group: The last group of stages at which it acts.
+        group: The last group of stages at which it acts; that of whole frames by itself.
     """
 
     def __init__(self, effect: CatalogueEffect) -> None:
@@ -39,7 +40,7 @@ class ImageEffect(nn.Module):
         self.effect = effect
         stages = [(group, f"on_{stage}") for group in Group for stage in group.value]
         acts = [g for g, hook in stages if getattr(type(effect), hook) is not getattr(Effect, hook)]
-        self.group = acts[-1] if acts else Group.DELAY
+        self.group = Group.FRAME if effect.of_frame else [Group.DELAY, *acts][-1]
         self.coefficients = nn.Parameter(effect.coefficients.clone())
 
     def shift(self, inputs: EffectInputs) -> Tensor:
@@ -123,7 +124,6 @@ class ImageEffects(nn.Module):
             count: Number of frames, B.
             like: Any tensor of the device.
         """
-        usable = [each for each in self.usable(known)[0] if each.effect.of_frame]
         one = like.new_ones(count, 1, 1, dtype=torch.float64)
         frames = SceneFrames(
             rays=one.new_tensor([[[0.0, 0.0, 1.0]]]),
@@ -133,7 +133,7 @@ class ImageEffects(nn.Module):
             conditions=known,
             surface=lambda: (one, one.expand(count, 1, 3)),
         )
-        return self._sum(usable, frames).reshape(-1).expand(count)
+        return self.shift(Group.FRAME, frames).reshape(-1).expand(count)
 
     def shift(self, group: Group, frames: SceneFrames) -> Tensor:
         """Return the change of the measured distance by one group, metres.
@@ -144,12 +144,8 @@ class ImageEffects(nn.Module):
             group: Which effects.
             frames: The frames, at the distance that the effects see.
         """
-        usable = self.usable(frames.conditions)[0]
-        chosen = [each for each in usable if each.group == group and not each.effect.of_frame]
-        return self._sum(chosen, frames)
-
-    def _sum(self, chosen: Sequence[ImageEffect], frames: SceneFrames) -> Tensor:
-        distance = frames.distance
+        usable, distance = self.usable(frames.conditions)[0], frames.distance
+        chosen = [each for each in usable if each.group == group]
         if not chosen:
             return distance.new_zeros(1, 1, 1)
         with distance.device:

@@ -225,8 +225,7 @@ def dropout_section(model: DropoutModel, observed: Observed) -> DropoutModel:
         model: The probability that a pixel is missing.
         observed: What it was measured from.
     """
-    level, table = model.saturation_amplitude, observed.table
-    saturated = table.raw_amplitude >= (np.inf if level is None else level)
+    table, saturated = observed.table, model.saturated(observed.table.raw_amplitude)
     if not saturated.any():
         return model
     share, rest = (

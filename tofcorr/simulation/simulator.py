@@ -268,8 +268,7 @@ def append_measurement(
     state: FrameState,
     depth_kind: DepthKind,
     write_raw: bool,
-    row: FrameRow | None,
-    mask: np.ndarray | None = None,
+    row: FrameRow,
 ) -> None:
     """Append the measurement of the camera, and its true distance and pose to `truth/`."""
     depth = state.measured_distance
@@ -279,7 +278,6 @@ def append_measurement(
         depth.numpy(),
         row=row,
         amplitude=state.measured_amplitude.nan_to_num(0.0).numpy(),
-        mask=mask,
         raw=state.raw.numpy() if write_raw else None,
         truth={
             "radial_distance": state.radial_distance.numpy().astype(np.float32),
