@@ -20,9 +20,7 @@ PRESETS = sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_preset_loads_and_simulates_a_frame(name: str, tmp_path: Path) -> None:
-    options = load_options(SimulatorOptions, FOLDER / f"{name}.yaml")
-    simulate(options, tmp_path / "r", num_frames=1)
-    recording = Recording.open(tmp_path / "r")
+    recording = simulate(name, tmp_path / "r", num_frames=1)
     assert recording.num_frames == 1
     assert np.isfinite(recording.depth).all()
 
@@ -38,8 +36,7 @@ def test_preset_loads_and_simulates_a_frame(name: str, tmp_path: Path) -> None:
 def test_paper_set_has_its_images_below_two_metres(
     name: str, targets: dict[str, int], tmp_path: Path
 ) -> None:
-    simulate(load_options(SimulatorOptions, FOLDER / f"{name}.yaml"), tmp_path / "r")
-    recording = Recording.open(tmp_path / "r")
+    recording = simulate(name, tmp_path / "r")
     assert recording.depth.shape == (sum(targets.values()), 50, 64)
     assert recording.modulation_frequency == 20.0e6
     names, counts = np.unique(recording.frames.target, return_counts=True)
@@ -51,18 +48,15 @@ def test_paper_set_has_its_images_below_two_metres(
 
 
 def test_repeats_hold_two_poses_of_ten_frames(tmp_path: Path) -> None:
-    simulate(load_options(SimulatorOptions, FOLDER / "repeats.yaml"), tmp_path / "r")
-    recording = Recording.open(tmp_path / "r")
-    assert recording.frames.pose_id is not None
-    _, counts = np.unique(recording.frames.pose_id, return_counts=True)
+    recording = simulate("repeats", tmp_path / "r")
+    _, counts = np.unique(recording.require("pose_id", "this test"), return_counts=True)
     assert sorted(counts.tolist()) == [1] * 40 + [10, 10]
 
 
 def test_long_range_shows_whole_periods_of_the_circular_error(tmp_path: Path) -> None:
-    options = load_options(SimulatorOptions, FOLDER / "long_range.yaml")
-    simulate(options, tmp_path / "r", noise=False)
+    recording = simulate("long_range", tmp_path / "r", noise=False)
     true = np.load(tmp_path / "r/truth/radial_distance.npy").ravel()
-    error = np.load(tmp_path / "r/depth.npy").ravel() - true
+    error = recording.depth.ravel() - true
     turn = 2 * np.pi * true / (unambiguous_range(20.0e6) / 4)
     columns = np.stack([np.ones_like(true), true, np.sin(turn), np.cos(turn)], axis=1)
     strength = np.linalg.lstsq(columns, error, rcond=None)[0]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from simulation.small import IMPERFECT, expected_frames, files_in, planned, small
 
-from tofcorr.data.recording import Recording, iterate_frames
+from tofcorr.data.recording import iterate_frames
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.options import load_options
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState
@@ -28,15 +28,12 @@ def test_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
 
 def test_truth_is_kept_apart(tmp_path: Path) -> None:
     options = small(sensor=IMPERFECT, hand_eye={"guess": {"translation_mm": 30, "rotation_deg": 5}})
-    simulate(options, tmp_path / "r")
+    guess = simulate(options, tmp_path / "r").tool_from_camera
     names = set(files_in(tmp_path / "r"))
     truth = {name for name in names if name.startswith("truth/")}
     assert names - truth == {"recording.yaml", "frames.csv", "depth.npy", "amplitude.npy"}
-    assert truth == {
-        f"truth/{name}"
-        for name in ("radial_distance.npy", "world_from_tool.npy", "truth.yaml", "options.yaml")
-    }
-    guess = Recording.open(tmp_path / "r").tool_from_camera
+    beside = ("radial_distance.npy", "world_from_tool.npy", "truth.yaml", "options.yaml")
+    assert truth == {f"truth/{name}" for name in beside}
     assert np.abs(guess - options.hand_eye.tool_from_camera().numpy()).max() > 1e-3
     true = np.load(tmp_path / "r/truth/radial_distance.npy")
     assert true.dtype == np.float32
@@ -52,8 +49,7 @@ def test_options_in_truth_run_again_to_the_same_bytes(tmp_path: Path) -> None:
 
 def test_recorded_geometry_predicts_the_expected_measurement(tmp_path: Path) -> None:
     options = small(scene={"plane": {"normal": [0.0, 0.6, 0.8], "offset_m": 0.7}})
-    simulate(options, tmp_path / "r", noise=False)
-    recording = Recording.open(tmp_path / "r")
+    recording = simulate(options, tmp_path / "r", noise=False)
     transform = options.hand_eye.tool_from_camera()
     for batch in iterate_frames(recording):
         points = ray_directions(recording.camera) * batch.radial_distance[..., None]
@@ -64,9 +60,9 @@ def test_recorded_geometry_predicts_the_expected_measurement(tmp_path: Path) -> 
 
 
 def test_z_depth_is_the_radial_distance_along_the_axis(tmp_path: Path) -> None:
-    simulate(small(), tmp_path / "radial", noise=False)
-    simulate(small(depth_kind="z"), tmp_path / "z", noise=False)
-    radial, z = (Recording.open(tmp_path / name) for name in ("radial", "z"))
+    radial, z = (
+        simulate(small(depth_kind=kind), tmp_path / kind, noise=False) for kind in ("radial", "z")
+    )
     along = torch.from_numpy(np.array(radial.depth)).to(torch.float64)
     expected = z_depth_from_radial_distance(along, ray_directions(radial.camera))
     np.testing.assert_allclose(z.depth, expected, atol=3e-7)
@@ -74,13 +70,12 @@ def test_z_depth_is_the_radial_distance_along_the_axis(tmp_path: Path) -> None:
 
 
 def test_raw_samples_demodulate_to_depth_and_amplitude(tmp_path: Path) -> None:
-    simulate(small(write_raw=True, sensor=IMPERFECT), tmp_path / "r")
-    recording = Recording.open(tmp_path / "r")
-    assert recording.raw is not None
-    assert recording.amplitude is not None
-    phase, amplitude, _ = demodulate(torch.from_numpy(np.array(recording.raw)).double())
+    recording = simulate(small(write_raw=True, sensor=IMPERFECT), tmp_path / "r")
+    raw = np.array(recording.require("raw", "this test"))
+    phase, amplitude, _ = demodulate(torch.from_numpy(raw).double())
     distance = distance_from_phase(phase, 20.0e6)
     np.testing.assert_allclose(recording.depth, distance, atol=1e-6)
+    assert recording.amplitude is not None
     np.testing.assert_allclose(recording.amplitude, amplitude, rtol=1e-6)
 
 
@@ -96,15 +91,13 @@ def test_conditions_reach_the_recording_or_stay_unknown(tmp_path: Path) -> None:
         "interval_jitter": 0.0,
         "frame_interval_s": 50.0,
     }
-    simulate(small(conditions=conditions), tmp_path / "all")
-    recording = Recording.open(tmp_path / "all")
+    recording = simulate(small(conditions=conditions), tmp_path / "all")
     np.testing.assert_allclose(recording.require("integration_time", "this test"), 400e-6)
     np.testing.assert_allclose(recording.require("ambient", "this test"), 30.0)
     np.testing.assert_allclose(recording.frames.timestamp, 50.0 * np.arange(7))
     warmed = 20.0 + 10.0 * (1 - np.exp(-0.5 * np.arange(7)))
     np.testing.assert_allclose(recording.require("body_temperature", "this test"), warmed)
-    simulate(small(conditions=conditions | {"recorded": []}), tmp_path / "none")
-    table = Recording.open(tmp_path / "none").frames
+    table = simulate(small(conditions=conditions | {"recorded": []}), tmp_path / "none").frames
     assert (table.pose_id, table.integration_time, table.ambient) == (None, None, None)
 
 

@@ -17,19 +17,17 @@ def test_twin_at_recorded_poses_equals_the_simulation(tmp_path: Path) -> None:
         sensor=IMPERFECT,
         conditions={"integration_time_us": [300.0, 600.0], "ambient_counts": [50.0, 400.0]},
     )
-    simulate(options, tmp_path / "r", noise=False)
-    recording = Recording.open(tmp_path / "r")
-    assert recording.amplitude is not None
+    recording = simulate(options, tmp_path / "r", noise=False)
+    amplitudes = recording.require("amplitude", "this test")
     for state in twin_frames(options, recording):
-        depth, amplitude = recording.depth[state.index], recording.amplitude[state.index]
+        depth, amplitude = recording.depth[state.index], amplitudes[state.index]
         # The quaternions of the file are good to 1e-16; depth is stored as float32.
         np.testing.assert_allclose(depth, state.measured_distance, atol=3e-7)
         np.testing.assert_allclose(amplitude, state.measured_amplitude, rtol=1e-6)
 
 
 def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(tmp_path: Path) -> None:
-    simulate(small(sensor=IMPERFECT), tmp_path / "r", noise=False)
-    recording = Recording.open(tmp_path / "r")
+    recording = simulate(small(sensor=IMPERFECT), tmp_path / "r", noise=False)
     assert recording.amplitude is not None
     blind = small(scene={"targets": {}}, sensor={"delays": IMPERFECT["delays"]})
     with pytest.raises(ConfigError, match=r"no target '(white|checkerboard)'"):
@@ -49,8 +47,7 @@ def test_twin_without_recorded_amplitude_says_what_is_missing(tmp_path: Path) ->
 
 def test_twin_uses_the_hand_eye_transform_it_is_given(tmp_path: Path) -> None:
     options = small()
-    simulate(options, tmp_path / "r", noise=False)
-    recording = Recording.open(tmp_path / "r")
+    recording = simulate(options, tmp_path / "r", noise=False)
     shifted = options.hand_eye.tool_from_camera()
     shifted[:3, 3] += torch.tensor([0.0, 0.0, 0.01], dtype=torch.float64)
     usual = list(twin_frames(options, recording))

@@ -83,11 +83,8 @@ def test_a_camera_that_starts_warm_cools_exponentially(inputs: EffectInputs) -> 
     still = replace(inputs, facts=facts)
     effect = RoomTemperatureEffect.for_recording(still)
     assert effect.shape.starts_s == (0.0, 1000.0)
-    names = [term.name for term in effect.terms(effect.shape)]
-    values = torch.zeros(len(names), dtype=torch.float64)
-    values[names.index("lagged_200s_per_degree")] = 0.01
-    values[names.index("start_0")], values[names.index("start_1")] = 2.0, -1.0
-    shift = effect.shift(still, values)
+    starts = {"lagged_200s_per_degree": 0.01, "start_0": 2.0, "start_1": -1.0}
+    shift = effect.shift(still, _coefficients(effect, **starts))
     of_frame = [float(shift[still.frame == frame][0]) for frame in range(4)]
     decay = np.exp(-times.numpy() / 200.0)
     expected = 0.02 * decay - 0.01 * np.array([0, 0, 0, 1.0])
