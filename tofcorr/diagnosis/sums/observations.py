@@ -171,7 +171,7 @@ def observe(recording: Recording, most_pixels: int, *, least_per_frame: int = 64
     budget = max(least_per_frame, most_pixels // recording.num_frames)
     order = even_order(recording.camera.height, recording.camera.width)
     chosen, images, distances, masks = [], [], [], []
-    for batch in iterate_frames(recording, dtype=torch.float32):
+    for batch in iterate_frames(recording, image_dtype=torch.float32):
         everywhere = batch.radial_distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
         distances.append(everywhere)
         if batch.amplitude is not None:
