@@ -1,10 +1,12 @@
-"""A clean recording that every fault is made in."""
+"""Clean recordings that faults are made in."""
 
 from pathlib import Path
 
+import diagnosed_recordings
 import pytest
 
 from benchmarks.wrong_recordings.parts import Parts
+from tofcorr.data.recording import Recording
 from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
@@ -23,3 +25,11 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def parts(clean: Path) -> Parts:
     return Parts.read(clean)
+
+
+@pytest.fixture(scope="session")
+def white_wall(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """Forty poses before a white wall."""
+    folder = tmp_path_factory.mktemp("white") / "recording"
+    shots = {"shots": [{"target": "white", "poses": 40}]}
+    return diagnosed_recordings.recorded(folder, 1, changes=shots)

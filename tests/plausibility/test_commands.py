@@ -50,25 +50,10 @@ def test_inspect_prints_the_findings_and_writes_one_page(
     assert "point away from the camera" in text
     assert "<script" not in text
     assert "src=" not in text
-    code, _, told = program("inspect", flipped, "--out", page)
-    assert code == 2
-    assert "exists already" in told
-    code, _, told = program("inspect", flipped, "--out", tmp_path / "page")
-    assert code == 2
-    assert "expected a name that ends in .html" in told
-
-
-def test_a_wrong_pose_is_named_and_left_out(parts: Parts, tmp_path: Path) -> None:
-    poses = parts.poses.copy()
-    poses[3, :3, 3] += 0.1 * parts.normal[3]
-    wrong = tofcorr.train(parts.changed(poses=poses).write(tmp_path / "wrong"), E0)
-    right = tofcorr.train(parts.write(tmp_path / "right"), E0)
-    assert [one["frame"] for one in wrong.report["left_out"]] == [3]
-    assert wrong.report["left_out"][0]["off_mm"] == pytest.approx(100, abs=15)
-    assert 3 not in (*wrong.report["frames"]["train"], *wrong.report["frames"]["test"])
-    assert repr(wrong).startswith("Doubtful recording: Frame 3 disagrees with all others")
-    assert right.report["left_out"] == []
-    assert right.report["headline"] is None
+    for wrong, said in ((page, "exists already"), (tmp_path / "page", "a name that ends in .html")):
+        code, _, told = program("inspect", flipped, "--out", wrong)
+        assert code == 2
+        assert said in told
 
 
 def test_evaluate_and_select_leave_out_the_frames_that_a_training_leaves_out(
@@ -78,20 +63,23 @@ def test_evaluate_and_select_leave_out_the_frames_that_a_training_leaves_out(
     poses = parts.poses.copy()
     poses[3, :3, 3] += 0.1 * parts.normal[3]
     wrong = parts.changed(poses=poses).write(tmp_path / "wrong")
-    trained = tofcorr.train(wrong, E0).report
+    training = tofcorr.train(wrong, E0)
+    trained = training.report
+    assert [one["frame"] for one in trained["left_out"]] == [3]
+    assert trained["left_out"][0]["off_mm"] == pytest.approx(100, abs=15)
+    assert 3 not in (*trained["frames"]["train"], *trained["frames"]["test"])
+    assert repr(training).startswith("Doubtful recording: Frame 3 disagrees with all others")
     models = {"models": [{"name": "E0", "model": {"terms": []}}]}
-    evaluated = tofcorr.evaluate(wrong, models)
+    evaluated, selected = tofcorr.evaluate(wrong, models), tofcorr.select(wrong, models)
     found = evaluated.to_mapping()["sets"][0]
     half = found["held_out"]["half"]
-    assert found["left_out"] == trained["left_out"]
+    assert found["left_out"] == selected.to_mapping()["left_out"] == trained["left_out"]
     assert half["test_frames"] == [trained["frames"]["test"]]
     error = half["error_mm"]["mean_abs_mm"]["E0"]["mean"]
     assert error == pytest.approx(trained["error_mm"]["after"]["test"]["mean_abs"], rel=1e-6)
-    assert "Frame 3 is left out of all fits and of the errors" in repr(evaluated)
-    selected = tofcorr.select(wrong, models)
-    assert selected.to_mapping()["left_out"] == trained["left_out"]
     assert selected.decisive.errors["E0"].mean < 1.5 * error
-    assert "Frame 3 is left out of all fits and of the errors" in repr(selected)
+    for result in (evaluated, selected):
+        assert "Frame 3 is left out of all fits and of the errors" in repr(result)
 
 
 def test_a_fold_that_held_out_nothing_but_left_out_frames_is_dropped() -> None:
@@ -121,6 +109,7 @@ def test_without_force_a_run_not_to_be_used_has_no_corrector(parts: Parts, tmp_p
 
 def test_a_clean_run_is_good_and_says_against_what(clean: Path) -> None:
     report = tofcorr.train(clean, "ea").report
+    assert (report["left_out"], report["headline"]) == ([], None)
     assert report["verdict"] in ("good", "usable")
     assert "mm with the hand-eye alone" in report["reason"]
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 
@@ -37,13 +36,6 @@ def test_a_right_focal_length_lies_within_the_standard_error_stated(clean: Path)
     assert names[place + 1] == "standard error of that change, %"
     assert 0 < error < 3
     assert abs(numbers["focal length should change by, %"]) < 3 * error
-
-
-@pytest.fixture(scope="module")
-def white_wall(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    folder = tmp_path_factory.mktemp("white") / "recording"
-    shots = {"shots": [{"target": "white", "poses": 40}]}
-    return diagnosed_recordings.recorded(folder, 1, changes=shots)
 
 
 @pytest.mark.parametrize("name", ["focal", "aspect", "centre", "corner", "bend"])

@@ -2,9 +2,7 @@
 
 from dataclasses import replace
 
-import diagnosed_recordings
 import numpy as np
-import pytest
 
 from tofcorr.data.recording import Recording
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, unambiguous_range, wrapped
@@ -12,19 +10,12 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    folder = tmp_path_factory.mktemp("wrapping") / "recording"
-    changes = {"shots": [{"target": "white", "poses": 40}]}
-    return diagnosed_recordings.recorded(folder, 73, changes=changes)
-
-
-def _sentences(recording: Recording, share_beyond: float) -> dict[str, str]:
+def _sentences(white_wall: Recording, share_beyond: float) -> dict[str, str]:
     """What is said of a camera whose range ends below this share of the distances."""
-    depth = np.asarray(recording.depth)
+    depth = np.asarray(white_wall.depth)
     size = float(np.nanquantile(depth, 1 - share_beyond))
     changed = replace(
-        recording,
+        white_wall,
         depth=np.mod(depth, size).astype(np.float32),
         modulation_frequency=SPEED_OF_LIGHT / (2 * size),
     )
@@ -32,8 +23,8 @@ def _sentences(recording: Recording, share_beyond: float) -> dict[str, str]:
     return {f"{one.severity} {one.check}": one.sentence for one in found.findings}
 
 
-def test_few_wrapped_pixels_are_garbage_whose_cause_is_known(recording: Recording) -> None:
-    said = _sentences(recording, 0.02)
+def test_few_wrapped_pixels_are_garbage_whose_cause_is_known(white_wall: Recording) -> None:
+    said = _sentences(white_wall, 0.02)
     garbage = [text for name, text in said.items() if name.endswith("garbage")]
     assert len(garbage) == 1
     assert "the unambiguous range" in garbage[0]
@@ -41,18 +32,18 @@ def test_few_wrapped_pixels_are_garbage_whose_cause_is_known(recording: Recordin
 
 
 def test_a_recording_that_is_mostly_wrapped_is_refused_with_the_reason(
-    recording: Recording,
+    white_wall: Recording,
 ) -> None:
-    said = _sentences(recording, 0.4)
+    said = _sentences(white_wall, 0.4)
     assert "they show targets beyond it" in said["impossible wrapping"]
 
 
-def test_shuffled_images_are_not_called_wrapped(recording: Recording) -> None:
+def test_shuffled_images_are_not_called_wrapped(white_wall: Recording) -> None:
     """Whatever the frequency: errors of metres are near a multiple of the range by chance."""
-    depth = np.asarray(recording.depth)
+    depth = np.asarray(white_wall.depth)
     order = np.random.default_rng(1).permutation(len(depth))
     for frequency in (60e6, 100e6, 150e6):
-        changed = replace(recording, depth=depth[order], modulation_frequency=frequency)
+        changed = replace(white_wall, depth=depth[order], modulation_frequency=frequency)
         found = examine(Dataset((changed,)))
         assert found.impossible
         assert not any("unambiguous range" in one.sentence for one in found.findings)

@@ -1,28 +1,35 @@
 """The hand-eye transform under which measured points lie best on the recorded planes.
 
-Robust over frames: a few wrong poses do not move it. A constant error of the distance and one in
-proportion to it are estimated as well, since every camera has them. Where nobody measured the
-planes, every wall is estimated with the hand-eye.
+The steps are those of a fit (`estimation`), on a few pixels of each frame and robust over frames: a
+few wrong poses do not move it. A constant error of the distance and one in proportion to it are
+estimated as well, since every camera has them. Where nobody measured the planes, every wall is
+estimated with the hand-eye.
 """
 
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import torch
+from torch import Tensor
+
+from tofcorr.estimation.linear import NormalEquations, solved
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
+from tofcorr.estimation.planes import Walls, joint_image_equations
+from tofcorr.estimation.robust import robust_weights
+from tofcorr.estimation.solvers import rotation_from_normals
+from tofcorr.geometry import se3
+from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.plausibility.finding import LARGE_CONSTANT
 
 TINY = float(np.finfo(np.float64).tiny)
 """What a divisor is at the least."""
-# Prior standard deviations of a step of the hand-eye in directions that the frames leave open,
-# radians and metres (large), of the constant error, metres (large), and of the error in proportion
-# to the distance (clocks are right to a percent, and no unit may hide in it). Chosen.
-_PRIOR = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.05, 0.01])
-# Standard deviation of one frame's misfit, metres; it only scales the priors. And the least misfit
-# that weights look at, metres. Chosen.
-_SCALE, _LEAST = 0.01, 1e-4
-# Cauchy's tuning constant, in standard deviations. 95 % efficiency on normal noise (Holland and
-# Welsch 1977).
-_CAUCHY = 2.385
+# Prior standard deviations of the constant error, metres (large), and of the error in proportion to
+# the distance (clocks are right to a percent, and no unit may hide in it). Chosen; against a misfit
+# of one frame of 10 mm. The hand-eye has one of a metre and a radian, wide enough for any.
+_PRIOR = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.05, 0.01], dtype=torch.float64) / 0.01
+# The least misfit that weights look at, metres. Chosen.
+_LEAST = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +71,27 @@ class Scene:
 
     def planes_in_tool(self) -> tuple[np.ndarray, np.ndarray]:
         """Return normals (F, 3) and offsets (F,) of the planes in the tool frame."""
-        rotation, place = self.poses[:, :3, :3], self.poses[:, :3, 3]
-        normal = np.einsum("fba,fb->fa", rotation, self.normal)
-        return normal, (self.normal * place).sum(1) + self.offset
+        normal, offset = plane_in_frame(*_tensors(self.normal, self.offset, self.poses))
+        return normal.numpy(), offset.numpy()
+
+    def image_moments(self) -> ImageMoments:
+        """Return the moments that a fit of a constant and a slope of the distance needs."""
+        # Columns of a point, its ray (the constant), the point again (the slope), and 1.
+        order = [0, 1, 2, 4, 5, 6, 0, 1, 2, 3]
+        parts = self.moments[:, order][:, :, order], *self.planes_in_tool()
+        gram, normal, offset = _tensors(*parts)
+        return ImageMoments(gram, normal, offset, gram[:, -1, -1], ["c0", "slope"])
 
     def some(self, chosen: np.ndarray) -> Self:
         """Return the scene of some frames, by index or by mask."""
         whole = ("moves", "guess")
         parts = {name: all_[chosen] for name, all_ in vars(self).items() if name not in whole}
         return replace(self, **parts)
+
+
+def _tensors(*arrays: np.ndarray) -> list[Tensor]:
+    # Poses may be mirrored views, which torch does not take.
+    return [torch.from_numpy(np.ascontiguousarray(one)) for one in arrays]
 
 
 def distinct(rows: np.ndarray) -> np.ndarray:
@@ -110,12 +129,11 @@ class Alignment:
 
     @property
     def badness(self) -> float:
-        """Misfit, and a tenth of what the constant error exceeds 100 mm by, metres.
+        """Misfit, and a tenth of what the constant error exceeds a large one by, metres.
 
         Points of another surface may lie parallel to the target: then only the constant shows it.
-        Cameras leave the factory within a few centimetres.
         """
-        return self.misfit + max(abs(self.constant) - 0.1, 0.0) / 10
+        return self.misfit + max(abs(self.constant) - LARGE_CONSTANT, 0.0) / 10
 
     @property
     def typical_angle(self) -> float:
@@ -124,104 +142,30 @@ class Alignment:
         return float(np.median(known)) if len(known) else np.nan
 
 
-def align(scene: Scene) -> Alignment:
-    """Return the best hand-eye transform; without a robot it is the identity."""
-    starts = _starts(scene) if scene.moves else [np.eye(4)]
-    return min((_refined(scene, start) for start in starts), key=lambda one: one.misfit)
-
-
 def judged(scene: Scene, hand_eye: np.ndarray, constant: float, slope: float) -> Alignment:
     """Return how far frames are from their planes under a given hand-eye transform."""
-    residual, normal, _ = _linear(scene, hand_eye, constant, slope)
-    square = np.einsum("fa,fab,fb->f", residual, scene.moments, residual)
+    errors = torch.tensor([constant, slope], dtype=torch.float64)
+    return _judged(scene, scene.image_moments(), Parameters(torch.from_numpy(hand_eye), errors))
+
+
+def _judged(scene: Scene, moments: ImageMoments, at: Parameters) -> Alignment:
+    rms = MomentObjective(moments).image_losses(at).clamp(min=0).sqrt().numpy()
+    normal = (moments.normal_tool @ at.tool_from_camera[:3, :3]).numpy()
     cosine = (scene.own_normal * normal).sum(1).clip(-1, 1)
     angle = np.where(scene.known, np.arccos(cosine), np.nan)
-    return Alignment(hand_eye, constant, slope, np.sqrt(np.maximum(square, 0.0)), angle)
+    constant, slope = at.coefficients.tolist()
+    return Alignment(at.tool_from_camera.numpy(), constant, slope, rms, angle)
 
 
-def _linear(
-    scene: Scene, hand_eye: np.ndarray, constant: float, slope: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the residual as a form on q (F, 7), and the normals in camera and tool (F, 3)."""
-    in_tool, offset = scene.planes_in_tool()
-    normal = in_tool @ hand_eye[:3, :3]
-    offset = in_tool @ hand_eye[:3, 3] + offset
-    parts = [(1 - slope) * normal, offset[:, None], -constant * normal]
-    return np.concatenate(parts, axis=1), normal, in_tool
+def align(scene: Scene, walls: Walls | None = None) -> Alignment:
+    """Return the best hand-eye transform; without a robot it is the identity.
 
-
-def _refined(scene: Scene, start: np.ndarray) -> Alignment:
-    """Take Gauss-Newton steps with the frames weighted by their misfit."""
-    found = judged(scene, start, 0.0, 0.0)
-    # Quadratic convergence from the closed form takes five, the weights a few more.
-    for _ in range(12):
-        found = _step(scene, found)
-    return found
-
-
-def _step(scene: Scene, at: Alignment) -> Alignment:
-    residual, normal, in_tool = _linear(scene, at.hand_eye, at.constant, at.slope)
-    scale = max(at.misfit, _LEAST)
-    weight = 1 / (1 + (at.rms / (_CAUCHY * scale)) ** 2) / _SCALE**2
-    # Rows: rotation (3), translation (3), constant, slope; columns: q.
-    change = np.zeros((len(normal), 8, 7))
-    if scene.moves:
-        across = np.cross(np.eye(3), normal[:, None]).swapaxes(1, 2)
-        change[:, 0:3, 0:3] = (1 - at.slope) * across
-        change[:, 0:3, 4:7] = -at.constant * across
-        change[:, 3:6, 3] = in_tool
-    change[:, 6, 4:7] = change[:, 7, 0:3] = -normal
-    product = change @ scene.moments
-    hessian = np.einsum("f,fab,fcb->ac", weight, product, change)
-    gradient = np.einsum("f,fab,fb->a", weight, product, residual)
-    prior = _PRIOR**-2.0
-    gradient[6:] += prior[6:] * [at.constant, at.slope]
-    step = -np.linalg.solve(hessian + np.diag(prior), gradient)
-    moved = at.hand_eye.copy()
-    moved[:3, :3] = at.hand_eye[:3, :3] @ Rotation.from_rotvec(step[:3]).as_matrix()
-    moved[:3, 3] += step[3:6]
-    return judged(scene, moved, at.constant + step[6], at.slope + step[7])
-
-
-def _starts(scene: Scene, subsets: int = 12, size: int = 4) -> list[np.ndarray]:
-    """Return the recorded guess, and closed forms from all frames and from the best of some.
-
-    With a third of the poses wrong, one of 12 subsets of 4 is right with a probability of 0.93.
+    Args:
+        scene: Poses, planes and points.
+        walls: Where estimated walls start; None: the planes of the scene are right.
     """
-    if not scene.known.any():
-        return [scene.guess, _single_ray_start(scene)]
-    known = np.flatnonzero(scene.known)
-    in_tool, own = scene.planes_in_tool()[0][known], scene.own_normal[known]
-    rotations = [_procrustes(in_tool, own)]
-    if len(known) > size:
-        generator = np.random.default_rng(0)
-        drawn = [generator.choice(len(known), size, replace=False) for _ in range(subsets)]
-        tried = [_procrustes(in_tool[one], own[one]) for one in drawn]
-        off = [np.median(np.abs(in_tool @ one - own).sum(1)) for one in tried]
-        rotations.append(tried[int(np.argmin(off))])
-    starts = np.tile(np.eye(4), (len(rotations), 1, 1))
-    starts[:, :3, :3] = rotations
-    return [scene.guess, *starts]
-
-
-def _procrustes(to: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """Return the rotation that turns directions `of` (N, 3) into `to` (N, 3)."""
-    left, _, right = np.linalg.svd(to.T @ of)
-    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-
-
-def _single_ray_start(scene: Scene) -> np.ndarray:
-    """Return a start where every frame has one direction only: linear in ray and translation."""
-    in_tool, offset_tool = scene.planes_in_tool()
-    mean = scene.moments[:, 3]
-    distance = np.linalg.norm(mean[:, :3], axis=1)
-    ray = mean[0, 4:7] / max(np.linalg.norm(mean[0, 4:7]), TINY)
-    matrix = np.concatenate([in_tool * distance[:, None], in_tool], axis=1)
-    solved = np.linalg.lstsq(matrix, -offset_tool, rcond=1e-9)[0]
-    start = np.eye(4)
-    start[:3, :3] = _procrustes(solved[None, :3], ray[None])
-    start[:3, 3] = solved[3:]
-    return start
+    found = (_refined(scene, start, walls) for start in _starts(scene))
+    return min(found, key=lambda one: one.misfit)
 
 
 def walls_of(scene: Scene) -> np.ndarray:
@@ -233,74 +177,54 @@ def walls_of(scene: Scene) -> np.ndarray:
     return np.unique(planes, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def align_with_free_walls(scene: Scene, fewest: int = 4) -> Alignment | None:
+def align_with_free_walls(scene: Scene) -> Alignment | None:
     """Return the alignment on walls estimated with it; None where the frames do not allow it.
 
-    A wall needs `fewest` frames: it has three unknowns.
+    A wall needs four frames: it has three unknowns.
     """
     wall = walls_of(scene)
-    if not scene.moves or np.bincount(wall).min() < fewest or not scene.known.all():
+    if not scene.moves or np.bincount(wall).min() < 4 or not scene.known.all():
         return None
-    starts = [scene]
-    normal = _directions(scene, wall)
-    if normal is not None:
-        # Each wall at the middle of its frames' points, the hand-eye guessed as the identity.
-        places = _world_moments(scene, np.eye(4), 0.0, 0.0)[:, 3, :3]
-        offset = np.array([-places[wall == w].mean(0) @ m for w, m in enumerate(normal)])
-        starts.append(replace(scene, normal=normal[wall], offset=offset[wall]))
-    return min((_alternated(start, wall) for start in starts), key=lambda one: one.misfit)
+    first = np.unique(wall, return_index=True)[1]
+    parts = scene.normal[first], scene.offset[first], wall, scene.poses
+    return align(scene, Walls(*_tensors(*parts)))
 
 
-def _alternated(scene: Scene, wall: np.ndarray) -> Alignment:
-    """Take walls from the alignment and the alignment from the walls, in turn.
+def _refined(scene: Scene, start: Tensor, walls: Walls | None) -> Alignment:
+    """Take Gauss-Newton steps with the frames weighted by their misfit."""
+    recorded = moments = scene.image_moments()
+    at = Parameters(start, torch.zeros(2, dtype=torch.float64), scene.moves)
+    unknowns = at.size + (0 if walls is None else walls.size)
+    # On the walls lies the hand-eye's prior of a metre and a radian.
+    scale = torch.cat([_PRIOR[-at.size :], _PRIOR[:1].expand(unknowns - at.size)]) ** -2
+    # Quadratic convergence from the closed form takes five, the weights a few more.
+    for _ in range(12):
+        rms = MomentObjective(moments).image_losses(at).clamp(min=0).sqrt()
+        weight = robust_weights(rms / rms.quantile(0.5).clamp(min=_LEAST), "cauchy")
+        images = joint_image_equations(moments.weighted(weight), at, walls).total()
+        pull = torch.nn.functional.pad(at.coefficients, (at.twist_size, unknowns - at.size))
+        equations = images.plus(NormalEquations(images.loss, scale * pull, scale.diag()))
+        step = -solved(equations.hessian, equations.gradient)
+        at = at.moved(step[: at.size])
+        if walls is not None:
+            walls = walls.moved(step[at.size :])
+            moments = walls.seen_by(recorded)
+    return _judged(scene, moments, at)
 
-    Beyond eight rounds, the misfit of walls 40 degrees off falls by less than a tenth.
+
+def _starts(scene: Scene) -> list[Tensor]:
+    """Return the recorded guess, and closed forms from all frames and from the best of some.
+
+    With a third of the poses wrong, one of 12 subsets of 4 is right with a probability of 0.93.
     """
-    found = align(scene)
-    for _ in range(8):
-        scene = _with_walls(scene, found, wall)
-        found = align(replace(scene, guess=found.hand_eye))
-    return found
-
-
-def _directions(scene: Scene, wall: np.ndarray) -> np.ndarray | None:
-    """Return the walls' normals (W, 3): R_i R n_i = m_w is linear in the entries of R and m.
-
-    None where the second smallest eigenvalue of that is no four times the smallest.
-    """
-    frames, count = len(wall), int(wall.max()) + 1
-    rows = np.zeros((frames, 3, 9 + 3 * count))
-    turned = np.einsum("fab,fc->fabc", scene.poses[:, :3, :3], scene.own_normal)
-    rows[:, :, :9] = turned.reshape(frames, 3, 9)
-    for axis in range(3):
-        rows[np.arange(frames), axis, 9 + 3 * wall + axis] = -1
-    values, vectors = np.linalg.eigh(np.einsum("fai,faj->ij", rows, rows))
-    if values[1] < 4 * max(values[0], TINY):
-        return None
-    solution = vectors[:, 0] * np.sign(np.linalg.det(vectors[:9, 0].reshape(3, 3)) or 1)
-    normal = solution[9:].reshape(count, 3)
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
-
-
-def _with_walls(scene: Scene, found: Alignment, wall: np.ndarray) -> Scene:
-    """Return the scene with each wall the plane of least squares through its frames' points."""
-    moments = _world_moments(scene, found.hand_eye, found.constant, found.slope)
-    weight = 1 / (1 + (found.rms / (3 * max(found.misfit, _LEAST))) ** 2)
-    normal, offset = scene.normal.copy(), scene.offset.copy()
-    for number in np.unique(wall):
-        own = wall == number
-        total = np.einsum("f,fab->ab", weight[own], moments[own])
-        mean = total[3, :3] / total[3, 3]
-        vectors = np.linalg.eigh(total[:3, :3] / total[3, 3] - np.outer(mean, mean))[1]
-        direction = vectors[:, 0] * (1.0 if vectors[:, 0] @ scene.normal[own][0] > 0 else -1.0)
-        normal[own], offset[own] = direction, -direction @ mean
-    return replace(scene, normal=normal, offset=offset)
-
-
-def _world_moments(scene: Scene, hand_eye: np.ndarray, constant: float, slope: float) -> np.ndarray:
-    """Return the mean of (x, 1)(x, 1)^T of each frame's points in the world, shape (F, 4, 4)."""
-    corrected = np.zeros((4, 7))
-    corrected[:3, :3], corrected[:3, 4:7] = (1 - slope) * np.eye(3), -constant * np.eye(3)
-    corrected[3, 3] = 1.0
-    form = scene.poses @ hand_eye @ corrected
-    return form @ scene.moments @ np.swapaxes(form, 1, 2)
+    if not scene.moves:
+        return [torch.eye(4, dtype=torch.float64)]
+    guess, known = torch.from_numpy(scene.guess), np.flatnonzero(scene.known)
+    in_tool, own = _tensors(scene.planes_in_tool()[0][known], scene.own_normal[known])
+    rotations = [rotation_from_normals(in_tool, own, guess[:3, :3])]
+    if len(known) > 4:
+        generator = np.random.default_rng(0)
+        drawn = [generator.choice(len(known), 4, replace=False) for _ in range(12)]
+        tried = [rotation_from_normals(in_tool[some], own[some], guess[:3, :3]) for some in drawn]
+        rotations.append(min(tried, key=lambda one: (in_tool @ one - own).abs().sum(1).median()))
+    return [guess, *(se3.assemble(one, torch.zeros(3).to(one)) for one in rotations)]

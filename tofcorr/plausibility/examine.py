@@ -126,8 +126,8 @@ def examine(data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> 
     )
 
 
-def _numbers(look: Look, *, aligned: bool, unsure: float = 0.03) -> dict[str, float]:
-    """Return what was measured; the focal length unless its standard error is above `unsure`."""
+def _numbers(look: Look, *, aligned: bool) -> dict[str, float]:
+    """Return what was measured; the focal length if its standard error is below 3 %."""
     stored = look.stored[np.isfinite(look.stored)]
     found: dict[str, float] = {
         "frames": float(look.data.num_frames),
@@ -142,7 +142,7 @@ def _numbers(look: Look, *, aligned: bool, unsure: float = 0.03) -> dict[str, fl
             found["distance to the planes after alignment, mm"] = 1e3 * given.misfit
             found["angle to the planes after alignment, deg"] = math.degrees(given.typical_angle)
             found["distances too long by, mm"] = 1e3 * given.constant
-        if look.shape is not None and (focal := look.shape["focal"]).size_error < unsure:
+        if look.shape is not None and 100 * (focal := look.shape["focal"]).size_error < 3:
             found["focal length should change by, %"] = 100 * float(focal.value[0])
             found["standard error of that change, %"] = 100 * focal.size_error
     return {name: value for name, value in found.items() if math.isfinite(value)}

@@ -5,7 +5,6 @@ amplitude, and smooth errors over the image. Whoever looks for something else (a
 a drift of the poses) adds its own columns to these: a function of some lines below.
 """
 
-from collections.abc import Callable
 from copy import copy
 from functools import cached_property
 from itertools import pairwise
@@ -14,9 +13,11 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from tofcorr.conditions import OPTIONAL_CONDITIONS
+from tofcorr.conditions import CONDITIONS, condition
+from tofcorr.estimation.linear import Curvature
 from tofcorr.geometry.rays import moved_rays, unambiguous_range
 from tofcorr.plausibility.alignment import TINY, Alignment, Scene
+from tofcorr.plausibility.finding import CAMERA
 
 # Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
 _KNOTS = 8
@@ -26,6 +27,8 @@ _RIGID, _OF_A_FRAME = 6, 3
 # three determined by each frame. From which a drift is: twice as many as determine 25 unknowns. And
 # from which conditions and phase are taken into account: ten determine all the rest. Chosen.
 _FEWEST_FOR_SHAPE, _FEWEST_FOR_DRIFT, _FEWEST_FOR_CONDITIONS = 11, 16, 20
+# Cosine of the angle of incidence from which the distance to the plane is computed. Chosen: 87 deg.
+_GRAZING = 0.05
 # Waves of the circular error in one unambiguous range: harmonics of four taps (Lange 2000).
 _WAVES = np.array([4, 8])
 
@@ -64,9 +67,6 @@ class LinearResiduals:
         amplitude: Which errors follow, shape (F, P); NaN: unknown; None: that of a matt wall, for
             recordings without. An error by the amplitude changes over a tilted wall as one of focal
             length or distortion does.
-        farthest: Pixels further than this many typical distances from the plane are left out.
-        grazing: Cosine of the angle of incidence below which the distance to the plane is not
-            computed: a ray along the wall meets it anywhere.
 
     Attributes:
         residual: Distance of each point to its plane, shape (F, P), metres.
@@ -80,15 +80,7 @@ class LinearResiduals:
         world: Where the points should be in the world, shape (F, P, 3), metres.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        found: Alignment,
-        amplitude: np.ndarray | None,
-        *,
-        farthest: float = 4.0,
-        grazing: float = 0.05,
-    ) -> None:
+    def __init__(self, scene: Scene, found: Alignment, amplitude: np.ndarray | None) -> None:
         rays, used = scene.rays, scene.on_plane
         self.scene, self.rays = scene, rays
         normal_tool, offset_tool = scene.planes_in_tool()
@@ -98,13 +90,13 @@ class LinearResiduals:
         cosine = self.cosine = np.einsum("fpa,fa->fp", rays, self.normal)
         self.residual = cosine * ((1 - found.slope) * d - found.constant) + offset[:, None]
         typical = np.maximum(found.rms, found.misfit)[:, None]
-        used = self.used = used & (np.abs(self.residual) < farthest * typical)
+        used = self.used = used & (np.abs(self.residual) < 4 * typical)
         self.weight = np.where(used, 1.0, 0.0) / typical**2
         # Errors are looked for over the distance to the plane, not over the one measured: that has
         # the noise of the residual, which a mixture of columns would explain by what else tells
         # distance. So are places: with that noise, the square of a point's place would follow its
-        # residual, and every wall would look bent.
-        seen = used & (np.abs(cosine) > grazing)
+        # residual, and every wall would look bent. A ray along the wall meets it anywhere.
+        seen = used & (np.abs(cosine) > _GRAZING)
         noise = self.residual / ((1 - found.slope) * np.where(seen, cosine, 1.0))
         d = self.distance = d - np.where(seen, noise, 0.0)
         points = rays * d[..., None]
@@ -152,7 +144,7 @@ class LinearResiduals:
         planes = np.einsum("fpa,fp->fa", self.plane_directions, left)
         return np.linalg.norm(planes, axis=1) / np.sqrt(count)
 
-    def added(self, *blocks: np.ndarray, ridge: float = 1e-9) -> list[Estimate]:
+    def added(self, *blocks: np.ndarray) -> list[Estimate]:
         """Estimate the unknowns of blocks of columns (F, P, N) beside those of the problem.
 
         Returns:
@@ -161,18 +153,15 @@ class LinearResiduals:
         columns = np.concatenate([self.columns, *blocks], axis=-1)
         weighted = columns * self.weight[..., None]
         matrix = np.einsum("fpa,fpb->ab", weighted, columns, optimize=True)
-        scale = 1 / np.sqrt(np.maximum(np.diag(matrix), TINY))
-        # The ridge only decides what nothing determines.
-        inverse = np.linalg.inv(matrix * scale * scale[:, None] + ridge * np.eye(len(scale)))
-        unknowns = -inverse @ (np.einsum("fpa,fp->a", weighted, self.residual) * scale) * scale
+        inverse = Curvature(torch.from_numpy(matrix)).inverse.numpy()
+        unknowns = -inverse @ np.einsum("fpa,fp->a", weighted, self.residual)
         left = self.residual + columns @ unknowns
-        scores = inverse @ (np.einsum("fpa,fp->fa", weighted, left) * scale).T
+        scores = np.einsum("fpa,fp->fa", weighted, left) @ inverse
         # The residuals are smaller than the errors, by the unknowns that were fitted to them.
-        count = len(self.residual)
+        count, error = len(self.residual), np.full(len(inverse), np.inf)
         freedom = count - len(unknowns) / _OF_A_FRAME
-        error = np.full(len(scale), np.inf)
         if freedom > 0:
-            error = scale * np.sqrt(count / freedom * np.square(scores).sum(axis=1))
+            error = np.sqrt(count / freedom * np.square(scores).sum(axis=0))
         ends = np.cumsum([self.columns.shape[-1], *(block.shape[-1] for block in blocks)])
         return [Estimate(unknowns[a:b], error[a:b], left) for a, b in pairwise(ends)]
 
@@ -188,35 +177,32 @@ def _hats(d: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.maximum(1 - np.abs(place - np.arange(_KNOTS)[:, None, None]), 0.0)
 
 
-def _brightness(amplitude: np.ndarray, darkest: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+def _brightness(amplitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the logarithm of the amplitude and its square, standardised, shape (F, P) each.
 
-    Amplitudes are cut below at the share `darkest` of the typical one: the logarithm of none is
-    infinite.
+    Amplitudes are cut below at a thousandth of the typical one: the logarithm of none is infinite.
     """
     known = amplitude[np.isfinite(amplitude)]
     typical = float(np.median(known)) if len(known) else 1.0
     filled = np.nan_to_num(amplitude, nan=typical)
-    bright = _standardised(np.log(np.maximum(filled, darkest * max(typical, TINY))))
+    bright = _standardised(np.log(np.maximum(filled, max(typical, TINY) / 1000)))
     return bright, bright**2
 
 
-def by_conditions(column: Callable[[str], np.ndarray | None], count: int) -> np.ndarray:
+def by_conditions(conditions: np.ndarray) -> np.ndarray:
     """Return the conditions that were recorded of all frames and differ, standardised, (F, K).
 
     K is 0 where there are few frames.
 
     Args:
-        column: Returns a condition by its name, shape (F,); None: not recorded.
-        count: F.
+        conditions: In the order of `CONDITIONS`, shape (F, C); NaN: unknown.
     """
-    found = []
-    for one in OPTIONAL_CONDITIONS if count >= _FEWEST_FOR_CONDITIONS else ():
-        values = column(one.name)
-        if values is not None and np.isfinite(values).all():
-            values = np.log(values) if one.positive else values
-            found += [_standardised(values)] if np.ptp(values) > 0 else []
-    return np.stack(found, axis=-1) if found else np.zeros((count, 0))
+    few, found = len(conditions) < _FEWEST_FOR_CONDITIONS, []
+    for name, values in zip(CONDITIONS, conditions.T, strict=True):
+        kind = condition(name)
+        if not few and not kind.required and np.isfinite(values).all() and np.ptp(values) > 0:
+            found.append(_standardised(np.log(values) if kind.positive else values))
+    return np.stack(found, axis=-1) if found else np.zeros((len(conditions), 0))
 
 
 def by_phase(problem: LinearResiduals, frequency: float | None) -> np.ndarray:
@@ -309,9 +295,7 @@ def places_on_wall(problem: LinearResiduals) -> tuple[np.ndarray, np.ndarray]:
     return s - np.median(s[problem.used]), t - np.median(t[problem.used])
 
 
-def pose_drift(
-    problem: LinearResiduals, least: float = 0.025, sigmas: float = 6.0
-) -> Estimate | None:
+def pose_drift(problem: LinearResiduals) -> Estimate | None:
     """Estimate by how much the robot's poses, or the wall, move steadily away.
 
     The world shifts and turns in proportion to the frame's number. The size of the estimate is the
@@ -319,9 +303,6 @@ def pose_drift(
 
     Args:
         problem: The residuals, in the order in which the frames were recorded.
-        least: Drift that counts, metres. A camera that warms up shifts its distances alike, by
-            about a centimetre, and 80 clean recordings had 2 mm.
-        sigmas: The same in standard errors.
 
     Returns:
         None where there is none, there are too few frames, or no robot moves.
@@ -339,7 +320,9 @@ def pose_drift(
     drift = drift @ (directions.T * each)
     when = np.linspace(-0.5, 0.5, len(scene.poses))[:, None, None]
     (found,) = problem.added(when * drift)
-    return found if found.size > max(least, sigmas * found.size_error) else None
+    # A camera that warms up shifts its distances alike, by about a centimetre, and 80 clean
+    # recordings had 2 mm.
+    return found if found.size > max(CAMERA, 6 * found.size_error) else None
 
 
 def length_scale(given: Alignment, problem: LinearResiduals) -> tuple[float, float]:

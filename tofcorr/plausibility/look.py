@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import Recording
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import (
@@ -19,6 +20,7 @@ from tofcorr.plausibility.alignment import (
     align,
     align_with_free_walls,
 )
+from tofcorr.plausibility.finding import CAMERA, LARGE_CONSTANT
 from tofcorr.plausibility.linear import (
     Estimate,
     LinearResiduals,
@@ -78,12 +80,12 @@ def _off_neighbours(
     return 2 * (1 / (a / at_p + b / at_q) - at_r)
 
 
-def _noise_of(differences: np.ndarray, jump: float = 0.15) -> tuple[float, float]:
+def _noise_of(differences: np.ndarray) -> tuple[float, float]:
     """Return a pixel's noise by second differences of neighbours, metres: robust, and as an RMS.
 
-    From a difference of `jump` metres on, one of them is garbage.
+    Where they differ by more than errors of a camera, one of them is garbage.
     """
-    differences = differences[np.abs(differences) < jump]
+    differences = differences[np.abs(differences) < LARGE_CONSTANT]
     if not len(differences):
         return np.nan, np.nan
     # A second difference of independent values has six times their variance.
@@ -91,38 +93,26 @@ def _noise_of(differences: np.ndarray, jump: float = 0.15) -> tuple[float, float
     return noise, float((np.mean(differences**2) / 6) ** 0.5)
 
 
-def _scene_of(
-    look: "Look",
-    stored: np.ndarray,
-    pixel: np.ndarray,
-    *,
-    spread: float = 0.02,
-    fewest: int = 6,
-    sigmas: float = 4.0,
-    tolerance: float = 0.02,
-) -> Scene:
+def _scene_of(look: "Look", stored: np.ndarray, pixel: np.ndarray) -> Scene:
     """Fit a plane to each frame: robustly, then by least squares to the pixels near it.
 
     Args:
         look: The recording.
         stored: Depths, shape (F, P), metres; NaN: not usable.
         pixel: Where, shape (F, P).
-        spread: Least standard deviation of a frame's rays across its two directions, radians; below
-            it the direction of the plane is not known: at 1 m it makes a base of 2 cm.
-        fewest: Pixels of a plane that can be judged: three determine one.
-        sigmas: A pixel is on its frame's plane within so many robust standard deviations,
-        tolerance: or this distance, metres: errors of a camera bend a wall by a centimetre.
     """
     rays = look.rays[pixel]
     distance = stored / rays[..., 2] if look.recording.depth_kind == "z" else stored
     valid = np.isfinite(distance)
-    known = _spread(_moments(rays, distance, valid), slice(4, 7))[1][:, 1] > spread**2
-    known &= valid.sum(1) >= fewest
+    # On a base as short, as seen from 1 m, errors of the camera turn the plane anywhere. And three
+    # pixels determine a plane, six can judge it.
+    known = _spread(_moments(rays, distance, valid), slice(4, 7))[1][:, 1] > CAMERA**2
+    known &= valid.sum(1) >= 6
     normal, height = _best_triples(rays, distance, valid)
     on_plane, moments, variances = valid, np.zeros(0), np.zeros(0)
     for _ in range(2):
         off = np.abs(distance - height[:, None] / _cosine(rays, normal[:, None])[:, 0])
-        near = np.maximum(sigmas * sigma_from_mad(_median(off)), tolerance)[:, None]
+        near = np.maximum(4 * sigma_from_mad(_median(off)), CAMERA)[:, None]
         on_plane = np.where(known[:, None], off <= near, valid)
         moments = _moments(rays, distance, on_plane)
         mean, variances, directions = _spread(moments, slice(0, 3))
@@ -131,8 +121,8 @@ def _scene_of(
     off_by = distance - height[:, None] / _cosine(rays, normal[:, None])[:, 0]
     return Scene(
         poses=look.poses,
-        normal=np.asarray(look.column("normal_world")),
-        offset=np.asarray(look.column("offset")),
+        normal=look.column("normal_world"),
+        offset=look.column("offset"),
         moves=look.data.moves,
         guess=np.asarray(look.recording.tool_from_camera, dtype=np.float64),
         rays=rays,
@@ -201,18 +191,12 @@ class Look:
         data: The recordings.
         planes: What the command does with the recorded planes.
         fits: Whether the command fits a model; `check` does not.
-        pixels: Looked at in all: a plane is then known to a tenth of the noise of one pixel, and 60
-            frames are read and judged in well below 0.3 s.
-        of_a_frame: The least and the most of one frame.
-        most_frames: Looked at, evenly spaced: twenty minutes of poses, judged in about a second.
-        across: Points across and down the fixed grid of each image.
 
     Attributes:
         sampled: Global numbers of the F frames looked at.
         pixel: Flat index of P pixels in the image of each, on the target by its mask, shape (F, P).
         stored: Depth as stored, shape (F, P), float64, metres; NaN: not usable, or no pixel.
         amplitude: Shape (F, P); None if not recorded.
-        grid: Depth as stored on the fixed grid, whatever the mask says, shape (F, G), float32.
         masked: Share of each image's pixels on the target by the mask, shape (F,); 1 without one.
         off_mask: As `stored`, but pixels off the mask, shape (F, P'); None without a mask.
         off_pixel: Flat indices of these, shape (F, P').
@@ -224,35 +208,23 @@ class Look:
         scene: Their poses and planes as recorded, and their points as measured.
     """
 
-    def __init__(
-        self,
-        data: Dataset,
-        planes: PlaneUse = "known",
-        *,
-        fits: bool = True,
-        pixels: int = 12_000,
-        of_a_frame: tuple[int, int] = (24, 200),
-        most_frames: int = 600,
-        across: int = 12,
-    ) -> None:
+    def __init__(self, data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> None:
         self.data, self.planes, self.fits = data, planes, fits
-        total, camera = data.num_frames, data.first.camera
-        self.sampled = np.unique(np.linspace(0, total - 1, min(total, most_frames)).astype(int))
-        number = int(np.clip(pixels // len(self.sampled), *of_a_frame))
-        rows, columns = (
-            np.unique(np.linspace(0, size - 1, across).astype(int))
-            for size in (camera.height, camera.width)
-        )
-        self._read(number, (rows[:, None] * camera.width + columns).ravel())
+        total = data.num_frames
+        # Twenty minutes of poses, judged in about a second.
+        self.sampled = np.unique(np.linspace(0, total - 1, min(total, 600)).astype(int))
+        # A plane is then known to a tenth of the noise of one pixel, and 60 frames are read and
+        # judged in well below 0.3 s.
+        self._read(int(np.clip(12_000 // len(self.sampled), 24, 200)))
         whole = _scene_of(self, self.stored, self.pixel)
         self.usable = np.asarray(whole.on_plane.any(1))
         self.frames, self.scene = self.sampled[self.usable], whole.some(self.usable)
 
-    def _read(self, number: int, grid: np.ndarray) -> None:
-        """Read so many pixels of each frame, and those of the grid."""
+    def _read(self, number: int) -> None:
+        """Read so many pixels of each frame."""
         width, rays = self.recording.camera.width, self.rays
         everywhere = _even(np.arange(len(rays)), number, width)
-        pixel, stored, bright, on_grid, off_pixel, off, share, second = ([] for _ in range(8))
+        pixel, stored, bright, off_pixel, off, share, second = ([] for _ in range(7))
         for recording, _, local in self.data.by_recording(self.sampled):
             for k in local.tolist():
                 image, inside = recording.depth[k].reshape(-1), np.arange(len(rays))
@@ -267,7 +239,6 @@ class Look:
                 pixel.append(chosen)
                 stored.append(depth)
                 share.append(len(inside) / len(rays))
-                on_grid.append(np.array(image[grid]))
                 off_pixel.append(np.setdiff1d(everywhere, inside, assume_unique=True))
                 off.append(_depth_at(image, off_pixel[-1]))
                 column = chosen % width
@@ -275,7 +246,7 @@ class Look:
                 second.append(_off_neighbours(image, middle, rays, recording.depth_kind == "z"))
         self.pixel, self.stored = _padded(pixel, 0).astype(int), _padded(stored, np.nan)
         self.amplitude = _padded(bright, np.nan) if len(bright) == len(stored) else None
-        self.grid, self.masked = np.stack(on_grid), np.array(share)
+        self.masked = np.array(share)
         has_mask = any(recording.mask is not None for recording in self.data.recordings)
         self.off_mask = _padded(off, np.nan) if has_mask else None
         self.off_pixel = _padded(off_pixel, 0).astype(int)
@@ -291,17 +262,18 @@ class Look:
         """Unit rays of all pixels of the image, shape (H W, 3)."""
         return self.data.ray_directions().numpy().reshape(-1, 3)
 
-    def column(self, name: str) -> np.ndarray | None:
-        """Return a column of the frames' tables for the frames looked at; None if one lacks it."""
-        parts = [getattr(one.frames, name) for one in self.data.recordings]
-        if any(part is None for part in parts):
-            return None
-        return np.concatenate(parts)[self.sampled]
+    def column(self, name: str) -> np.ndarray:
+        """Return a column that every recording has, for the frames looked at, shape (F, ...)."""
+        return self.data.column(name).numpy()[self.sampled]
+
+    def condition(self, name: str) -> np.ndarray:
+        """Return a condition of the frames looked at, shape (F,); NaN: unknown."""
+        return self.data.conditions(self.sampled)[:, CONDITIONS.index(name)].numpy()
 
     @property
     def poses(self) -> np.ndarray:
         """world_from_tool of the frames looked at, shape (F, 4, 4), metres."""
-        return np.asarray(self.column("world_from_tool"))
+        return self.column("world_from_tool")
 
     def with_images(self, stored: np.ndarray, pixel: np.ndarray) -> Scene:
         """Return the scene if these depths (F, P) had been measured, at these pixels."""
@@ -351,7 +323,8 @@ class Look:
         no reason to doubt a recording that says so.
         """
         assert self.linear is not None
-        conditions = by_conditions(self.column, len(self.sampled))[self.usable][self.scene.known]
+        seen = self.frames[self.scene.known]
+        conditions = by_conditions(self.data.conditions(seen).numpy())
         circular = by_phase(self.linear, self.recording.modulation_frequency)
         along = [conditions[:, None], circular]
         return self.linear.with_columns(

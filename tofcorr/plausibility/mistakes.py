@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tofcorr.plausibility.alignment import Alignment, Scene, align, align_with_free_walls
+from tofcorr.plausibility.finding import CAMERA, FAR_OFF, SPOILS
 from tofcorr.plausibility.look import Look
 
 FAR_BETTER = 0.5
@@ -131,33 +132,23 @@ Explanation = tuple[str, str, Alignment, bool]
 whether undoing it frees unknowns, so that some of the misfit falls in any case."""
 
 
-def best_explanations(
-    look: Look,
-    acceptable: float = 0.02,
-    times_flat: float = 4.0,
-    gain: float = 0.008,
-    as_good: float = 1.3,
-) -> list[Explanation]:
+def best_explanations(look: Look) -> list[Explanation]:
     """Return the explanations that are about as good as the best and far better than none.
 
-    Args:
-        look: The recording.
-        acceptable: What an explanation may leave, metres,
-        times_flat: or so many times the flatness of the walls.
-        gain: What it takes off at the least, metres.
-        as_good: Of several, the first listed that comes this near the best is named.
+    They leave no more than errors of a camera, or the noise of its walls, and take off what spoils
+    a fit. Of several, the first listed that comes near the best is named: within four thirds.
     """
     given = look.given
-    most = min(FAR_BETTER * given.badness, max(acceptable, times_flat * look.flatness))
+    most = min(FAR_BETTER * given.badness, max(CAMERA, 4 * look.flatness))
     better = [
         (cause, advice, found, frees)
         for cause, advice, found, frees in explanations(look)
         if found.badness <= most
-        and given.badness - found.badness > gain
+        and given.badness - found.badness > SPOILS
         and (not frees or found.misfit <= FAR_BETTER * given.misfit)
     ]
     least = min((found.badness for *_, found, _ in better), default=0.0)
-    return [one for one in better if one[2].badness <= as_good * least]
+    return [one for one in better if 3 * one[2].badness <= 4 * least]
 
 
 def explanations(look: Look) -> Iterator[Explanation]:
@@ -169,12 +160,12 @@ def explanations(look: Look) -> Iterator[Explanation]:
             yield cause, advice, found, frees
 
 
-def _of_poses(look: Look, narrowest: float = 0.02) -> Iterator[tuple[str, str, Scene]]:
-    """Yield mistakes in poses; none that shrinks them to an extent below `narrowest`, metres."""
+def _of_poses(look: Look) -> Iterator[tuple[str, str, Scene]]:
+    """Yield mistakes in poses; none that shrinks them to an extent of errors of a camera."""
     scene = look.scene
     if not scene.moves:
         return
-    narrowest = min(narrowest, float(np.ptp(scene.poses[:, :3, 3], axis=0).max()))
+    narrowest = min(CAMERA, float(np.ptp(scene.poses[:, :3, 3], axis=0).max()))
     for name, (cause, advice, undo) in IN_POSES.items():
         poses = undo(scene.poses)
         # Frames at the end have no pose of theirs.
@@ -211,32 +202,27 @@ def _of_planes(look: Look) -> Iterator[tuple[str, str, Scene | Alignment | None]
         )
 
 
-def _in_two_parts(look: Look, fewest: int = 6) -> Alignment | None:
+def _in_two_parts(look: Look) -> Alignment | None:
     """Return the alignment of the two sides of a cut, each by itself, at the best of some cuts.
 
-    Either side has `fewest` frames at least: seven unknowns, three from a frame.
+    Either side has six frames at least: seven unknowns, three from a frame.
     """
     number, found = np.arange(len(look.scene.poses)), []
-    for share in (1 / 2, 1 / 4, 3 / 4, 1 / 3, 2 / 3):
-        before = number < round(share * len(number))
-        if min(before.sum(), (~before).sum()) >= fewest:
+    for twelfths in (6, 3, 9, 4, 8):
+        before = number < round(twelfths * len(number) / 12)
+        if min(before.sum(), (~before).sum()) >= 6:
             one, other = (align(look.scene.some(part)) for part in (before, ~before))
             rms, angle = np.append(one.rms, other.rms), np.append(one.angle, other.angle)
             found.append(Alignment(np.eye(4), 0.0, 0.0, rms, angle))
     return min(found, key=lambda one: one.misfit, default=None)
 
 
-def _of_images(
-    look: Look, nearest: float = 0.1, fewest: int = 12
-) -> Iterator[tuple[str, str, Scene]]:
+def _of_images(look: Look) -> Iterator[tuple[str, str, Scene]]:
     """Yield mistakes in images.
 
-    Args:
-        look: The recording.
-        nearest: A unit is not tried that leaves a distance below it, metres: a camera that shrinks
-            to a point misses no plane.
-        fewest: Pixels off the mask that most frames must have to say that it is inverted: any
-            plane fits the few that a right mask leaves off the target.
+    A unit is not tried that leaves a distance as short as pixels may be off: a camera that shrinks
+    to a point misses no plane. To say that the mask is inverted, most frames must have twelve
+    pixels off it: any plane fits the few that a right mask leaves off the target.
     """
     camera = look.recording.camera
     if camera.height * camera.width < 4:
@@ -247,10 +233,10 @@ def _of_images(
             pixel = undone.reshape(-1)[look.pixel]
             yield cause, advice, look.with_images(look.stored, pixel)
     for cause, advice, undo in IN_DEPTH.values():
-        if np.nanmedian(depth := undo(look.stored)) >= nearest:
+        if np.nanmedian(depth := undo(look.stored)) >= FAR_OFF:
             yield cause, advice, look.with_images(depth, look.pixel)
     off = look.off_mask
-    if off is not None and (np.isfinite(off).sum(axis=1) >= fewest).mean() > 0.5:
+    if off is not None and (np.isfinite(off).sum(axis=1) >= 12).mean() > 0.5:
         yield (
             "the mask is inverted: it is 0 on the target",
             "write 1 where a pixel looks at the target",

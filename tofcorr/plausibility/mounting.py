@@ -156,12 +156,12 @@ class Mounting:
         """
         return max(6, len(self.frame) // 6)
 
-    def moment(self, moments: int = 41) -> Parts | None:
+    def moment(self) -> Parts | None:
         """Return the parts before and after one of some moments; None: the camera did not move."""
         number, least = len(self.frame), self._fewest
         if number < 2 * least:
             return None
-        tried = np.unique(np.linspace(least, number - least, moments).astype(int))
+        tried = np.unique(np.linspace(least, number - least, 41).astype(int))
         limits = _LEAST_OTHERWISE if number < _FEWEST_FOR_PARTS else _LEAST_AT_A_MOMENT
         return self._best((np.arange(number) >= moment for moment in tried), limits)
 
@@ -177,34 +177,31 @@ class Mounting:
         improved = map(self._improved, self._starts())
         return self._best((one for one in improved if one is not None), _LEAST_OTHERWISE)
 
-    def _starts(
-        self, twists: int = 100, frames: int = 3, kept: int = 60, ridge: float = 1e-4
-    ) -> list[np.ndarray]:
+    def _starts(self) -> list[np.ndarray]:
         """Return halves of the frames, (N,) bool, that agree best with a twist of some frames.
 
-        Args:
-            twists: Tried; of two parts of half the frames, one draw in four is of one part alone.
-            frames: That fix one; three have nine numbers, a constant and a twist seven.
-            kept: Best of them; of 20 recordings of 22 poses, 60 found the true parts in all.
-            ridge: Share of a twist's mean information that is added to each of its directions: it
-                only decides what three frames do not determine.
+        Three frames fix one: they have nine numbers, a constant and a twist seven. Of two parts of
+        half the frames, one draw in four is of one part alone; of 20 recordings of 22 poses, the
+        best 60 of 100 twists found the true parts in all.
         """
         number, size = len(self.frame), self.step.shape[-1]
         step = self.step / np.maximum(np.sqrt(np.square(self.step).mean(axis=(0, 1))), TINY)
-        drawn = np.random.default_rng(number).random((twists, number)).argsort(axis=1)[:, :frames]
-        columns = step[drawn].reshape(twists, -1, size)
+        drawn = np.random.default_rng(number).random((100, number)).argsort(axis=1)[:, :3]
+        columns = step[drawn].reshape(100, -1, size)
         matrix = columns.mT @ columns
-        matrix = matrix + ridge * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(size)
-        right = columns.mT @ self._residual[drawn].reshape(twists, -1, 1)
+        # A ten thousandth of the mean information: it only decides what three frames do not.
+        ridge = np.trace(matrix, axis1=1, axis2=2) / 10_000
+        matrix = matrix + ridge[:, None, None] * np.eye(size)
+        right = columns.mT @ self._residual[drawn].reshape(100, -1, 1)
         twist = np.linalg.solve(matrix, right)[..., 0]
         explained = np.einsum("fak,sk->sfa", step, twist)
         off = np.square(self._residual[..., 0] - explained).sum(axis=2)
         agreeing = np.sort(off, axis=1)[:, : number // 2].sum(axis=1)
-        return [one <= np.median(one) for one in off[np.argsort(agreeing)[:kept]]]
+        return [one <= np.median(one) for one in off[np.argsort(agreeing)[:60]]]
 
-    def _improved(self, chosen: np.ndarray, rounds: int = 30) -> np.ndarray | None:
+    def _improved(self, chosen: np.ndarray) -> np.ndarray | None:
         """Put every frame to the part that explains it better, until none changes."""
-        for _ in range(rounds):
+        for _ in range(30):
             if min(int(chosen.sum()), int((~chosen).sum())) < self._fewest:
                 return None
             own = chosen[:, None, None]
@@ -219,17 +216,17 @@ class Mounting:
         return chosen
 
 
-def _agreeing(columns: np.ndarray, residual: np.ndarray, times: float = 5.0) -> np.ndarray:
+def _agreeing(columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return which frames (F,) do not, as single ones, disagree with all others.
 
-    Frames with so many times the median residual are left out, unless they are more than a tenth:
+    Frames with five times the median residual are left out, unless they are more than a tenth:
     then they may be a part by itself.
     """
     kept = np.ones(len(columns), dtype=bool)
     for _ in range(2):
         fitted = np.linalg.lstsq(_stacked(columns[kept]), _stacked(residual[kept]), rcond=None)[0]
         left = np.linalg.norm(residual - columns @ fitted, axis=(1, 2))
-        kept = left < times * np.median(left)
+        kept = left < 5 * np.median(left)
     return kept if (~kept).sum() <= len(kept) / 10 else np.ones_like(kept)
 
 

@@ -68,15 +68,12 @@ def all_figures(found: Inspection) -> dict[str, Figure]:
     return figures
 
 
-def depth_maps(look: Look, across: int = 64, frames: int = 40) -> Figure:
-    """Draw the median depth of some frames, and the share of them in which a pixel is used.
-
-    Images of more than so many pixels `across` are thinned.
-    """
+def depth_maps(look: Look) -> Figure:
+    """Draw the median depth of some frames, and the share of them in which a pixel is used."""
     recording = look.recording
     camera = recording.camera
-    step = max(camera.width // across, 1)
-    chosen = np.unique(np.linspace(0, recording.num_frames - 1, frames).astype(int))
+    step = max(camera.width // 64, 1)  # A picture shows no more.
+    chosen = np.unique(np.linspace(0, recording.num_frames - 1, 40).astype(int))
     depth = np.array(recording.depth[chosen, ::step, ::step], dtype=np.float64)
     used = np.isfinite(depth) & (depth > 0)
     if recording.mask is not None:

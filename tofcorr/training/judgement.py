@@ -10,8 +10,7 @@ from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.sample import MaskOptions
-from tofcorr.plausibility.checks.geometry import FAR_OFF
-from tofcorr.plausibility.finding import Inspection, in_words
+from tofcorr.plausibility.finding import FAR_OFF, Inspection, in_words
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.support import Support, hardly_tilted, shortcomings, worst_sigma
 

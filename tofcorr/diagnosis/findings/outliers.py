@@ -22,7 +22,7 @@ from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import multiples_in_words, range_of_wrapped
-from tofcorr.plausibility.finding import Inspection, in_words
+from tofcorr.plausibility.finding import LARGEST_GAP, Inspection, in_words
 from tofcorr.spread import sigma_from_mad
 
 
@@ -242,11 +242,6 @@ def mask_warning(observations: Observations, *, least_share: float = 0.02) -> st
         "A mask made from the depth, as by RANSAC, leaves out the pixels with large "
         "errors: widen its threshold."
     )
-
-
-LARGEST_GAP = 0.2
-"""Gap, metres, above which no cause is named. Every effect of the catalogue together makes less at
-the range of a depth camera; geometry that is wrong makes more."""
 
 
 def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:

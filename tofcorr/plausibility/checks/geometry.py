@@ -17,7 +17,20 @@ from tofcorr.geometry.rays import (
     wrapped,
 )
 from tofcorr.plausibility.alignment import walls_of
-from tofcorr.plausibility.finding import Finding, doubtful, impossible, in_words, note
+from tofcorr.plausibility.finding import (
+    CAMERA,
+    FAR_OFF,
+    HOPELESS,
+    LARGE_CONSTANT,
+    ODD_SLOPE,
+    SIGMAS,
+    SPOILS,
+    Finding,
+    doubtful,
+    impossible,
+    in_words,
+    note,
+)
 from tofcorr.plausibility.linear import Estimate, length_scale, places_on_wall
 from tofcorr.plausibility.look import Look
 from tofcorr.plausibility.mounting import remounting
@@ -25,58 +38,35 @@ from tofcorr.plausibility.mounting import remounting
 if TYPE_CHECKING:
     from tofcorr.plausibility.mistakes import Explanation
 
-FAR_OFF = 0.1
-"""Distance along the ray from its plane from which a pixel is garbage or wrapped, metres. Chosen:
-errors of a camera are centimetres."""
 
-# Misfit from which a mistake makes a fit meaningless, metres. Chosen: below, a fit is wrong by
-# about as much as it is to correct.
-_MEANINGLESS = 0.025
-# An estimate counts from so many of its standard errors on. Chosen: of 560 estimates in 62 clean
-# recordings none reached four.
-_SIGMAS = 5.0
-# Misfit of a frame from which no wall is seen at all, no alignment can be believed, or no
-# calibration used, metres. Chosen.
-_HOPELESS = 0.05
-# Error in proportion to the distance, after the prior of the alignment, from which on the usual
-# mistakes are tried and which heads a report. Chosen: of 319 cameras of other generators without
-# such a fault one in 30 had more (up to 5 %).
-_ODD_SLOPE = 0.03
-# Constant error of a camera's distances that is worth a note, metres. Chosen.
-_LARGE_CONSTANT = 0.2
-
-
-def lone_walls(look: Look, fewest: int = 3, most: float = 0.5) -> Iterator[Finding]:
+def lone_walls(look: Look) -> Iterator[Finding]:
     """Are walls at unknown places seen often enough to be one wall? Only where walls are fitted.
 
-    Args:
-        look: The recording.
-        fewest: Frames of a wall at an unknown place: one frame determines about the three unknowns
-            of the wall itself, as in training.
-        most: Share of the frames that may show walls of fewer: the others still fix the hand-eye.
+    One frame determines about the three unknowns of the wall itself. Half of the frames may show
+    walls of fewer than three, as in training: the others still fix the hand-eye.
     """
     if not look.fits or look.planes != "unknown":
         return
     wall = walls_of(look.scene)
-    few = np.bincount(wall)[wall] < fewest
-    if few.mean() <= most:
+    few = np.bincount(wall)[wall] < 3
+    if few.mean() <= 0.5:
         return
     remedy = "measure the planes, or record the poses of a robot"
     if look.data.moves:
         remedy = "give all frames of one wall the same nx, ny, nz, d and target in frames.csv"
     yield impossible(
-        f"{few.sum()} of {len(wall)} frames have a plane that fewer than {fewest} frames "
-        "share, and the planes are to be estimated: a fit could place each wall where its "
+        f"{few.sum()} of {len(wall)} frames have a plane that fewer than 3 frames share, "
+        "and the planes are to be estimated: a fit could place each wall where its "
         f"frame measured it, and would leave no error at all; {remedy}.",
         check="lone_walls",
     )
 
 
-def garbage(look: Look, some: float = 0.003) -> Iterator[Finding]:
-    """Do the pixels of a frame lie on one plane? A share `some` that does not is worth a note."""
+def garbage(look: Look) -> Iterator[Finding]:
+    """Do the pixels of a frame lie on one plane? 3 of 1000 that do not are worth a note."""
     if not look.scene.known.any():
         return
-    if look.flatness > _HOPELESS:
+    if look.flatness > HOPELESS:
         yield Finding(
             "impossible" if look.fits else "doubtful",
             f"The points of a frame lie {1e3 * look.flatness:.0f} mm off a plane of their own: the "
@@ -85,7 +75,7 @@ def garbage(look: Look, some: float = 0.003) -> Iterator[Finding]:
         )
         return
     share, bent, dominated = garbage_of(look)
-    if share < some and not bent:
+    if 1000 * share < 3 and not bent:
         return
     what = "edges, reflections or other surfaces"
     frequency, far = look.recording.modulation_frequency, _far_off(look)
@@ -104,35 +94,28 @@ def garbage(look: Look, some: float = 0.003) -> Iterator[Finding]:
     )
 
 
-def garbage_of(
-    look: Look, many: float = 0.01, pull: float = 0.007, of_squares: float = 4.0
-) -> tuple[float, bool, bool]:
+def garbage_of(look: Look) -> tuple[float, bool, bool]:
     """Return the share of pixels far off their frame's plane, and what they do to a fit.
 
-    Args:
-        look: The recording.
-        many: Share that bends a plane of least squares: 1 % of pixels 0.7 m off do so by 7 mm.
-        pull: Mean over all pixels of how far garbage is off that does as much, metres.
-        of_squares: Squares of garbage, in times those of all other pixels, from which it dominates
-            a fit: they double the standard errors of least squares.
-
     Returns:
-        The share, whether they bend a fit, and whether they make most of what a fit minimises.
+        The share; whether they bend a fit: 1 % of pixels 0.7 m off bend a plane of least squares by
+        7 mm; and whether they make most of what a fit minimises: squares of four times those of all
+        other pixels double the standard errors of least squares.
     """
     off = _far_off(look)
     if not len(off):
         return 0.0, False, False
     share = float((off > 0).mean())
     others = float(np.mean(look.scene.flatness[look.scene.known] ** 2))
-    dominated = float(np.mean(off**2)) > of_squares * others
-    return share, bool(share >= many or off.mean() >= pull), dominated
+    dominated = float(np.mean(off**2)) > 4 * others
+    return share, bool(100 * share >= 1 or 1000 * off.mean() >= 7), dominated
 
 
-def _far_off(look: Look, sigmas: float = 8.0) -> np.ndarray:
+def _far_off(look: Look) -> np.ndarray:
     """Return how far each usable pixel is off, shape (M,), metres; zero up to the limit."""
     known = look.scene.known
     off = np.abs(look.scene.off_by[known])
-    limit = np.maximum(FAR_OFF, sigmas * look.scene.flatness[known])[:, None]
+    limit = np.maximum(FAR_OFF, 8 * look.scene.flatness[known])[:, None]
     return np.where(off > limit, off, 0.0)[np.isfinite(off)]
 
 
@@ -142,13 +125,11 @@ def _range_in_words(frequency: float) -> str:
     return f"{multiples} of {1e-6 * frequency:.4g} MHz"
 
 
-def _wrapping(look: Look, many: float = 0.1) -> Iterator[Finding]:
+def _wrapping(look: Look) -> Iterator[Finding]:
     """Is the target beyond the unambiguous range, where it is measured one range nearer?
 
-    Args:
-        look: The recording.
-        many: Share of the pixels that must be whole ranges off the recorded planes to explain why
-            frames are: fewer do not put a third of the frames off, and they are garbage.
+    A tenth of the pixels must be whole ranges off the recorded planes to explain why frames are:
+    fewer do not put a third of the frames off, and they are garbage.
     """
     frequency, given, scene = look.recording.modulation_frequency, look.given, look.scene
     if frequency is None or look.planes != "known":
@@ -160,7 +141,7 @@ def _wrapping(look: Look, many: float = 0.1) -> Iterator[Finding]:
     errors = scene.distance - (1 + given.slope) * true - given.constant
     errors = errors[np.isfinite(errors)]
     share = float(wrapped(errors, frequency).mean()) if len(errors) else 0.0
-    if share < many or range_of_wrapped(errors[np.abs(errors) > FAR_OFF], frequency) is None:
+    if 10 * share < 1 or range_of_wrapped(errors[np.abs(errors) > FAR_OFF], frequency) is None:
         return
     yield Finding(
         "impossible" if look.fits else "doubtful",
@@ -172,15 +153,15 @@ def _wrapping(look: Look, many: float = 0.1) -> Iterator[Finding]:
     )
 
 
-def normals(look: Look, turned_deg: float = 135.0) -> Iterator[Finding]:
+def normals(look: Look) -> Iterator[Finding]:
     """Do the planes' normals point to the camera? Exactly turned round they are 180 degrees off."""
     found = look.as_given
-    if found is None or look.planes != "known" or found.misfit > _HOPELESS:
+    if found is None or look.planes != "known" or found.misfit > HOPELESS:
         return
     # A few noisy pixels tell their plane badly. A turned normal has the camera behind its plane.
     normal, offset = look.scene.planes_in_tool()
     behind = normal @ found.hand_eye[:3, 3] + offset < 0
-    away = np.flatnonzero((np.degrees(np.nan_to_num(found.angle)) > turned_deg) & behind)
+    away = np.flatnonzero((np.degrees(np.nan_to_num(found.angle)) > 135) & behind)
     if not len(away):
         return
     frames = tuple(look.frames[away].tolist())
@@ -192,25 +173,21 @@ def normals(look: Look, turned_deg: float = 135.0) -> Iterator[Finding]:
     )
 
 
-def shape(look: Look, far_off: float = 0.03, unsure: float = 0.1) -> Iterator[Finding]:
+def shape(look: Look) -> Iterator[Finding]:
     """Has the image the K and the distortion, and the depth the kind, that the header says?
 
-    Args:
-        look: The recording.
-        far_off: Distance of the frames to their planes above which poses or planes are wrong, and
-            shape cannot be told, metres.
-        unsure: Largest standard error at which the kind is looked at: 0 is the declared one, 1 the
-            other one.
+    Where poses or planes are wrong, that cannot be told.
     """
     if look.shape is None:
         return
-    if float(np.median(look.of_camera.frame_rms(look.shape["kind"].left))) > far_off:
+    if float(np.median(look.of_camera.frame_rms(look.shape["kind"].left))) > CAMERA:
         return
     declared = look.recording.depth_kind
     other = "z" if declared == "radial" else "radial"
     kind = look.shape["kind"]
     share = float(kind.value[0])
-    if kind.size_error < unsure and abs(share - 1) < 0.5:
+    # 0 is the declared one, 1 the other one, from which it is so many standard errors.
+    if 2 * SIGMAS * kind.size_error < 1 and abs(share - 1) < 0.5:
         yield impossible(
             f"recording.yaml says depth_kind: {declared}, but walls are bent as if the depth were "
             f"{other} ({100 * share:.0f} % of the difference, standard error "
@@ -253,21 +230,12 @@ better. Chosen: 3 % of the focal length bend a wall tilted by 30 degrees by a ce
 border; 2 degrees of the principal point; 0.5 % at the corner bends it by 3 mm per metre."""
 
 
-def _wrong_camera(
-    found: dict[str, Estimate], unsure: float = 0.03, other_camera: float = 0.25
-) -> Finding | None:
-    """Judge K and distortion, and say what is most surely wrong.
-
-    Args:
-        found: Estimates of the errors of the image's shape.
-        unsure: Largest standard error at which one is looked at.
-        other_camera: Error of the focal length that makes a fit meaningless.
-    """
+def _wrong_camera(found: dict[str, Estimate]) -> Finding | None:
+    """Judge K and distortion by estimates of their errors, and say what is most surely wrong."""
     surely = {
         name: one.size / one.size_error
         for name, (_, least, _) in _CAMERA.items()
-        if (one := found[name]).size > max(least, _SIGMAS * one.size_error)
-        and one.size_error < unsure
+        if (one := found[name]).size > max(least, SIGMAS * one.size_error)
     }
     if not surely:
         return None
@@ -277,7 +245,8 @@ def _wrong_camera(
     longer, out = ("longer", "out") if first > 0 else ("shorter", "in")
     better = words.format(size=abs(first), first=first, second=second, longer=longer, out=out)
     return Finding(
-        "impossible" if name == "focal" and one.size > other_camera else "doubtful",
+        # With a quarter more it is another camera's.
+        "impossible" if name == "focal" and 4 * one.size > 1 else "doubtful",
         f"Walls fit better if {better} (standard error {100 * one.size_error:.1f} %): are K and "
         "distortion of this camera, of this resolution and crop, and of images as they are here, "
         "rectified or not?",
@@ -286,13 +255,13 @@ def _wrong_camera(
     )
 
 
-def _curved(look: Look, found: Estimate, least: float = 0.01) -> Iterator[Finding]:
-    """Judge whether the target itself is bent, by as much as is calibrated (`least`, metres)."""
+def _curved(look: Look, found: Estimate) -> Iterator[Finding]:
+    """Judge whether the target itself is bent, by what spoils a fit."""
     used = look.of_camera.used
     half_width = float(np.quantile(np.hypot(*places_on_wall(look.of_camera))[used], 0.9))
     curvature = np.abs(found.value)
     sag = curvature * half_width**2
-    if ((sag > least) & (curvature > _SIGMAS * found.error)).any():
+    if ((sag > SPOILS) & (curvature > SIGMAS * found.error)).any():
         yield doubtful(
             f"The target is bent by {1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of "
             "its middle, from wherever it is seen: use a flat one, or mask what is not.",
@@ -306,7 +275,7 @@ def drift(look: Look) -> Iterator[Finding]:
     found = look.drift
     if found is not None:
         # Frames miss their planes by a quarter of it in the middle of each half.
-        meaningless = found.size > 4 * _MEANINGLESS
+        meaningless = found.size > 4 * CAMERA
         yield Finding(
             "impossible" if meaningless else "doubtful",
             f"From the first frame to the last the points move {1e3 * found.size:.0f} mm off the "
@@ -315,42 +284,33 @@ def drift(look: Look) -> Iterator[Finding]:
         )
 
 
-def agreement(
-    look: Look, suspicious: float = 0.005, of_flatness: float = 0.5, odd_constant: float = 0.15
-) -> Iterator[Finding]:
+def agreement(look: Look) -> Iterator[Finding]:
     """Do poses, planes and depth agree, and if not, which usual mistake explains it?
 
-    Args:
-        look: The recording.
-        suspicious: Distance of whole frames from their planes, metres, from which mistakes are
-            undone, and which is doubtful if none explains it: of 72 clean recordings the most had
-            2.5 mm. Where errors of the camera cannot be told, 12 and 30 mm.
-        of_flatness: The same in times the flatness of the walls, since noise of the pixels moves
-            planes as well: of 60 clean recordings none had more than both.
-        odd_constant: Constant error of the distance from which mistakes are undone, metres.
+    Mistakes are undone where whole frames are 5 mm off their planes, and half of the flatness of
+    the walls, since noise of the pixels moves planes as well: of 72 clean recordings the most had
+    2.5 mm. It is doubtful if none explains that; where errors of the camera cannot be taken off, if
+    they do not either.
     """
     given = look.as_given
     if given is None:
         return
-    excess = _excess(look)
-    fine = max(suspicious, of_flatness * look.flatness)
-    tried, doubtful = (fine, fine) if look.shape is not None else (0.012, 0.03)
-    odd = abs(given.constant) > odd_constant or abs(given.slope) > _ODD_SLOPE
-    if excess < tried and not odd:
-        yield from _scale(look)
-        return
-    from tofcorr.plausibility.mistakes import best_explanations  # Of use to few recordings.
+    excess, fine = _excess(look), max(CAMERA / 2, look.flatness) / 2
+    large = abs(given.constant) > LARGE_CONSTANT
+    named: list[Explanation] = []
+    if excess >= fine or large or abs(given.slope) > ODD_SLOPE:
+        from tofcorr.plausibility.mistakes import best_explanations  # Of use to few recordings.
 
-    named = best_explanations(look)
+        named = best_explanations(look)
     if named:
         yield _explained(look, named)
-    elif excess > doubtful:
+    elif excess > (CAMERA if look.shape is None else fine):
         # A camera that moved on the tool explains it, unless by far too much.
-        moved = [] if excess > _HOPELESS else list(remounting(look))
+        moved = [] if excess > HOPELESS else list(remounting(look))
         yield from moved or list(_wrapping(look)) or [_unexplained(look, excess)]
     else:
         yield from _scale(look)
-        if abs(given.constant) > _LARGE_CONSTANT:
+        if large:
             yield note(
                 f"The distances are {1e3 * given.constant:+.0f} mm off on the whole, much for a "
                 "camera: is this the depth of the target, and in metres?"
@@ -369,13 +329,11 @@ def _excess(look: Look) -> float:
     return math.sqrt(float(np.nanmean(off**2))) if np.isfinite(off).any() else 0.0
 
 
-def _explained(
-    look: Look, named: "list[Explanation]", of_planes: float = 0.06, turned_deg: float = 15.0
-) -> Finding:
+def _explained(look: Look, named: "list[Explanation]") -> Finding:
     """Return what says which mistake it is.
 
-    Where only the planes are wrong, a fit is meaningless from `of_planes` metres or `turned_deg`
-    on: planes a few degrees off are what `diagnose` finds as target_registration.
+    Where only the planes are wrong, a fit is meaningless if they are hopelessly off, or by 15
+    degrees: planes a few degrees off are what `diagnose` finds as target_registration.
     """
     from tofcorr.plausibility.mistakes import WRONG_PLANES
 
@@ -383,9 +341,9 @@ def _explained(
     # A mirrored image and a mirrored world look alike; say both.
     others = [more for more, other, _, freed in named if other != advice and not freed]
     also = f" (as likely: {others[0]})" if others and not frees else ""
-    fatal = cause != WRONG_PLANES
-    turned = not fatal and math.degrees(given.typical_angle) > turned_deg
-    meaningless = given.badness > (_MEANINGLESS if fatal else of_planes) or turned
+    meaningless = given.badness > CAMERA
+    if cause == WRONG_PLANES:
+        meaningless = given.badness > HOPELESS or math.degrees(given.typical_angle) > 15
     return Finding(
         "impossible" if meaningless else "doubtful",
         f"{_misfit(look)}, and by {_mm(found.misfit)} if one mistake is undone: {cause}"
@@ -394,27 +352,27 @@ def _explained(
     )
 
 
-def _unexplained(look: Look, excess: float, unusable: float = 0.008) -> Finding:
-    """Return what says that no mistake explains the misfit; `unusable` metres spoil a fit."""
+def _unexplained(look: Look, excess: float) -> Finding:
+    """Return what says that no mistake explains the misfit."""
     hints = "; if nobody measured the planes, use `planes: unknown`"
     hints = hints if look.planes == "known" else ""
     # Without the frequency, waves of the circular error cannot be told from wrong poses.
     if look.recording.modulation_frequency is None:
         hints += "; state `modulation_frequency_hz` if you know it"
-    far = int((look.rms > _HOPELESS).sum())
-    others = f", {far} of {len(look.rms)} frames more than {_mm(_HOPELESS)}" if far else ""
+    far = int((look.rms > HOPELESS).sum())
+    others = f", {far} of {len(look.rms)} frames more than {_mm(HOPELESS)}" if far else ""
     return Finding(
-        "impossible" if excess > _HOPELESS else "doubtful",
+        "impossible" if excess > HOPELESS else "doubtful",
         f"{_misfit(look)}{others}, and no usual mistake explains it: poses, planes or depth are of "
         f"something else, or the poses scatter{hints}.",
-        spoils=excess > unusable,
+        spoils=excess > SPOILS,
     )
 
 
 def _misfit(look: Look) -> str:
     given, angle = look.given, math.degrees(look.given.typical_angle)
     turned = f" and {angle:.0f} degrees" if angle >= 2 else ""
-    far = abs(given.constant) > _LARGE_CONSTANT
+    far = abs(given.constant) > LARGE_CONSTANT
     constant = f", with all distances {1e3 * given.constant:+.0f} mm off" if far else ""
     return (
         f"After the best alignment of the camera the points lie {_mm(given.misfit)}{turned} off "
@@ -426,20 +384,14 @@ def _mm(metres: float) -> str:
     return f"{1e3 * metres:.0f} mm" if metres < 10 else f"{metres:.0f} m"
 
 
-def _scale(
-    look: Look, other_unit: float = 0.15, least_length: float = 2e-3, unsure: float = 0.005
-) -> Iterator[Finding]:
+def _scale(look: Look) -> Iterator[Finding]:
     """Do robot and camera agree on lengths?
 
-    Args:
-        look: The recording.
-        other_unit: Error in proportion to the distance that is another unit.
-        least_length: Difference of the hand-eye's length that is worth a note, metres: below, other
-            errors are as large.
-        unsure: Standard error up to which a scale is looked at.
+    An error of 15 % is another unit. A difference of the hand-eye's length of 2 mm is worth a note:
+    below, other errors are as large. A scale with a standard error above 0.5 % is not looked at.
     """
     given = look.given
-    if abs(given.slope) > other_unit:
+    if 100 * abs(given.slope) > 15:
         yield impossible(
             f"All distances are {100 * given.slope:+.0f} % off against the poses: depth or "
             "poses are in another unit, or scaled.",
@@ -450,13 +402,13 @@ def _scale(
     share, error = 0.0, math.inf
     if look.linear is not None and look.scene.moves:
         share, error = length_scale(given, look.linear)
-    if error > unsure:
+    if 1000 * error > 5:
         share, error = given.slope, math.inf
     length = abs(share) * float(math.hypot(*given.hand_eye[:3, 3]))
-    heads = abs(given.slope) > _ODD_SLOPE
-    if not heads and not (length > least_length and abs(share) > _SIGMAS * error):
+    heads = abs(given.slope) > ODD_SLOPE
+    if not heads and not (1000 * length > 2 and abs(share) > SIGMAS * error):
         return
-    uncertain = f" (standard error {100 * error:.2g} %)" if error <= unsure else ""
+    uncertain = f" (standard error {100 * error:.2g} %)" if math.isfinite(error) else ""
     yield Finding(
         "ambiguous" if heads else "note",
         f"The camera's distances are {100 * abs(share):.1f} %{uncertain} "
@@ -479,22 +431,17 @@ def outlying_poses(look: Look) -> Iterator[Finding]:
         )
 
 
-def outlying_frames(
-    look: Look, times: float = 5.0, least: float = 0.02, most: float = 0.3, fewest: int = 6
-) -> dict[int, float]:
+def outlying_frames(look: Look) -> dict[int, float]:
     """Return the misfit of every frame that disagrees with all others, metres, the worst first.
 
-    Args:
-        look: The recording.
-        times: A frame disagrees if its misfit is so many times the median's,
-        least: and so many metres; twice that where errors of the camera cannot be taken off first.
-        most: Share of the frames up to which they are single ones: the alignment is robust to it.
-        fewest: Frames among which one can disagree: the alignment takes three.
+    A frame disagrees if its misfit is five times the median's, and what no error of a camera makes;
+    twice that where these cannot be taken off first. More than three in ten are no single ones: the
+    alignment is robust to so many. It takes three frames, so that one of six can disagree.
     """
-    if look.as_given is None or len(look.rms) < fewest:
+    if look.as_given is None or len(look.rms) < 6:
         return {}
-    rms, limit = look.rms, 2 * least if look.shape is None else least
-    off = np.flatnonzero(rms > max(times * float(np.median(rms)), limit))
-    if len(off) > most * len(rms):
+    rms, limit = look.rms, (2 if look.shape is None else 1) * CAMERA
+    off = np.flatnonzero(rms > max(5 * float(np.median(rms)), limit))
+    if 10 * len(off) > 3 * len(rms):
         return {}
     return {int(look.frames[k]): float(rms[k]) for k in off[np.argsort(-rms[off])]}
