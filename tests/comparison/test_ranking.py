@@ -5,10 +5,9 @@ import pytest
 from comparison.asked import options, rewritten
 from simulated_walls import simulated_wall
 
-from tofcorr.comparison.evaluate import evaluate_set
+from tofcorr.comparison.experiment import held_out_experiment
 from tofcorr.comparison.options import HAND_EYE_ONLY, SelectionOptions
 from tofcorr.comparison.select import rank_models
-from tofcorr.comparison.statistics import rank
 from tofcorr.pixels.dataset import Dataset
 
 
@@ -41,7 +40,7 @@ def test_robust_weights_win_where_training_pixels_carry_gross_outliers(
 ) -> None:
     asked = options(*ROBUST, **ON_THE_WALL)
     outliers, none = (
-        evaluate_set("wall", dataset, asked).values["half"]["mean_abs_mm"]
+        held_out_experiment("wall", dataset, asked).values["half"]["mean_abs_mm"]
         for dataset in (spoilt, clean)
     )
     assert outliers["EA robust"][0] < 0.7 * outliers["EA"][0]
@@ -66,16 +65,9 @@ def test_the_ranking_does_not_depend_on_the_order_of_the_models(spoilt: Dataset)
     for name, one in first.errors.items():
         assert one.mean == pytest.approx(second.errors[name].mean, rel=1e-6)
     either = [
-        evaluate_set("wall", spoilt, options(*models, **ON_THE_WALL)).values["half"]
+        held_out_experiment("wall", spoilt, options(*models, **ON_THE_WALL)).values["half"]
         for models in (both, both[::-1])
     ]
     for column in (HAND_EYE_ONLY, "EA", "EA robust"):
         values = [half["mean_abs_mm"][column] for half in either]
         np.testing.assert_allclose(values[0], values[1], rtol=1e-6)
-
-
-def test_models_of_equal_error_and_complexity_are_ranked_by_name() -> None:
-    errors = {name: np.array([1.0, 2.0, 3.0]) for name in ("b", "a", "c")}
-    for names in (["b", "a", "c"], ["c", "b", "a"]):
-        ranking = rank({name: errors[name] for name in names}, dict.fromkeys(names, 1), 3)
-        assert (ranking.best, ranking.winner) == ("a", "a")

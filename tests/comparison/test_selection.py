@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from simulated_walls import EA, simulated_wall
 
-from tofcorr.comparison.experiment import groupings
 from tofcorr.comparison.options import SelectionOptions
 from tofcorr.comparison.select import rank_models
 from tofcorr.comparison.statistics import rank
@@ -57,6 +56,13 @@ def test_a_difference_far_smaller_than_the_errors_spread_is_seen_because_it_is_p
     assert ranking.errors["m1"].standard_error > 0.3
 
 
+def test_models_of_equal_error_and_complexity_are_ranked_by_name() -> None:
+    for names in (["b", "a", "c"], ["c", "b", "a"]):
+        errors = {name: np.array([1.0, 2.0, 3.0]) for name in names}
+        ranking = rank(errors, dict.fromkeys(names, 1), 3)
+        assert (ranking.best, ranking.winner) == ("a", "a")
+
+
 def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None:
     wrong = sum(rank(drawn(seed, 0, 0), {"m0": 1, "m1": 2}, 6).ties == [] for seed in range(200))
     assert wrong <= 10
@@ -64,7 +70,7 @@ def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None
 
 @pytest.mark.parametrize("by", ["image", "distance", "target"])
 def test_each_frame_is_held_out_once_and_poses_stay_together(wall: Dataset, by: str) -> None:
-    held_out, skipped = groupings(wall, options(by=[by]))
+    held_out, skipped = options(by=[by]).splits(wall)
     (groups,) = held_out.values()
     assert not skipped
     assert sorted(np.concatenate(list(groups.values()))) == list(range(wall.num_frames))
@@ -74,7 +80,7 @@ def test_each_frame_is_held_out_once_and_poses_stay_together(wall: Dataset, by: 
 
 
 def test_bands_of_distance_do_not_overlap(wall: Dataset) -> None:
-    held_out, _ = groupings(wall, options(by=["distance"], distance_bands=4))
+    held_out, _ = options(by=["distance"], distance_bands=4).splits(wall)
     ends = [name.removesuffix(" m").split(" to ") for name in held_out["distance"]]
     flat = [float(end) for pair in ends for end in pair]
     assert flat == sorted(flat)
@@ -82,22 +88,21 @@ def test_bands_of_distance_do_not_overlap(wall: Dataset) -> None:
 
 
 def test_the_model_that_holds_the_truth_is_chosen(wall: Dataset) -> None:
-    fits: list[int] = []
-    selection = rank_models(wall, options(), lambda: fits.append(1))
+    selection = rank_models(wall, options())
     assert selection.decisive.winner == "EA"
     assert selection.decisive.ties == []
-    assert len(fits) == 2 * (6 + 3 + 2)
+    assert len(selection.experiment.models) == 6 + 3 + 2
     assert selection.verdict.startswith("EA is the choice")
     json.dumps(selection.to_mapping(), allow_nan=False)
 
 
 def test_a_recording_of_one_target_is_not_compared_by_target(tmp_path: Path) -> None:
     dataset = simulated_wall(tmp_path / "white", shots=(("white", 12),))
-    held_out, skipped = groupings(dataset, options())
+    held_out, skipped = options().splits(dataset)
     assert set(held_out) == {"image", "distance"}
     assert skipped["target"] == "the recording has one target only."
     with pytest.raises(CalibrationDataError, match="the recording has one target only"):
-        groupings(dataset, options(by=["target"]))
+        options(by=["target"]).splits(dataset)
 
 
 def test_two_models_of_one_name_are_refused() -> None:

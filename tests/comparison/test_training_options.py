@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 from comparison.asked import options, rewritten
-from synthetic_scene import EA, Scene, make_scene, write_scene
+from synthetic_scene import EA, Scene, write_scene
 
-from tofcorr.comparison.evaluate import evaluate_set
-from tofcorr.comparison.experiment import FittedModel, ModelFitter, held_out_errors
+from tofcorr.comparison.experiment import ModelFitter, held_out_experiment
 from tofcorr.comparison.options import HAND_EYE_ONLY, SelectionOptions
 from tofcorr.comparison.select import rank_models
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.metrics import FittedModel, held_out_errors
 from tofcorr.pixels.sample import usable_pixels
 
 TRAIN = np.arange(0, 24)
@@ -33,11 +33,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "unknown walls": {"planes": "unknown"},
     "unknown walls, robust": {"planes": "unknown", "weights": {"robust": "cauchy"}},
 }
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return make_scene(torch.Generator().manual_seed(3), EA, num_frames=32, noise=0.002)
 
 
 @pytest.fixture(scope="module")
@@ -135,13 +130,13 @@ def test_a_comparison_of_unknown_planes_judges_by_the_walls_found_in_training_im
         {"name": "known", "model": EA, "planes": "known"},
         {"name": "found", "model": EA, "planes": "unknown"},
     ]
-    right = evaluate_set("wall", Dataset((recording,)), options(models[0]))
+    right = held_out_experiment("wall", Dataset((recording,)), options(models[0]))
     expected = right.values["half"]["mean_abs_mm"]["known"][0]
-    by_walls = evaluate_set("wall", misplaced(recording), options(*models, planes="unknown"))
+    by_walls = held_out_experiment("wall", misplaced(recording), options(*models, planes="unknown"))
     by_walls_found = by_walls.values["half"]["mean_abs_mm"]["found"][0]
     assert by_walls_found == pytest.approx(expected, rel=0.1)
     # Hand-eye and constant can follow a shift common to all walls only in part.
-    by_record = evaluate_set("wall", misplaced(recording), options(*models))
+    by_record = held_out_experiment("wall", misplaced(recording), options(*models))
     assert by_record.values["half"]["mean_abs_mm"]["found"][0] > 2 * expected
 
 

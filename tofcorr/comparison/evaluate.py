@@ -1,10 +1,9 @@
 """`tofcorr.evaluate`: models side by side on held-out images."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, ScalarFormatter
 
-from tofcorr.comparison.experiment import METRICS, Experiment, held_out_experiment, protocols
+from tofcorr.comparison.experiment import METRICS, Experiment, held_out_experiment
 from tofcorr.comparison.options import (
     BEFORE,
     HAND_EYE_ONLY,
@@ -26,8 +25,6 @@ from tofcorr.files import staged_folder
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.plausibility.examine import vet
-from tofcorr.plausibility.finding import Inspection
-from tofcorr.progress import bar
 from tofcorr.training.figures import save_figure
 from tofcorr.training.monitor import event_writer
 from tofcorr.training.report import number_or_none
@@ -105,7 +102,7 @@ class EvaluationResult:
         splits, tests = list(one.splits[protocol].values()), []
         for metric in METRICS:
             for first, second in pairs(self.options.columns) if len(splits) > 1 else []:
-                found = self._estimate(one, protocol, metric, first, second)
+                found = one.estimate(protocol, metric, first, second)
                 tests.append(
                     {
                         "metric": metric,
@@ -121,7 +118,7 @@ class EvaluationResult:
             "test_frames": [test.tolist() for test in splits],
             "error_mm": {
                 metric: {
-                    column: self._estimate(one, protocol, metric, column).to_mapping()
+                    column: one.estimate(protocol, metric, column).to_mapping()
                     | {"splits": [number_or_none(value) for value in values.tolist()]}
                     for column, values in by_column.items()
                 }
@@ -129,14 +126,6 @@ class EvaluationResult:
             },
             "paired_tests": tests,
         }
-
-    def _estimate(
-        self, one: Experiment, protocol: str, metric: str, column: str, less: str | None = None
-    ) -> Estimate:
-        """Return the estimate of a set, allowing for what random splits have in common."""
-        share = self.options.repeats.test_fraction
-        overlap = share / (1 - share) if protocol == "repeats" else 0.0
-        return one.estimate(protocol, metric, column, less, overlap)
 
     def plot_comparison(self) -> Figure:
         """Draw the held-out mean absolute error of each model and set, with 95 % intervals."""
@@ -225,8 +214,7 @@ class EvaluationResult:
     def _repeats_table(self, metric: str, kind: str) -> Table:
         rows, repeats = [], self.options.repeats
         for one in self.sets:
-            columns = self.options.columns
-            found = [self._estimate(one, "repeats", metric, column) for column in columns]
+            found = [one.estimate("repeats", metric, column) for column in self.options.columns]
             rows.append([one.name, *(f"{e.mean:.2f} ± {e.standard_deviation:.2f}" for e in found)])
             ends = [f"{low:.2f}–{high:.2f}" for low, high in (e.interval for e in found)]
             rows.append(["  95 % interval", *ends])
@@ -242,7 +230,7 @@ class EvaluationResult:
         rows, dof = [], 0
         for one in self.sets:
             for first, second in main_pairs(self.options.columns):
-                found = self._estimate(one, protocol, metric, first, second)
+                found = one.estimate(protocol, metric, first, second)
                 dof = found.degrees_of_freedom
                 share = abs(found.mean) / one.estimate(protocol, metric, first).mean
                 better = f"{second if found.mean > 0 else first} better by {100 * share:.0f} %"
@@ -295,41 +283,14 @@ def evaluate(
         inspections = [vet(one, resolved_planes(options.planes, sets), force=force) for one in data]
         headlines = tuple(one.headline for one in inspections if one.headline)
         names = set_names([recording.path for recording in sets])
-        with bar(options.num_fits * len(sets), "evaluating", "fit") as advance:
-            evaluations = tuple(
-                evaluate_set(name, one, options, partial(advance, 1), inspection)
-                for name, one, inspection in zip(names, data, inspections, strict=True)
-            )
+        evaluations = tuple(
+            held_out_experiment(name, one, options, inspection)
+            for name, one, inspection in zip(names, data, inspections, strict=True)
+        )
         result = EvaluationResult(evaluations, options, headlines)
         if folder is not None:
             result.write(folder)
     return result
-
-
-def evaluate_set(
-    name: str,
-    dataset: Dataset,
-    options: EvaluationOptions,
-    progress: Callable[[], object] | None = None,
-    inspection: Inspection | None = None,
-) -> Experiment:
-    """Fit all models to the training frames of every split, and measure the frames held out.
-
-    Args:
-        name: The set's name.
-        dataset: Its recordings.
-        options: Models and protocols.
-        progress: Called after each fit.
-        inspection: What was odd about the recordings. Frames that disagree with all others are
-            left out, as a training leaves them out, and garbage is met as there; None: neither.
-
-    Raises:
-        CalibrationDataError: There are too few poses for the splits, or a model needs amplitudes
-            that a recording lacks.
-    """
-    options = options.for_recordings(dataset.recordings).against_garbage(inspection)
-    drawn, baselines = protocols(dataset, options), (BEFORE, HAND_EYE_ONLY)
-    return held_out_experiment(name, dataset, options, drawn, inspection, progress, baselines)
 
 
 def set_names(paths: Sequence[Path | str]) -> list[str]:

@@ -13,147 +13,34 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from tofcorr.comparison.options import (
     BEFORE,
     ComparedModel,
     ComparisonOptions,
-    EvaluationOptions,
-    SelectionOptions,
+    Splits,
     masks_of,
 )
 from tofcorr.comparison.statistics import Estimate, estimate
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.error_terms.model import ErrorModelOptions, Pixels
-from tofcorr.errors import CalibrationDataError
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.planes import estimate_walls
 from tofcorr.fit.fitting import fit, hand_eye_alone
 from tofcorr.fit.problem import FitOptions, Problem, build_model, refuse_missing_inputs
 from tofcorr.fit.walls import FoundWalls, recorded_walls, walls_alone, with_every_wall
-from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import (
     Dataset,
-    SplitOptions,
     covered_domain,
-    folds,
     hand_eye_is_free,
     recorded_hand_eye,
-    split_frames,
 )
-from tofcorr.pixels.metrics import FrameErrors
-from tofcorr.pixels.sample import MaskOptions, pixels_of_image, usable_pixels
+from tofcorr.pixels.metrics import FittedModel, FrameErrors, held_out_errors
+from tofcorr.pixels.sample import MaskOptions, usable_pixels
 from tofcorr.plausibility.finding import Inspection
+from tofcorr.progress import through
 from tofcorr.training.calibration import TrainingOptions, without_correction
 from tofcorr.training.judgement import frames_left_out, left_out_mapping, left_out_words
-
-KINDS = ("to_plane", "along_ray", "in_z")
-"""Kinds of error: the distance of the corrected points to the target's plane, which is what is
-fitted; corrected minus true distance along the viewing ray, larger at oblique rays; corrected minus
-true depth along the optical axis, at the same ray."""
-
-
-Splits = dict[str, dict[str, np.ndarray]]
-"""The frames held out (global numbers), by protocol or by what their groups are groups of, and then
-by name; all others are fitted. Images of one pose stay together."""
-
-
-def protocols(dataset: Dataset, options: EvaluationOptions) -> Splits:
-    """Return the splits of each protocol that was asked for; the half split always.
-
-    A random half split (Table 1 of Abdo and Borgeat 2010), k-fold cross-validation by image (their
-    Table 2) and repeated random splits.
-
-    Raises:
-        CalibrationDataError: There are too few poses.
-    """
-
-    def drawn(fraction: float, seed: int) -> np.ndarray:
-        return split_frames(dataset, SplitOptions(test_fraction=fraction, seed=seed))[1]
-
-    found: Splits = {"half": {"half": drawn(options.test_fraction, options.seed)}}
-    if options.folds:
-        found["folds"] = _by_image(dataset, options)
-    repeats = options.repeats
-    if repeats.number:
-        seeds = np.random.SeedSequence(options.seed).generate_state(repeats.number)
-        found["repeats"] = {
-            f"repeat {k}": drawn(repeats.test_fraction, int(seed))
-            for k, seed in enumerate(seeds, start=1)
-        }
-    return found
-
-
-def groupings(dataset: Dataset, options: SelectionOptions) -> tuple[Splits, dict[str, str]]:
-    """Return the groups of frames to hold out in turn, and why a grouping is not possible.
-
-    The groups are images, bands of distance, or targets.
-
-    Raises:
-        CalibrationDataError: None of them is possible.
-    """
-    found: Splits = {}
-    skipped: dict[str, str] = {}
-    poses = dataset.pose_groups()
-    for by in options.by:
-        try:
-            groups = _GROUPS[by](dataset, options)
-        except CalibrationDataError as error:
-            skipped[by] = str(error)
-            continue
-        left = {name: len(np.unique(np.delete(poses, test))) for name, test in groups.items()}
-        scarce = min(left, key=left.__getitem__)
-        if len(groups) < 2:
-            skipped[by] = f"the recording has one {by} only."
-        # Three tilted views are the least that determine a hand-eye transform from planes; the fit
-        # itself refuses what more unknowns need.
-        elif left[scarce] < 3:
-            skipped[by] = (
-                f"without {scarce} {left[scarce]} poses are left to fit, and 3 are needed."
-            )
-        else:
-            found[by] = groups
-    if not found:
-        raise CalibrationDataError(
-            f"{dataset.first.path}: no images can be held out to compare the models: "
-            + " ".join(skipped.values())
-        )
-    return found, skipped
-
-
-def _by_image(
-    dataset: Dataset, options: EvaluationOptions | SelectionOptions
-) -> dict[str, np.ndarray]:
-    tests = folds(dataset, options.folds, options.seed)
-    return {f"fold {k}": frames for k, frames in enumerate(tests, start=1)}
-
-
-def _by_distance(dataset: Dataset, options: SelectionOptions) -> dict[str, np.ndarray]:
-    # Each frame's median measured distance; no usable pixel: infinite.
-    distance = np.full(dataset.num_frames, np.inf)
-    for batch in dataset.batches():
-        for k, frame in enumerate(batch.indices.tolist()):
-            usable = batch.radial_distance[k][batch.valid[k]]
-            distance[frame] = float(usable.median()) if usable.numel() else np.inf
-    poses = dataset.pose_groups()
-    of_pose = np.array([np.median(distance[poses == pose]) for pose in range(poses.max() + 1)])
-    order = np.argsort(of_pose, kind="stable")
-    return {
-        f"{of_pose[band].min():.2f} to {of_pose[band].max():.2f} m": np.flatnonzero(
-            np.isin(poses, band)
-        )
-        for band in np.array_split(order, min(options.distance_bands, len(order)))
-    }
-
-
-def _by_target(dataset: Dataset, _: SelectionOptions) -> dict[str, np.ndarray]:
-    names = np.unique(dataset.targets)
-    return {str(name): np.flatnonzero(dataset.targets == name) for name in names}
-
-
-_GROUPS = {"image": _by_image, "distance": _by_distance, "target": _by_target}
 
 
 def without_frames(
@@ -166,21 +53,6 @@ def without_frames(
     """
     kept = {name: np.setdiff1d(test, frames) for name, test in splits.items()}
     return {name: test for name, test in kept.items() if len(test) or not len(splits[name])}
-
-
-@dataclass(frozen=True)
-class FittedModel:
-    """A model fitted to training frames, and what measures it.
-
-    Attributes:
-        model: Error model and hand-eye transform.
-        held_out: Global numbers of the frames that measure it.
-        planes: The data set whose planes it is judged against; None: that which measures it.
-    """
-
-    model: CalibrationModel
-    held_out: np.ndarray
-    planes: Dataset | None = None
 
 
 METRICS: dict[str, Callable[[dict[str, FrameErrors]], float]] = {
@@ -200,6 +72,7 @@ class Experiment:
         dataset: Its recordings.
         options: The models, as the recordings made them.
         splits: What was held out.
+        skipped: What could not be, and why.
         models: By split as in `splits`, and by column.
         errors: The same of their errors on the frames held out, by kind.
         fitter: What fitted them, and the pixels that measure them.
@@ -212,6 +85,7 @@ class Experiment:
     dataset: Dataset
     options: ComparisonOptions
     splits: Splits
+    skipped: dict[str, str]
     models: list[dict[str, FittedModel]]
     errors: dict[str, list[dict[str, dict[str, FrameErrors]]]]
     fitter: "ModelFitter"
@@ -246,7 +120,7 @@ class Experiment:
         }
 
     def estimate(
-        self, protocol: str, metric: str, column: str, less: str | None = None, overlap: float = 0.0
+        self, protocol: str, metric: str, column: str, less: str | None = None
     ) -> Estimate:
         """Return the mean over the splits of a protocol, with its interval, millimetres.
 
@@ -255,20 +129,17 @@ class Experiment:
             metric: What is averaged.
             column: The model.
             less: Another one, whose values are subtracted: a paired t-test.
-            overlap: Of the splits, see `statistics.estimate`.
         """
         values = self.values[protocol][metric]
-        return estimate(values[column] - (0.0 if less is None else values[less]), overlap)
+        difference = values[column] - (0.0 if less is None else values[less])
+        return estimate(difference, self.options.overlap(protocol))
 
 
 def held_out_experiment(
     name: str,
     dataset: Dataset,
     options: ComparisonOptions,
-    splits: Splits,
-    inspection: Inspection | None,
-    progress: Callable[[], object] | None = None,
-    baselines: Sequence[str] = (),
+    inspection: Inspection | None = None,
 ) -> Experiment:
     """Fit all models to the training frames of every split, and measure the frames held out.
 
@@ -278,26 +149,27 @@ def held_out_experiment(
     Args:
         name: The set's name.
         dataset: The recordings.
-        options: The models.
-        splits: What is held out.
+        options: The models, and what is held out.
         inspection: What was odd about the recordings. Frames that disagree with all others are
-            left out, as a training leaves them out; None: none are.
-        progress: Called after each fit.
-        baselines: Headings of columns without depth correction, before those of the models.
+            left out, as a training leaves them out, and garbage is met as there; None: neither.
 
     Raises:
-        CalibrationDataError: A model needs what a recording lacks, or no pixel is usable.
+        CalibrationDataError: A model needs what a recording lacks, no pixel is usable, or there are
+            too few poses for the splits.
     """
+    options = options.for_recordings(dataset.recordings).against_garbage(inspection)
+    # The masks alone say which pixels the splits look at.
+    splits, skipped = options.splits(usable_pixels(dataset, options, robust=False))
     frames, left_out = np.arange(dataset.num_frames), ()
     if inspection is not None:
         drawn = [np.setdiff1d(frames, test) for own in splits.values() for test in own.values()]
         left_out = frames_left_out(inspection, drawn)
         splits = {kind: without_frames(own, left_out) for kind, own in splits.items()}
-    fitter = ModelFitter(dataset, options, progress, left_out)
-    models = []
-    for test in (test for own in splits.values() for test in own.values()):
+    fitter = ModelFitter(dataset, options, left_out)
+    models, tests = [], [test for own in splits.values() for test in own.values()]
+    for test in through(tests, f"comparing {name}".strip()):
         train = np.setdiff1d(frames, [*left_out, *test])
-        bare = {column: fitter.bare(column, train, test) for column in baselines}
+        bare = {column: fitter.bare(column, train, test) for column in options.baselines}
         models.append(bare | {one.name: fitter.fit(one, train, test) for one in options.models})
     in_a_row = [one for columns in models for one in columns.values()]
     found = iter(held_out_errors(fitter.measured, in_a_row, options.device))
@@ -307,6 +179,7 @@ def held_out_experiment(
         dataset=dataset,
         options=options,
         splits=splits,
+        skipped=skipped,
         models=models,
         errors={kind: [next(by_split) for _ in own] for kind, own in splits.items()},
         fitter=fitter,
@@ -321,7 +194,6 @@ class ModelFitter:
     Args:
         dataset: The recordings.
         options: Models, masks, hand-eye, solver and device.
-        progress: Called after each fit of a model.
         left_out: Global numbers of frames that no fit uses and no error measures.
 
     Attributes:
@@ -338,10 +210,9 @@ class ModelFitter:
         self,
         dataset: Dataset,
         options: ComparisonOptions,
-        progress: Callable[[], object] | None = None,
         left_out: Collection[int] = (),
     ) -> None:
-        self._dataset, self._options, self._progress = dataset, options, progress
+        self._dataset, self._options = dataset, options
         used = np.setdiff1d(np.arange(dataset.num_frames), list(left_out))
         self._trainings = {model.name: options.training(model) for model in options.models}
         self.measured = usable_pixels(dataset, options, robust=False)
@@ -368,8 +239,6 @@ class ModelFitter:
             self.warnings.append(
                 f"{model.name}, fitted to {len(train)} frames: {found.solution.message}"
             )
-        if self._progress is not None:
-            self._progress()
         planes = self._judged_against(found.walls, model.name, held_out, found.model)
         return FittedModel(found.model, held_out, planes)
 
@@ -427,60 +296,3 @@ class ModelFitter:
                 "held-out images are judged against the recorded plane."
             )
         return found.put_into(self._dataset)
-
-
-def held_out_errors(
-    dataset: Dataset, fitted: Sequence[FittedModel], device: str = "cpu"
-) -> list[dict[str, FrameErrors]]:
-    """Measure every model on its held-out frames, all in one pass over the pixels.
-
-    Args:
-        dataset: The recordings, with the masks that choose the pixels to measure on.
-        fitted: The models. All that hold out a frame are measured on the same pixels of it.
-        device: Where to compute.
-
-    Returns:
-        The errors by kind, in the order of the models.
-    """
-    rays = dataset.ray_directions().reshape(-1, 3).to(device)
-    models = [one.model.to(device) for one in fitted]
-    planes = [_planes_in_tool(one.planes or dataset) for one in fitted]
-    frames = [set(one.held_out.tolist()) for one in fitted]
-    sums: list[dict[int, Tensor]] = [{} for _ in fitted]
-    for batch in dataset.batches(np.unique(np.concatenate([f.held_out for f in fitted])), device):
-        for k, frame in enumerate(batch.indices.tolist()):
-            used = batch.valid[k].reshape(-1).nonzero()[:, 0]
-            pixels = pixels_of_image(batch, k, used)
-            for model, own, plane, found in zip(models, frames, planes, sums, strict=True):
-                if frame in own:
-                    found[frame] = _error_sums(model, pixels, rays[used], plane[frame].to(device))
-    return [_by_kind(found) for found in sums]
-
-
-def _planes_in_tool(dataset: Dataset) -> Tensor:
-    """Return the planes n . x + d = 0 of a data set's frames in the tool frame, (N, 4)."""
-    names = "normal_world", "offset", "world_from_tool"
-    normal, offset = plane_in_frame(*(dataset.column(name) for name in names))
-    return torch.cat([normal, offset[:, None]], dim=1)
-
-
-@torch.no_grad()
-def _error_sums(model: CalibrationModel, pixels: Pixels, rays: Tensor, plane: Tensor) -> Tensor:
-    """Return |error| and error^2 of the three kinds, summed, and the number of pixels: (7,)."""
-    corrected = pixels.radial_distance - model.error.error_at(pixels)
-    plane_in_camera = plane.to(corrected) @ model.hand_eye()
-    cosine = rays @ plane_in_camera[:3]
-    to_plane = cosine * corrected + plane_in_camera[3]
-    along_ray = to_plane / cosine
-    kinds = torch.stack([to_plane, along_ray, along_ray * rays[:, 2]])
-    sums = torch.stack([kinds.abs().sum(1), kinds.square().sum(1)], dim=1)
-    return torch.cat([sums.flatten(), sums.new_tensor([len(rays)])]).cpu()
-
-
-def _by_kind(sums: dict[int, Tensor]) -> dict[str, FrameErrors]:
-    frames = np.array(list(sums), dtype=np.int64)
-    rows = torch.stack(list(sums.values()), dim=1).numpy() if sums else np.zeros((7, 0))
-    return {
-        kind: FrameErrors(frames, rows[2 * k], rows[2 * k + 1], rows[6])
-        for k, kind in enumerate(KINDS)
-    }

@@ -3,14 +3,23 @@
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import Field, NonNegativeInt, model_validator
 
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.errors import ConfigError
+from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.solvers import SolverOptions
 from tofcorr.options import Options, resolve_options
-from tofcorr.pixels.dataset import HandEyeOptions, PlaneChoice, resolved_planes
+from tofcorr.pixels.dataset import (
+    Dataset,
+    HandEyeOptions,
+    PlaneChoice,
+    SplitOptions,
+    folds,
+    resolved_planes,
+    split_frames,
+)
 from tofcorr.pixels.sample import MaskOptions
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.calibration import TrainingOptions
@@ -26,6 +35,10 @@ HAND_EYE_ONLY = "hand-eye only"
 """The hand-eye transform refitted, and no depth correction: what geometry alone explains."""
 
 Grouping = Literal["image", "distance", "target"]
+
+Splits = dict[str, dict[str, np.ndarray]]
+"""The frames held out (global numbers), by protocol or by what their groups are groups of, and then
+by name; all others are fitted. Images of one pose stay together."""
 
 
 class ComparedModel(TrainingOptions):
@@ -87,12 +100,26 @@ class ComparisonOptions(MaskOptions):
         device: Where the passes over the pixels run: `cpu`, `cuda`, `cuda:1`, ...
     """
 
+    baselines: ClassVar[tuple[str, ...]] = ()
+
     models: tuple[ComparedModel, ...] = Field(min_length=1)
     seed: NonNegativeInt = 0
     hand_eye: HandEyeOptions = HandEyeOptions()
     solver: SolverOptions = SolverOptions()
     planes: PlaneChoice = "auto"
     device: str = "cpu"
+
+    def splits(self, dataset: Dataset) -> tuple[Splits, dict[str, str]]:
+        """Return what is held out, and why something that was asked for cannot be.
+
+        Raises:
+            CalibrationDataError: There are too few poses.
+        """
+        raise NotImplementedError
+
+    def overlap(self, protocol: str) -> float:
+        """Return how much the splits of a protocol have in common, see `statistics.estimate`."""
+        return 0.0
 
     def training(self, model: ComparedModel) -> TrainingOptions:
         """Return the options that a model is fitted with: its own, completed by the common ones."""
@@ -152,6 +179,7 @@ class EvaluationOptions(ComparisonOptions):
     """
 
     config_folder: ClassVar[str] = "evaluate"
+    baselines: ClassVar[tuple[str, ...]] = (BEFORE, HAND_EYE_ONLY)
 
     test_fraction: float = Field(default=0.5, gt=0.0, lt=1.0)
     folds: NonNegativeInt = 6
@@ -168,12 +196,34 @@ class EvaluationOptions(ComparisonOptions):
     @property
     def columns(self) -> list[str]:
         """The headings of the tables' columns."""
-        return [BEFORE, HAND_EYE_ONLY, *(model.name for model in self.models)]
+        return [*self.baselines, *(model.name for model in self.models)]
 
-    @property
-    def num_fits(self) -> int:
-        """How many models are fitted to evaluate one set of images."""
-        return (1 + self.folds + self.repeats.number) * len(self.models)
+    def splits(self, dataset: Dataset) -> tuple[Splits, dict[str, str]]:
+        """Return the splits of each protocol that was asked for; the half split always.
+
+        A random half split (Table 1 of Abdo and Borgeat 2010), k-fold cross-validation by image
+        (their Table 2) and repeated random splits.
+        """
+
+        def drawn(fraction: float, seed: int) -> np.ndarray:
+            return split_frames(dataset, SplitOptions(test_fraction=fraction, seed=seed))[1]
+
+        found: Splits = {"half": {"half": drawn(self.test_fraction, self.seed)}}
+        if self.folds:
+            found["folds"] = _by_image(dataset, self.folds, self.seed)
+        repeats = self.repeats
+        if repeats.number:
+            seeds = np.random.SeedSequence(self.seed).generate_state(repeats.number)
+            found["repeats"] = {
+                f"repeat {k}": drawn(repeats.test_fraction, int(seed))
+                for k, seed in enumerate(seeds, start=1)
+            }
+        return found, {}
+
+    def overlap(self, protocol: str) -> float:
+        """Return what random splits have in common."""
+        share = self.repeats.test_fraction
+        return share / (1 - share) if protocol == "repeats" else 0.0
 
 
 class SelectionOptions(ComparisonOptions):
@@ -201,6 +251,70 @@ class SelectionOptions(ComparisonOptions):
             if twice := _repeated(values):
                 raise ValueError(f"every {what} may stand once, '{twice[0]}' stands twice")
         return self
+
+    def splits(self, dataset: Dataset) -> tuple[Splits, dict[str, str]]:
+        """Return the groups of frames to hold out in turn: images, bands of distance, or targets.
+
+        Raises:
+            CalibrationDataError: None of them is possible.
+        """
+        found: Splits = {}
+        skipped: dict[str, str] = {}
+        poses = dataset.pose_groups()
+        for by in self.by:
+            try:
+                groups = self._groups(dataset, by)
+            except CalibrationDataError as error:
+                skipped[by] = str(error)
+                continue
+            left = {name: len(np.unique(np.delete(poses, test))) for name, test in groups.items()}
+            scarce = min(left, key=left.__getitem__)
+            if len(groups) < 2:
+                skipped[by] = f"the recording has one {by} only."
+            # Three tilted views are the least that determine a hand-eye transform from planes; the
+            # fit itself refuses what more unknowns need.
+            elif left[scarce] < 3:
+                skipped[by] = (
+                    f"without {scarce} {left[scarce]} poses are left to fit, and 3 are needed."
+                )
+            else:
+                found[by] = groups
+        if not found:
+            raise CalibrationDataError(
+                f"{dataset.first.path}: no images can be held out to compare the models: "
+                + " ".join(skipped.values())
+            )
+        return found, skipped
+
+    def _groups(self, dataset: Dataset, by: Grouping) -> dict[str, np.ndarray]:
+        if by == "image":
+            return _by_image(dataset, self.folds, self.seed)
+        if by == "distance":
+            return _by_distance(dataset, self.distance_bands)
+        names = np.unique(dataset.targets)
+        return {str(name): np.flatnonzero(dataset.targets == name) for name in names}
+
+
+def _by_image(dataset: Dataset, number: int, seed: int) -> dict[str, np.ndarray]:
+    return {f"fold {k}": test for k, test in enumerate(folds(dataset, number, seed), start=1)}
+
+
+def _by_distance(dataset: Dataset, bands: int) -> dict[str, np.ndarray]:
+    # Each frame's median measured distance; no usable pixel: infinite.
+    distance = np.full(dataset.num_frames, np.inf)
+    for batch in dataset.batches():
+        for k, frame in enumerate(batch.indices.tolist()):
+            usable = batch.radial_distance[k][batch.valid[k]]
+            distance[frame] = float(usable.median()) if usable.numel() else np.inf
+    poses = dataset.pose_groups()
+    of_pose = np.array([np.median(distance[poses == pose]) for pose in range(poses.max() + 1)])
+    order = np.argsort(of_pose, kind="stable")
+    return {
+        f"{of_pose[band].min():.2f} to {of_pose[band].max():.2f} m": np.flatnonzero(
+            np.isin(poses, band)
+        )
+        for band in np.array_split(order, min(bands, len(order)))
+    }
 
 
 def _repeated(names: list[Any]) -> list[str]:

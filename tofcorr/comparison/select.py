@@ -1,17 +1,16 @@
 """`tofcorr.select`: the model that predicts best on held-out images, distances and targets."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from tofcorr.comparison.experiment import Experiment, groupings, held_out_experiment
+from tofcorr.comparison.experiment import Experiment, held_out_experiment
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
 from tofcorr.comparison.statistics import Ranking, Table, rank
 from tofcorr.error_terms.base import Domain
@@ -21,10 +20,8 @@ from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.pixels.metrics import FrameErrors
-from tofcorr.pixels.sample import usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
-from tofcorr.progress import bar
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import number_or_none
 
@@ -44,14 +41,12 @@ class SelectionResult:
 
     Attributes:
         rankings: The models ranked, by what was held out.
-        skipped: Why a grouping was not possible, by grouping.
         experiment: The models fitted, and the groups held out in turn.
         options: Models and groupings.
         headline: What makes the recordings doubtful, one sentence; None: nothing.
     """
 
     rankings: dict[str, Ranking]
-    skipped: dict[str, str]
     experiment: Experiment
     options: SelectionOptions
     headline: str | None = None
@@ -134,7 +129,7 @@ class SelectionResult:
             self.verdict,
             *tables,
             *comparability_notes(self.options),
-            *(f"Not held out by {by}: {why}" for by, why in self.skipped.items()),
+            *(f"Not held out by {by}: {why}" for by, why in self.experiment.skipped.items()),
             *(f"Warning: {warning}" for warning in self.experiment.warnings),
             "Errors are distances to the plane, each pose held out once, mean over the poses ± one "
             "standard error. Behind the best: paired difference, pose by pose, with its 95 % "
@@ -176,7 +171,7 @@ class SelectionResult:
             },
             "measured_on": masks_of(options).to_mapping() | {"planes": options.planes},
             "notes": comparability_notes(options),
-            "skipped": dict(self.skipped),
+            "skipped": found.skipped,
             "left_out": found.left_out,
             "warnings": found.warnings,
             "headline": self.headline,
@@ -229,11 +224,8 @@ def select(
         dataset = Dataset(opened(recordings))
         planes = resolved_planes(options.planes, dataset.recordings)
         inspection = vet(dataset, planes, force=force)
-        total = len(options.models) * sum(map(len, groupings(dataset, options)[0].values()))
-        with bar(total, "comparing", "fit") as advance:
-            found = rank_models(dataset, options, partial(advance, 1), inspection)
-        # What the page says of the models is what was asked for.
-        result = replace(found, options=options, headline=inspection.headline)
+        found = rank_models(dataset, options, inspection)
+        result = replace(found, headline=inspection.headline)
         if folder is not None:
             (folder / "selection.md").write_text(result.markdown(), encoding="utf-8")
             numbers = json.dumps(result.to_mapping(), indent=1, allow_nan=False)
@@ -242,30 +234,23 @@ def select(
 
 
 def rank_models(
-    dataset: Dataset,
-    options: SelectionOptions,
-    progress: Callable[[], object] | None = None,
-    inspection: Inspection | None = None,
+    dataset: Dataset, options: SelectionOptions, inspection: Inspection | None = None
 ) -> SelectionResult:
     """Fit every model without each group of frames, and rank by the errors on the group.
 
     Args:
         dataset: The recordings.
         options: Models and groupings.
-        progress: Called after each fit.
         inspection: What was odd about the recordings. Frames that disagree with all others are
             left out, as a training leaves them out, and garbage is met as there; None: neither.
 
     Raises:
         CalibrationDataError: No grouping is possible, or a model needs what a recording lacks.
     """
-    options = options.for_recordings(dataset.recordings).against_garbage(inspection)
-    # The masks alone say which pixels the groups look at.
-    splits, skipped = groupings(usable_pixels(dataset, options, robust=False), options)
-    found = held_out_experiment("", dataset, options, splits, inspection, progress)
+    found = held_out_experiment("", dataset, options, inspection)
     complexity = {
-        model.name: _complexity(options.training(model), found.fitter.domain, dataset)
-        for model in options.models
+        model.name: _complexity(found.options.training(model), found.fitter.domain, dataset)
+        for model in found.options.models
     }
     rankings = {}
     for by, groups in found.errors.items():
@@ -274,7 +259,8 @@ def rank_models(
             for name in complexity
         }
         rankings[by] = rank(errors, complexity, len(groups))
-    return SelectionResult(rankings, skipped, found, options)
+    # What the page says of the models is what was asked for.
+    return SelectionResult(rankings, found, options)
 
 
 def _by_pose(dataset: Dataset, groups: list[FrameErrors], options: SelectionOptions) -> np.ndarray:

@@ -1,16 +1,25 @@
-"""Errors of corrected points: their distance to the target's plane, frame by frame."""
+"""Errors of corrected points: their distances to the target's plane, frame by frame."""
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
+from tofcorr.error_terms.model import Pixels
+from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import everyones, own_share
-from tofcorr.pixels.sample import distance_to_plane
+from tofcorr.pixels.sample import pixels_of_image
+
+KINDS = ("to_plane", "along_ray", "in_z")
+"""Kinds of error: the distance of the corrected points to the target's plane, which is what is
+fitted; corrected minus true distance along the viewing ray, larger at oblique rays; corrected minus
+true depth along the optical axis, at the same ray."""
 
 
 @dataclass(frozen=True)
@@ -43,37 +52,93 @@ class FrameErrors:
         return float(sums[inside].sum() / count) if count else math.nan
 
 
+@dataclass(frozen=True)
+class FittedModel:
+    """A model fitted to training frames, and what measures it.
+
+    Attributes:
+        model: Error model and hand-eye transform.
+        held_out: Global numbers of the frames that measure it.
+        planes: The data set whose planes it is judged against; None: that which measures it.
+    """
+
+    model: CalibrationModel
+    held_out: np.ndarray
+    planes: Dataset | None = None
+
+
 def frame_errors(
     dataset: Dataset,
     models: Mapping[str, CalibrationModel],
     frames: Sequence[int] | np.ndarray | None = None,
     device: str = "cpu",
 ) -> dict[str, FrameErrors]:
-    """Measure models on frames, all in one pass over the pixels.
+    """Return the distances to the plane that models leave on the same frames; None: on all."""
+    wanted = np.arange(dataset.num_frames) if frames is None else np.asarray(frames)
+    fitted = [FittedModel(model, wanted) for model in models.values()]
+    found = held_out_errors(dataset, fitted, device)
+    return {name: one["to_plane"] for name, one in zip(models, found, strict=True)}
+
+
+def held_out_errors(
+    dataset: Dataset, fitted: Sequence[FittedModel], device: str = "cpu"
+) -> list[dict[str, FrameErrors]]:
+    """Measure every model on its held-out frames, all in one pass over the pixels.
+
+    Processes started by `torchrun` share the pass.
 
     Args:
-        dataset: The recordings.
-        models: What to measure, by name.
-        frames: Global numbers; all frames if None.
+        dataset: The recordings, with the masks that choose the pixels to measure on.
+        fitted: The models. All that hold out a frame are measured on the same pixels of it.
         device: Where to compute.
 
     Returns:
-        The sums of each model, frames in the order of the data set.
+        The errors by kind, in the order of the models.
     """
-    wanted = np.arange(dataset.num_frames) if frames is None else np.sort(np.asarray(frames))
-    rays = dataset.ray_directions().to(device)
-    numbers = [np.zeros(0, dtype=np.int64)]
-    sums = {name: [np.zeros((3, 0))] for name in models}
+    rays = dataset.ray_directions().reshape(-1, 3).to(device)
+    # The caller's models stay where they are.
+    models = [deepcopy(one.model).to(device) for one in fitted]
+    planes = [_planes_in_tool(one.planes or dataset) for one in fitted]
+    frames = [set(one.held_out.tolist()) for one in fitted]
+    sums: list[dict[int, Tensor]] = [{} for _ in fitted]
+    wanted = np.unique(np.concatenate([one.held_out for one in fitted]))
     for batch in dataset.batches(own_share(wanted), device):
-        numbers.append(batch.indices.cpu().numpy())
-        for name, model in models.items():
-            used = torch.where(batch.valid, distance_to_plane(model, batch, rays), 0.0)
-            per_frame = [used.abs().sum((1, 2)), used.square().sum((1, 2)), batch.valid.sum((1, 2))]
-            sums[name].append(torch.stack([part.double() for part in per_frame]).cpu().numpy())
-    shares = everyones((numbers, sums))
-    frame = np.concatenate([part for own, _ in shares for part in own])
-    order, found = np.argsort(frame), {}
-    for name in models:
-        total = np.concatenate([part for _, own in shares for part in own[name]], axis=1)
-        found[name] = FrameErrors(frame[order], *total[:, order])
-    return found
+        for k, frame in enumerate(batch.indices.tolist()):
+            used = batch.valid[k].reshape(-1).nonzero()[:, 0]
+            pixels = pixels_of_image(batch, k, used)
+            for model, own, plane, found in zip(models, frames, planes, sums, strict=True):
+                if frame in own:
+                    found[frame] = _error_sums(model, pixels, rays[used], plane[frame].to(device))
+    shares = everyones(sums)
+    return [
+        _by_kind({k: v for own in one for k, v in own.items()}) for one in zip(*shares, strict=True)
+    ]
+
+
+def _planes_in_tool(dataset: Dataset) -> Tensor:
+    """Return the planes n . x + d = 0 of a data set's frames in the tool frame, (N, 4)."""
+    names = "normal_world", "offset", "world_from_tool"
+    normal, offset = plane_in_frame(*(dataset.column(name) for name in names))
+    return torch.cat([normal, offset[:, None]], dim=1)
+
+
+@torch.no_grad()
+def _error_sums(model: CalibrationModel, pixels: Pixels, rays: Tensor, plane: Tensor) -> Tensor:
+    """Return |error| and error^2 of the three kinds, summed, and the number of pixels: (7,)."""
+    corrected = pixels.radial_distance - model.error.error_at(pixels)
+    plane_in_camera = plane.to(corrected) @ model.hand_eye()
+    cosine = rays @ plane_in_camera[:3]
+    to_plane = cosine * corrected + plane_in_camera[3]
+    along_ray = to_plane / cosine
+    kinds = torch.stack([to_plane, along_ray, along_ray * rays[:, 2]])
+    sums = torch.stack([kinds.abs().sum(1), kinds.square().sum(1)], dim=1)
+    return torch.cat([sums.flatten(), sums.new_tensor([len(rays)])]).cpu()
+
+
+def _by_kind(sums: dict[int, Tensor]) -> dict[str, FrameErrors]:
+    frames = np.array(sorted(sums), dtype=np.int64)
+    rows = torch.stack([sums[k] for k in sorted(sums)], dim=1).numpy() if sums else np.zeros((7, 0))
+    return {
+        kind: FrameErrors(frames, rows[2 * k], rows[2 * k + 1], rows[6])
+        for k, kind in enumerate(KINDS)
+    }
