@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
 from tofcorr.drift.offset import FEWEST_PIXELS, Offset, OffsetSums, Wall
@@ -23,14 +22,9 @@ from tofcorr.fit.reference import (
 )
 from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.plausibility.examine import vet
+from tofcorr.plausibility.finding import CAMERA, LARGEST_GAP
 from tofcorr.progress import through
 
-# Smallest drift, metres, that no camera can have: a certain one is refused if it is most likely
-# beyond. The same as the gap above which `tofcorr diagnose` names no cause: with every effect of a
-# camera there is less.
-_IMPOSSIBLE = 0.2
-# Smallest that is odd if it is certain at all, metres. Chosen: warming up makes up to 20 mm.
-_ODD = 0.03
 # Why the equations of a check may have no solution, and what to do.
 _NO_SOLUTION = (
     "poses, planes or depth are far off, or the frames hardly differ; see `tofcorr inspect`, or "
@@ -84,10 +78,11 @@ def check(
     with solvable(dataset.first.path, "check", _NO_SOLUTION):
         result = check_drift(state, dataset, wall, threshold_mm / 1e3, reference)
     low, high = result.interval
-    if abs(result.offset) > _IMPOSSIBLE and not low <= 0 <= high and not force:
+    # A certain drift is refused if it is most likely beyond what any camera has.
+    if abs(result.offset) > LARGEST_GAP and not low <= 0 <= high and not force:
         raise CalibrationDataError(
             f"{dataset.first.path}: the distances would be {1e3 * result.offset:+.0f} mm off, and "
-            f"no camera drifts by more than {1e3 * _IMPOSSIBLE:.0f} mm: check unit and kind of the "
+            f"no camera drifts by more than {1e3 * LARGEST_GAP:.0f} mm: check unit and kind of the "
             "depth, the mask and the wall (`tofcorr inspect` shows more; --force, in Python "
             "force=True, measures all the same)."
         )
@@ -124,7 +119,8 @@ def check_drift(
     """
     _refuse_unfit(state, dataset, wall)
     known = reference or unknown_reference(state, wall_is_known=wall == "recorded")
-    known = known if dataset.has_amplitude else replace(known, noise=None)
+    if not dataset.has_amplitude:
+        known = known.model_copy(update={"noise": None})
     sums = OffsetSums(state, dataset, wall, known)
     if not list(through(sums.read(), "checking", total=dataset.num_frames)):
         raise CalibrationDataError(
@@ -147,7 +143,7 @@ def check_drift(
         images=found.images,
         outside=1 - sums.calibrated / max(sums.on_wall, 1),
         form_is_known=reference is not None,
-        unlike=0.0 if known.views is None else share_unlike(torch.stack(sums.views), known.views),
+        unlike=0.0 if known.views is None else share_unlike(sums.sums.views, known.views),
         headline=_headline(found),
     )
 
@@ -160,7 +156,8 @@ def _headline(found: Offset) -> str | None:
             "much as those of the calibration: two cameras, walls that are not flat or elsewhere "
             "than recorded, or wrong poses."
         )
-    if abs(found.value) <= max(_ODD, found.half_width):
+    # Warming up makes as much as other errors of a camera.
+    if abs(found.value) <= max(CAMERA, found.half_width):
         return None
     return (
         f"Doubtful frames: they are {1e3 * abs(found.value):.0f} mm too "

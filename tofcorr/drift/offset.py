@@ -26,15 +26,8 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.linear import Curvature, GroupSums, inverse, reduced
 from tofcorr.estimation.robust import f_tail, student_quantile
-from tofcorr.fit.linear_image import (
-    BOWS,
-    LinearPixels,
-    block_squares,
-    design_effect,
-    linearised,
-    wall_moves,
-)
-from tofcorr.fit.reference import Reference, own_noise, pixel_weights, repeated, view_of
+from tofcorr.fit.linear_image import BOWS, linearised, wall_moves
+from tofcorr.fit.reference import ImageSums, Reference, own_noise, repeated
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import image_planes, off_the_wall, some_pixels
@@ -93,7 +86,7 @@ class OffsetSums:
         reference: What the calibration knows, and how its images departed from it.
 
     Attributes:
-        views: Of the images read so far, as `fit.reference.view_of` gives them.
+        sums: Of the images read so far: the offset, the shared wall, its bow, the calibration.
         on_wall: Pixels on the wall that their image shows.
         calibrated: Those of them within the calibrated ranges, which alone are used.
     """
@@ -105,17 +98,14 @@ class OffsetSums:
         within = reference.covariance_within if wall == "per_image" else None
         # Standardises what the calibration left unknown.
         self._factor = Curvature(reference.covariance if within is None else within).root
-        self.views: list[Tensor] = []
+        self.sums = ImageSums(reference.noise)
         self.on_wall = self.calibrated = 0
         self._images: list[ImageDrift] = []
-        self._products: list[Tensor] = []
-        self._count: list[int] = []
-        self._squares = torch.zeros(())
 
     def read(self) -> Iterator[int]:
         """Correct the images and add those with enough usable pixels; yield their numbers."""
         rays, error = self._dataset.ray_directions(), self._state.model().error
-        off_wall, domain = off_the_wall(rays), self._state.domain
+        off_wall, domain, known = off_the_wall(rays), self._state.domain, self._reference
         twist = self._state.hand_eye_estimated
         # Without a robot the recorded planes are in the camera's own coordinates.
         fixed = torch.eye(4, dtype=torch.float64)
@@ -141,33 +131,14 @@ class OffsetSums:
                 image = linearised(error, pixels, ray, plane, shown, twist=twist, domain=domain)
                 pose = poses[frame] @ hand_eye
                 one = [wall_moves(image.points, plane[0], pose)] if self._wall == "one" else []
-                self._add(image, one)
+                bow = math.sqrt(known.bow_variance) * image.shapes[:, :BOWS]
+                left = image.residual - image.unknowns @ known.mean
+                self.sums.add(frame, image, [*one, bow, image.unknowns @ self._factor], left)
                 distance = corrected.radial_distance[k].flatten()[used]
                 points = rays.flatten(0, 1)[used] * distance[:, None]
                 flatness = _departure_from_plane(points, shown, used, rays.shape[1])
                 self._images.append(ImageDrift(frame, math.nan, flatness, len(used)))
                 yield frame
-
-    def _add(self, image: LinearPixels, one_wall: list[Tensor]) -> None:
-        """Add an image: offset, shared wall, its bow, calibration, own wall, residual."""
-        known = self._reference
-        columns = torch.cat(
-            [
-                image.gain[:, None],
-                *one_wall,
-                math.sqrt(known.bow_variance) * image.shapes[:, :BOWS],
-                image.unknowns @ self._factor,
-                image.moves,
-                image.shapes,
-                (image.residual - image.unknowns @ known.mean)[:, None],
-            ],
-            dim=1,
-        )
-        weight = pixel_weights(known.noise, image)
-        self._squares = self._squares + block_squares(image, weight)
-        self._products.append(columns.T @ (weight[:, None] * columns))
-        self._count.append(len(columns))
-        self.views.append(view_of(image))
 
     def estimate(self) -> Offset:
         """Return the offset of all images with its standard error.
@@ -176,14 +147,9 @@ class OffsetSums:
         variances are scaled by the spread seen in both together, or in these alone where the two
         surely differ.
         """
-        reference, count = self._reference, len(self._count)
-        sums = GroupSums(
-            torch.stack(self._products),
-            torch.tensor(self._count).double(),
-            len(reference.random_variance),
-        )
+        reference, count, sums = self._reference, len(self.sums), self.sums.groups
         # Pixels that are alike count as fewer, which is as if each were as much noisier.
-        noise = own_noise(sums) * design_effect(self._squares)
+        noise = own_noise(sums) * self.sums.design_effect
         precision = 1 / reference.random_variance
         if self._wall == "per_image":
             precision[:3] = 0.0

@@ -9,19 +9,19 @@ no calibrated view is near, nothing has shown them.
 
 import json
 import math
-from collections import defaultdict
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from collections import Counter
+from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.correction.state import CalibrationState
+from tofcorr.correction.state import CalibrationState, Float64
 from tofcorr.error_terms.base import Domain
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import (
@@ -51,6 +51,7 @@ from tofcorr.fit.linear_image import (
     wall_moves,
 )
 from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.options import Count, NonNegativeNumber, Number, Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import off_the_wall, some_pixels
 from tofcorr.pixels.sample import pixels_of_image
@@ -60,8 +61,29 @@ from tofcorr.pixels.sample import pixels_of_image
 _FORM, _POSE, _BOW = 1e-3, 3e-4, 5e-5
 
 
-@dataclass(frozen=True)
-class Reference:
+def _tensor(values: object) -> object:
+    return torch.tensor(values, dtype=torch.float64) if isinstance(values, list) else values
+
+
+def _positive(values: Tensor) -> Tensor:
+    if not bool((values > 0).all()):
+        raise ValueError("expected positive numbers")
+    return values
+
+
+def _covariance(values: Tensor) -> Tensor:
+    square = values.dim() == 2 and values.shape[0] == values.shape[1]
+    if not square or not torch.allclose(values, values.T) or bool((values.diagonal() < 0).any()):
+        raise ValueError("expected a covariance")
+    return values
+
+
+Numbers = Annotated[Float64, BeforeValidator(_tensor), PlainSerializer(Tensor.tolist)]
+Positive = Annotated[Number, Field(gt=0)]
+Covariance = Annotated[Numbers, AfterValidator(_covariance)]
+
+
+class Reference(Options):
     """How far the camera may be from what its calibration says.
 
     Attributes:
@@ -77,23 +99,24 @@ class Reference:
         poses: From how many poses of the robot this is known.
         noise: a, b, c of the variance of a measured distance; None: the same for all pixels.
         scatter: Mean square of the images' departures from each other, whatever their walls, over
-            what noise and smooth errors let expect; see `scatter`.
+            what noise and smooth errors let expect; see `scatter`. Older files lack it and what
+            follows.
         covariance_within: The covariance where only the insides of images are looked at. What all
             images have alike, such as a fixed pattern, is then in both recordings, and what is left
             is as small as they depart from each other. None: as `covariance`.
         views: From where each pose saw its wall, shape (K, 7); see `view_of`. None: not known.
     """
 
-    mean: Tensor
-    covariance: Tensor
-    random_variance: Tensor
-    bow_variance: float
-    persistence: float
-    poses: int
-    noise: tuple[float, float, float] | None
-    scatter: float = 1.0
-    covariance_within: Tensor | None = None
-    views: Tensor | None = None
+    mean: Numbers
+    covariance: Covariance
+    random_variance: Annotated[Numbers, AfterValidator(_positive)]
+    bow_variance: Positive
+    persistence: Annotated[Number, Field(ge=0, lt=1)]
+    poses: Count
+    noise: tuple[NonNegativeNumber, NonNegativeNumber, NonNegativeNumber] | None
+    scatter: Positive = 1.0
+    covariance_within: Covariance | None = None
+    views: Numbers | None = None
 
     @property
     def independent_poses(self) -> float:
@@ -143,28 +166,66 @@ def unknown_reference(state: CalibrationState, *, wall_is_known: bool) -> Refere
     )
 
 
-def pixel_weights(noise: tuple[float, float, float] | None, image: LinearPixels) -> Tensor:
-    """Return one over the variance of each pixel's noise, shape (M,), 1 / m^2.
+class ImageSums:
+    """Sums of products over the pixels of images, which are added group by group.
 
     Args:
-        noise: a, b, c of the variance; None: the same for all pixels, which is only a scale, since
-            the noise of each image is measured.
-        image: One image, with amplitudes where there is a noise.
+        noise: a, b, c of the variance of a measured distance; None: the same for all pixels, which
+            is only a scale, since the noise of each image is measured.
     """
-    if noise is None:
-        return torch.full_like(image.residual, _FORM**-2)
-    variance = DistanceNoise(*noise, source="neighbours").variance(image.pixels.amplitude)
-    return 1 / variance.clamp(min=LEAST_RESIDUAL**2)
 
+    def __init__(self, noise: tuple[float, float, float] | None) -> None:
+        self._noise = None if noise is None else DistanceNoise(*noise, source="neighbours")
+        self._products: dict[int, Tensor] = {}
+        self._count: Counter[int] = Counter()
+        self._views: dict[int, Tensor] = {}
+        self._squares = torch.zeros(())
 
-def view_of(image: LinearPixels) -> Tensor:
-    """Return what describes the view of an image, shape (7,).
+    def add(
+        self, group: int, image: LinearPixels, shared: Sequence[Tensor], residual: Tensor
+    ) -> None:
+        """Add an image to a group.
 
-    It is the wall's normal, the direction to its middle, and the logarithm of its distance.
-    """
-    middle = image.points.mean(dim=0)
-    distance = middle.norm()
-    return torch.cat([image.normal[0], middle / distance, distance.log()[None]])
+        Args:
+            group: Which one, such as a pose.
+            image: Its pixels, with amplitudes where there is a noise.
+            shared: Columns of what all images share, after the offset, each (M, K).
+            residual: Of the pixels, shape (M,), metres.
+        """
+        weight = torch.full_like(residual, _FORM**-2)
+        if self._noise is not None:
+            weight = 1 / self._noise.variance(image.pixels.amplitude).clamp(min=LEAST_RESIDUAL**2)
+        own = [image.moves, image.shapes, residual[:, None]]
+        columns = torch.cat([image.gain[:, None], *shared, *own], dim=1)
+        products = columns.T @ (weight[:, None] * columns)
+        self._products[group] = self._products.get(group, 0.0) + products
+        self._count[group] += len(residual)
+        self._squares = self._squares + block_squares(image, weight)
+        # The wall's normal, the direction to its middle, and the logarithm of its distance.
+        middle = image.points.mean(dim=0)
+        distance = middle.norm()
+        view = torch.cat([image.normal[0], middle / distance, distance.log()[None]])
+        self._views.setdefault(group, view)
+
+    def __len__(self) -> int:
+        """Return how many groups there are."""
+        return len(self._count)
+
+    @property
+    def groups(self) -> GroupSums:
+        """The sums of each group."""
+        count = torch.tensor(list(self._count.values())).double()
+        return GroupSums(torch.stack(list(self._products.values())), count, 3 + SHAPES)
+
+    @property
+    def views(self) -> Tensor:
+        """From where the first image of each group saw its wall, shape (G, 7)."""
+        return torch.stack(list(self._views.values()))
+
+    @property
+    def design_effect(self) -> float:
+        """Of pixels that are alike fewer count, by so much."""
+        return design_effect(self._squares)
 
 
 def share_unlike(views: Tensor, calibrated: Tensor) -> float:
@@ -257,10 +318,7 @@ def estimate_reference(
     groups, names = dataset.pose_groups(), dataset.targets
     frames = frames[:: max(-(-len(frames) // most_frames), 1)]
     walls = [] if walls_are_known else sorted(set(names[frames].tolist()))
-    products: dict[int, Tensor] = defaultdict(lambda: torch.zeros(()))
-    count: dict[int, int] = defaultdict(int)
-    views: dict[int, Tensor] = {}
-    squares = torch.zeros(())
+    sums = ImageSums(noise)
     for batch in dataset.batches(frames):
         inside = batch.valid & domain.holds(batch.radial_distance, batch.amplitude)
         for k, frame in enumerate(batch.indices.tolist()):
@@ -270,30 +328,20 @@ def estimate_reference(
             plane = plane_in_frame(batch.normal_tool[k], batch.offset_tool[k], hand_eye)
             pixels, ray = pixels_of_image(batch, k, used), rays.flatten(0, 1)[used]
             image = linearised(model.error, pixels, ray, plane, twist=twist, domain=domain)
-            weight = pixel_weights(noise, image)
-            squares = squares + block_squares(image, weight)
             wall = wall_moves(image.points, plane[0], poses[frame] @ hand_eye)
             shared = [wall * (name == names[frame]) for name in walls]
             shared = [image.unknowns, image.shapes[:, :BOWS], *shared]
-            own = [image.moves, image.shapes, image.residual[:, None]]
-            columns = torch.cat([image.gain[:, None], *shared, *own], dim=1)
-            group = int(groups[frame])
-            products[group] = products[group] + columns.T @ (weight[:, None] * columns)
-            count[group] += len(weight)
-            views.setdefault(group, view_of(image))
-    if len(products) < 3:
+            sums.add(int(groups[frame]), image, shared, image.residual)
+    if len(sums) < 3:
         return None
-    effect = design_effect(squares)
-    sums = GroupSums(
-        torch.stack(list(products.values())) / effect,
-        torch.tensor(list(count.values())).double() / effect,
-        len(_RANDOM),
-    )
+    products, count, random = sums.groups
+    effect = sums.design_effect
+    of_poses = GroupSums(products / effect, count / effect, random)
     try:
-        found = _solved(sums, form_classes(domain), noise, 3 * len(walls))
+        found = _solved(of_poses, form_classes(domain), noise, 3 * len(walls))
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
         return None
-    return replace(found, views=torch.stack(list(views.values())))
+    return found.model_copy(update={"views": sums.views})
 
 
 def _solved(
@@ -385,30 +433,12 @@ REFERENCE_FILE = "reference.json"
 """Its name in a run folder."""
 
 _FORMAT = {"format": "tofcorr-reference", "version": 2}
-_POSITIVE: tuple[str, Callable[[Tensor], Tensor]] = ("positive numbers", lambda one: one > 0)
-_COVARIANCE: tuple[str, Callable[[Tensor], Tensor]] = (
-    "a covariance",
-    lambda one: torch.isclose(one, one.T) & (one.diagonal() >= 0),
-)
-# What is expected of the entries of a file besides their shape.
-_EXPECTED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
-    "covariance": _COVARIANCE,
-    "random_variance": _POSITIVE,
-    "bow_variance": _POSITIVE,
-    "persistence": ("a number from 0 to below 1", lambda one: (one >= 0) & (one < 1)),
-    "poses": ("a positive whole number", lambda one: (one > 0) & (one == one.round())),
-    "noise": ("no negative number", lambda one: one >= 0),
-    "scatter": _POSITIVE,
-    "covariance_within": _COVARIANCE,
-}
 
 
 def save_reference(path: Path, reference: Reference, state: CalibrationState) -> None:
     """Write a reference as JSON, with the coefficients that it belongs to."""
-    entries = {"coefficients": state.coefficients}
-    entries |= {one.name: getattr(reference, one.name) for one in fields(reference)}
-    plain = {k: one.tolist() if isinstance(one, Tensor) else one for k, one in entries.items()}
-    values = _FORMAT | plain
+    belongs = {"coefficients": state.coefficients.tolist()}
+    values = _FORMAT | belongs | reference.to_mapping()
     values |= {"sha256": _digest(values)}
     path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -425,55 +455,32 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
     """
     if not path.is_file():
         return None
+    values: dict[str, Any] = {}
     try:
-        return _reference(json.loads(path.read_text(encoding="utf-8")), state)
-    except (OSError, ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
+        values |= json.loads(path.read_text(encoding="utf-8"))
+        digest = values.pop("sha256")
+        wrong = {
+            "it was changed after it was written": digest != _digest(values),
+            "it is of another version": any(values.pop(k) != v for k, v in _FORMAT.items()),
+            "it is of another calibration": values.pop("coefficients")
+            != state.coefficients.tolist(),
+        }
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        wrong = {f"it cannot be read ({error})": True}
+    for reason in (reason for reason, holds in wrong.items() if holds):
         raise CalibrationDataError(
-            f"{path}: is damaged, or not of this run ({error}); train again, or remove the file "
-            "to check without it."
-        ) from None
-
-
-def _reference(values: dict[str, Any], state: CalibrationState) -> Reference:
-    for key, expected in _FORMAT.items():
-        if values[key] != expected:
-            raise ValueError(f"its {key} is {values[key]}, this package reads {expected}")
-    if values["sha256"] != _digest({k: one for k, one in values.items() if k != "sha256"}):
-        raise ValueError("it was changed after it was written")
-    size, views = num_unknowns(state), values.get("views")
-    shapes = {
-        "coefficients": (len(state.coefficients),),
-        "mean": (size,),
-        "covariance": (size, size),
-        "random_variance": (3 + SHAPES,),
-        "bow_variance": (),
-        "persistence": (),
-        "poses": (),
-        "noise": (3,),
-        "scatter": (),
-        "covariance_within": (size, size),
-        "views": (0 if views is None else len(views), 7),
-    }
-    # Files of older versions have no scatter, nor what came with it.
-    values = {"scatter": 1.0, "covariance_within": None, "views": None} | values
-    unknown = {k for k in ("noise", "covariance_within", "views") if values[k] is None}
-    found = {k: _entry(values, k, one) for k, one in shapes.items() if k not in unknown}
-    if not torch.equal(found.pop("coefficients"), state.coefficients.cpu()):
-        raise ValueError("its coefficients are those of another calibration")
-    entries: dict[str, Any] = dict.fromkeys(unknown) | found
-    entries |= {k: one.item() for k, one in found.items() if not one.ndim}
-    noise = None if "noise" in unknown else tuple(found["noise"].tolist())
-    return Reference(**entries | {"noise": noise, "poses": int(entries["poses"])})
-
-
-def _entry(values: dict[str, Any], key: str, shape: tuple[int, ...]) -> Tensor:
-    found = torch.tensor(values[key], dtype=torch.float64)
-    if found.shape != shape:
-        raise ValueError(f"{key}: has shape {tuple(found.shape)}, expected {shape}")
-    if not bool(found.isfinite().all()):
-        raise ValueError(f"{key}: holds a value that is not finite")
-    if key in _EXPECTED and not bool(_EXPECTED[key][1](found).all()):
-        raise ValueError(f"{key}: expected {_EXPECTED[key][0]}")
+            f"{path}: {reason}; train again, or remove the file to check without it."
+        )
+    found = Reference.from_mapping(values, str(path), CalibrationDataError)
+    size = num_unknowns(state)
+    widths = {"mean": size, "covariance": size, "covariance_within": size}
+    for name, width in (widths | {"random_variance": 3 + SHAPES, "views": 7}).items():
+        numbers = getattr(found, name)
+        if numbers is not None and numbers.shape[-1] != width:
+            raise CalibrationDataError(
+                f"{path}: '{name}' has shape {tuple(numbers.shape)}, expected {width} numbers in "
+                "a row; train again, or remove the file to check without it."
+            )
     return found
 
 
