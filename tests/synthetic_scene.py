@@ -9,7 +9,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
@@ -40,20 +39,16 @@ E0 = {
         {"kind": "pixel_polynomial", "degree": 1},
     ]
 }
-EA = {
-    "terms": [
-        {"kind": "distance_polynomial", "degree": 3},
-        {"kind": "pixel_polynomial", "degree": 2},
-        {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
-    ]
-}
-EB = {
-    "terms": [
-        {"kind": "distance_polynomial", "degree": 3},
-        {"kind": "pixel_polynomial", "degree": 2},
-        {"kind": "amplitude_polynomial", "variable": "normalised_amplitude", "degree": 2},
-    ]
-}
+EA, EB = (
+    {
+        "terms": [
+            {"kind": "distance_polynomial", "degree": 3},
+            {"kind": "pixel_polynomial", "degree": 2},
+            {"kind": "amplitude_polynomial", "variable": variable, "degree": 2},
+        ]
+    }
+    for variable in ("amplitude", "normalised_amplitude")
+)
 
 
 def error_model(terms: dict) -> ErrorModel:
@@ -80,25 +75,17 @@ class Scene:
         return MomentAccumulator(self.design(terms))(self.batch, weights)
 
     def residual(self, parameters: Parameters) -> Tensor:
-        """Return the residuals of all pixels by the reference, shape (B, H, W)."""
-        return calibration_model(self.model, parameters).residual(
-            self.batch.radial_distance,
-            self.batch.amplitude,
-            self.rays,
-            self.batch.normal_tool,
-            self.batch.offset_tool,
-        )
+        """Return the residuals of all pixels, shape (B, H, W)."""
+        return self.residual_of_step(parameters, torch.zeros(parameters.size).double())
 
     def residual_of_step(self, origin: Parameters, step: Tensor) -> Tensor:
         """Return the residuals after a step, differentiable in it, shape (B, H, W)."""
-        moved = origin.moved(step)
-        batch = self.batch
-        columns = {"constant": moved.coefficients[0]}
-        start = 1
-        for name, parameter in self.model.named_parameters():
-            if name != "constant":
-                columns[name] = moved.coefficients[start : start + parameter.numel()]
-                start += parameter.numel()
+        moved, batch = origin.moved(step), self.batch
+        names, values = zip(*self.model.named_parameters(), strict=True)
+        parts = moved.coefficients.split([one.numel() for one in values])
+        columns = {
+            n: part.reshape(one.shape) for n, part, one in zip(names, parts, values, strict=True)
+        }
         error = torch.func.functional_call(
             self.model, columns, (batch.radial_distance, batch.amplitude)
         )
@@ -106,13 +93,6 @@ class Scene:
         points_tool = points @ moved.tool_from_camera[:3, :3].T + moved.tool_from_camera[:3, 3]
         along = torch.einsum("bhwk,bk->bhw", points_tool, batch.normal_tool)
         return along + batch.offset_tool[:, None, None]
-
-
-def calibration_model(model: ErrorModel, parameters: Parameters) -> CalibrationModel:
-    model.set_coefficient_vector(parameters.coefficients)
-    hand_eye = HandEye()
-    hand_eye.rebase(parameters.tool_from_camera)
-    return CalibrationModel(model, hand_eye)
 
 
 def make_scene(

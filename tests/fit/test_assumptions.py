@@ -31,7 +31,7 @@ def right(data: Dataset) -> Fit:
 def found(data: Dataset, right: Fit) -> dict[str, Shift]:
     seen = misfit_pixels(data, right, np.arange(data.num_frames))
     assert seen is not None
-    return {one.cause: one for one in assumptions(seen, right, data.first.camera)}
+    return {one.cause: one for one in assumptions(seen, right)}
 
 
 def _with_k(recording: Recording, focal: float, right: float, down: float) -> Recording:
@@ -80,7 +80,7 @@ def test_turned_planes_move_the_camera_as_far(
     across = tangents(torch.from_numpy(table.normal_world)).numpy()
     before = right.solution.parameters.tool_from_camera
     pose = (torch.from_numpy(table.world_from_tool) @ before)[seen.frame]
-    world = torch.einsum("mij,mj->mi", pose[:, :3, :3], seen.points) + pose[:, :3, 3]
+    world = torch.einsum("mij,mj->mi", pose[:, :3, :3], seen.linear.points) + pose[:, :3, 3]
     places = np.einsum("ma,mka->mk", world.numpy(), across[seen.frame.numpy()])
     shifts = []
     for axis in (0, 1):
@@ -98,5 +98,5 @@ def test_planes_that_are_estimated_are_not_assumed(data: Dataset, right: Fit) ->
     seen = misfit_pixels(data, right, np.arange(8))
     assert seen is not None
     seen = replace(seen, walls_estimated=True)
-    names = {one.cause for one in assumptions(seen, right, data.first.camera)}
+    names = {one.cause for one in assumptions(seen, right)}
     assert names == {"focal_length", "principal_point_right", "principal_point_down"}

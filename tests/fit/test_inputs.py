@@ -17,27 +17,21 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.calibration import TrainingOptions
 
 
-def test_a_model_named_by_the_refusal_of_another_takes_the_recording(tmp_path: Path) -> None:
-    # The default model's refusal of a recording without amplitudes said no more than that.
+@pytest.mark.parametrize("command", [None, EvaluationOptions, SelectionOptions])
+def test_the_model_named_by_the_refusal_of_another_takes_the_recording(
+    command: type[EvaluationOptions | SelectionOptions] | None, tmp_path: Path
+) -> None:
+    """The refusal said no more than that, or `select` advised a configuration of `train`."""
     folder = write_small_recording(tmp_path / "bare", amplitude=None, modulation_frequency=None)
     data = Dataset((Recording.open(folder),))
     for refused in ("ea", "periodic"):
-        with pytest.raises(CalibrationDataError, match="--config e0"):
+        with pytest.raises(CalibrationDataError, match="--config e0") as error:
             refuse_missing_inputs(data, resolve_options(TrainingOptions, refused).model)
-    refuse_missing_inputs(data, resolve_options(TrainingOptions, "e0").model)
-
-
-@pytest.mark.parametrize("command", [EvaluationOptions, SelectionOptions])
-def test_the_models_named_for_a_comparison_take_the_recording(
-    command: type[EvaluationOptions | SelectionOptions], tmp_path: Path
-) -> None:
-    """`select` refused it with the advice to take another configuration of `train`."""
-    data = Dataset((Recording.open(write_small_recording(tmp_path / "bare", amplitude=None)),))
-    with pytest.raises(CalibrationDataError) as refused:
-        refuse_missing_inputs(data, resolve_options(TrainingOptions, "ea").model)
-    (change,) = re.findall(r"--set '(.*?)'", str(refused.value))
-    (model,) = resolve_options(command, "paper", [change]).models
-    refuse_missing_inputs(data, model.model)
+    (change,) = re.findall(r"--set '(.*?)'", str(error.value))
+    named = resolve_options(TrainingOptions, "e0")
+    if command is not None:
+        (named,) = resolve_options(command, "paper", [change]).models
+    refuse_missing_inputs(data, named.model)
 
 
 def test_amplitudes_that_are_all_the_same_are_no_amplitudes(tmp_path: Path) -> None:

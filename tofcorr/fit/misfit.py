@@ -21,16 +21,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.data.recording import Recording
 from tofcorr.error_terms.model import Pixels
 from tofcorr.estimation.linear import AddedColumns, Curvature, NormalEquations, pose_products
 from tofcorr.estimation.robust import student_quantile
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.linear_image import LinearPixels, linearised
 from tofcorr.fit.problem import Fit, Shift
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import moved_rays, phase_from_radial_distance, plane_in_frame, tangents
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.sample import cosine_of_incidence, draw_pixels, thinned
+from tofcorr.pixels.sample import draw_pixels, thinned
 
 # Least shift of the hand-eye transform that is reported, metres or radians: no error of a usual
 # camera moves it by less. Chosen.
@@ -38,43 +38,59 @@ _LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class MisfitPixels(LinearPixels):
-    """M pixels of F frames beside a model; its unknowns are followed by those of estimated walls.
+class MisfitPixels:
+    """M pixels of F frames beside a model.
 
     Attributes:
+        linear: Their linear form; its unknowns are followed by those of estimated walls. Amplitudes
+            that were not recorded are NaN.
         frame: Place of each pixel's frame among those looked at, shape (M,).
         pose: The pose of each frame, shape (F,), counted from zero.
         weight: Of each pixel in the fit, shape (M,).
         on_wall: Where the rays meet the planes, along two directions of the wall, from its middle,
             shape (M, 2), metres.
-        amplitude: Shape (M,); NaN where none was recorded.
-        before: What the same pixel measured in the frame before, shape (M,), metres; NaN: nothing.
-        amplitude_before: Its amplitude there, shape (M,); NaN: unknown.
-        depth_kind: Of the recording: an error of a ray leaves the depth as it was stored.
-        modulation_frequency: Hz; None if unknown.
+        before: What the same pixel measured in the frame before, metres, and its amplitude there,
+            shape (2, M); NaN: nothing.
+        recording: Whose camera it is.
         walls_estimated: Whether the walls were estimated with the rest.
     """
 
+    linear: LinearPixels
     frame: Tensor
     pose: Tensor
     weight: Tensor
     on_wall: Tensor
-    amplitude: Tensor
     before: Tensor
-    amplitude_before: Tensor
-    depth_kind: str
-    modulation_frequency: float | None
+    recording: Recording
     walls_estimated: bool
 
     def moved_rays(self, x: Tensor, y: Tensor) -> Tensor:
         """Return what it does to the residuals that the rays (x, y, 1) move by so much, (M,)."""
-        return moved_rays(self.ray, self.normal, self.distance, (x, y), self.depth_kind)
+        at, kind = self.linear, self.recording.depth_kind
+        return moved_rays(at.ray, at.normal, at.distance, (x, y), kind)
+
+    def error(self, *values: Tensor) -> Tensor:
+        """Return what errors of the distance (M,) do to the residual, shape (M, K)."""
+        return self.linear.gain[:, None] * torch.stack(values, dim=1)
+
+    @property
+    def on_image(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Where the rays cross the plane z = 1, and the square of their distance from the axis."""
+        x, y = (self.linear.ray[:, axis] / self.linear.ray[:, 2] for axis in (0, 1))
+        return x, y, x * x + y * y
+
+    @property
+    def brightness(self) -> Tensor | None:
+        """The logarithm of the amplitude, standardised; None where it is not known."""
+        amplitude = self.linear.pixels.amplitude
+        if not bool(amplitude.isfinite().all()):
+            return None
+        # The logarithm of no amplitude is infinite: it is cut at a thousandth of the median.
+        return _standard(amplitude.clamp(min=float(amplitude.median()) / 1000).log())
 
 
-def misfit_pixels(
-    data: Dataset, fit: Fit, frames: np.ndarray, most_frames: int = 200
-) -> MisfitPixels | None:
-    """Read some pixels of some frames, the same ones at each call.
+def misfit_pixels(data: Dataset, fit: Fit, frames: np.ndarray) -> MisfitPixels | None:
+    """Read some pixels of 200 of the frames, evenly spread, the same ones at each call.
 
     Measured: with 200 pixels of each of 40 frames a focal length 1.5 % off is found with p = 1e-3
     to 1e-10, with 400 with 1e-6 to 1e-16; these take 0.07 s, twice as many 0.11 s.
@@ -83,20 +99,18 @@ def misfit_pixels(
         data: The recordings, with the walls of the fit.
         fit: The fitted model.
         frames: Global numbers of the frames, increasing.
-        most_frames: Of more, so many evenly spread ones are read.
 
     Returns:
         The pixels; None if no ray meets its wall, which a fit that went astray has turned away.
     """
-    chosen, rays = thinned(frames, most_frames), data.ray_directions()
+    chosen = thinned(frames, 200)
+    hand_eye = fit.solution.parameters.tool_from_camera
+    sample = draw_pixels(data, chosen, min(16_000, 400 * len(chosen)), seed=0)
     # At more than 80 degrees, what is computed from the geometry grows without bounds.
-    steepest = -math.cos(math.radians(80))
-    facing = data.without(lambda one: cosine_of_incidence(fit.model, one, rays) > steepest)
-    number = min(16_000, 400 * len(chosen))
-    sample = draw_pixels(facing, chosen, number, seed=0)
+    sample = sample.of(sample.cosine(hand_eye) < -math.cos(math.radians(80)))
     if not len(sample.frame):
         return None
-    hand_eye, of = fit.solution.parameters.tool_from_camera, chosen[sample.frame.numpy()]
+    of = chosen[sample.frame.numpy()]
     to_tool = hand_eye.expand(len(of), 4, 4)
     plane = plane_in_frame(sample.normal_tool, sample.offset_tool, to_tool)
     seen = linearised(fit.model.error, sample.pixels, sample.ray, plane, twist=True)
@@ -110,26 +124,20 @@ def misfit_pixels(
         walls = torch.zeros(len(wall), int(wall.max()) + 1, 3).to(on_wall)
         walls[torch.arange(len(wall)), wall] = torch.nn.functional.pad(on_wall, (0, 1), value=1.0)
         unknowns = torch.cat([unknowns, walls.flatten(1)], dim=1)
-    unknown = torch.full_like(seen.residual, torch.nan)
-    depth_before, amplitude_before = _before(data, of, sample.pixels)
-    along_z = data.first.depth_kind == "z"
+    pixels, equal = seen.pixels, torch.ones_like(seen.residual)
+    if not data.has_amplitude:
+        pixels = pixels._replace(amplitude=torch.nan * equal)
+    before = _before(data, of, sample.pixels)
+    if data.first.depth_kind == "z":
+        before[0] /= sample.ray[:, 2]
     return MisfitPixels(
-        pixels=seen.pixels,
-        ray=seen.ray,
-        normal=seen.normal,
-        distance=seen.distance,
-        residual=seen.residual,
-        gain=seen.gain,
-        unknowns=unknowns,
+        linear=replace(seen, pixels=pixels, unknowns=unknowns),
         frame=sample.frame,
         pose=torch.from_numpy(np.unique(data.pose_groups()[chosen], return_inverse=True)[1]),
-        weight=torch.ones_like(unknown) if fit.weights is None else fit.weights.of_sample(sample),
+        weight=equal if fit.weights is None else fit.weights.of_sample(sample),
         on_wall=on_wall - on_wall.median(dim=0).values,
-        amplitude=sample.pixels.amplitude if data.has_amplitude else unknown,
-        before=depth_before / sample.ray[:, 2] if along_z else depth_before,
-        amplitude_before=amplitude_before,
-        depth_kind=data.first.depth_kind,
-        modulation_frequency=data.first.modulation_frequency,
+        before=before,
+        recording=data.first,
         walls_estimated=fit.walls is not None,
     )
 
@@ -164,59 +172,45 @@ def _standard(values: Tensor) -> Tensor:
     return (values - values.mean()) / values.std().clamp(min=torch.finfo(torch.float64).eps)
 
 
-def _on_image(seen: MisfitPixels) -> tuple[Tensor, Tensor, Tensor]:
-    x, y = (seen.ray[:, axis] / seen.ray[:, 2] for axis in (0, 1))
-    return x, y, x * x + y * y
-
-
-def _brightness(seen: MisfitPixels) -> Tensor | None:
-    """Return the logarithm of the amplitude, standardised; None where it is not known."""
-    if not bool(seen.amplitude.isfinite().all()):
-        return None
-    # The logarithm of no amplitude is infinite: it is cut at a thousandth of the median.
-    return _standard(seen.amplitude.clamp(min=float(seen.amplitude.median()) / 1000).log())
-
-
-def _error(seen: MisfitPixels, *values: Tensor) -> Tensor:
-    """Return what errors of the distance (M,) do to the residual, shape (M, K)."""
-    return seen.gain[:, None] * torch.stack(values, dim=1)
-
-
 def finer_forms(seen: MisfitPixels) -> Probes:
     """Return errors over distance, pixel and amplitude that are finer than those of a usual model.
 
     What a smooth term cannot follow leaves some of itself in every other probe.
     """
-    u, (x, y, square), bright = _standard(seen.distance), _on_image(seen), _brightness(seen)
+    (x, y, square), u, bright = seen.on_image, _standard(seen.linear.distance), seen.brightness
     place = x * y, square**2, x**3, y**3, x * x * y, x * y * y
     finely = "more finely than the model"
     found = {
-        "distance": (f"follow the distance {finely}", _error(seen, u**4, u**5)),
-        "pixel": (f"follow the place in the image {finely}", _error(seen, *place)),
+        "distance": (f"follow the distance {finely}", seen.error(u**4, u**5)),
+        "pixel": (f"follow the place in the image {finely}", seen.error(*place)),
     }
     if bright is not None:
         trace = "follow the amplitude otherwise than the model"
-        found["amplitude"] = trace, _error(seen, bright, bright**2)
+        found["amplitude"] = trace, seen.error(bright, bright**2)
     return found
 
 
 def probes(seen: MisfitPixels) -> Probes:
     """Return the other probes that a recording allows."""
-    (x, y, square), u, facing = _on_image(seen), _standard(seen.distance), -seen.gain
+    (x, y, square), bright, error = seen.on_image, seen.brightness, seen.error
+    distance, facing, amplitude = (
+        seen.linear.distance,
+        -seen.linear.gain,
+        seen.linear.pixels.amplitude,
+    )
     (s, t), when = seen.on_wall.unbind(dim=1), _standard(seen.frame.to(torch.float64))
-    one, none, bright = torch.ones_like(x), torch.zeros_like(x), _brightness(seen)
+    one, none, u = torch.ones_like(x), torch.zeros_like(x), _standard(distance)
     # Amplitude ratios are cut, so that single dark pixels do not decide.
-    change = torch.where(seen.before.isfinite(), seen.before - seen.distance, 0.0)
-    light = (seen.amplitude_before / seen.amplitude).clamp(max=20).nan_to_num()
+    before, amplitude_before = seen.before
+    change = torch.where(before.isfinite(), before - distance, 0.0)
+    light = (amplitude_before / amplitude).clamp(max=20).nan_to_num()
+    frequency = seen.recording.modulation_frequency
 
     def of_phase(further: Tensor) -> Tensor:
         """Return the error by a weak signal of a longer path, in units of its share."""
-        if seen.modulation_frequency is None:
+        if frequency is None:
             return further
-        return torch.sin(phase_from_radial_distance(further, seen.modulation_frequency))
-
-    def error(*values: Tensor) -> Tensor:
-        return _error(seen, *values)
+        return torch.sin(phase_from_radial_distance(further, frequency))
 
     def lens(*moves: tuple[Tensor, Tensor]) -> Tensor:
         return torch.stack([seen.moved_rays(*move) for move in moves], dim=1)
@@ -237,21 +231,21 @@ def probes(seen: MisfitPixels) -> Probes:
         ),
         "target_shape": ("are those of a bent target", torch.stack([s * s, t * t, s * t], dim=1)),
         # Light from all sides: its error grows as the direct light falls.
-        "room": ("grow as light from all sides makes them", error(seen.distance**2 / facing)),
+        "room": ("grow as light from all sides makes them", error(distance**2 / facing)),
         # Light that the camera's mount sends back to the wall.
         "facing": (
             "are those of light between target and camera",
-            error(of_phase(seen.distance) * facing / seen.distance**2),
+            error(of_phase(distance) * facing / distance**2),
         ),
     }
     if not seen.walls_estimated:
         found["plane"] = ("are those of planes elsewhere", torch.stack([one, s, t], dim=1))
-    if seen.modulation_frequency is not None:
+    if frequency is not None:
         # Four waves in one unambiguous range: of the third harmonic with four taps (Lange 2000).
-        phase = 4 * phase_from_radial_distance(seen.distance, seen.modulation_frequency)
+        phase = 4 * phase_from_radial_distance(distance, frequency)
         found["circular"] = ("repeat over the distance", error(phase.sin(), phase.cos()))
     if bright is not None:
-        ratio = (seen.amplitude.median() / seen.amplitude).clamp(max=20)
+        ratio = (amplitude.median() / amplitude).clamp(max=20)
         together = "follow amplitude and distance together"
         found["amplitude_by_distance"] = (together, error(bright * u))
         found["stray_light"] = ("are those of light that strayed in the lens", error(ratio))
@@ -301,14 +295,14 @@ def _shifts(seen: MisfitPixels, fit: Fit, tried: Probes, beside: Probes) -> list
     unknowns of opposite signs: larger than the widest prior.
     """
     # Of a root mean square error of the distance of 1.
-    least = torch.finfo(torch.float64).eps
+    least, at = torch.finfo(torch.float64).eps, seen.linear
     scaled = [
-        columns / (columns / seen.gain[:, None]).square().mean(dim=0).sqrt().clamp(min=least)
+        columns / (columns / at.gain[:, None]).square().mean(dim=0).sqrt().clamp(min=least)
         for _, columns in (*beside.values(), *tried.values())
     ]
-    every = torch.cat([seen.unknowns, *scaled, seen.residual[:, None]], dim=1)
+    every = torch.cat([at.unknowns, *scaled, at.residual[:, None]], dim=1)
     products = pose_products(every, seen.pose[seen.frame], seen.weight.clamp(min=0))
-    known = seen.unknowns.shape[1] + sum(columns.shape[1] for columns in scaled[: len(beside)])
+    known = at.unknowns.shape[1] + sum(columns.shape[1] for columns in scaled[: len(beside)])
     compared = AddedColumns(products, _prior(seen, fit, known))
     found, first = [], 0
     for name, (trace, columns) in tried.items():
@@ -319,16 +313,15 @@ def _shifts(seen: MisfitPixels, fit: Fit, tried: Probes, beside: Probes) -> list
     return found
 
 
-def assumptions(seen: MisfitPixels, fit: Fit, camera: CameraIntrinsics) -> tuple[Shift, ...]:
+def assumptions(seen: MisfitPixels, fit: Fit) -> tuple[Shift, ...]:
     """Return what errors of the intrinsics and of measured planes would do.
 
     Args:
         seen: Some pixels beside the fitted model.
         fit: The fitted model, its hand-eye transform estimated.
-        camera: As recorded.
     """
-    (fx, _, _), (_, fy, _), _ = camera.matrix
-    x, y, _ = _on_image(seen)
+    (fx, _, _), (_, fy, _), _ = seen.recording.camera.matrix
+    x, y, _ = seen.on_image
     one, none = torch.ones_like(x), torch.zeros_like(x)
     # Such errors remain after a careful calibration of the lens, and of a wall by touching it. With
     # a longer focal length rays come nearer the axis, with a shifted point they move the other way.
@@ -341,8 +334,8 @@ def assumptions(seen: MisfitPixels, fit: Fit, camera: CameraIntrinsics) -> tuple
     if not seen.walls_estimated:
         errors["plane_offset"] = ("d of all planes 1 mm larger", one / 1000)
         errors["plane_tilt"] = ("all planes turned by 0.1 deg", math.radians(1 / 10) * seen.on_wall)
-    weighted = seen.unknowns * seen.weight.clamp(min=0)[:, None]
-    hessian = weighted.T @ seen.unknowns
+    weighted = seen.linear.unknowns * seen.weight.clamp(min=0)[:, None]
+    hessian = weighted.T @ seen.linear.unknowns
     inverse = Curvature(hessian + _prior(seen, fit, len(hessian)).hessian).inverse[:6]
     found = []
     for name, (words, columns) in errors.items():

@@ -45,8 +45,9 @@ def fit_residual(
     folds = min(options.folds, int(pose.max()) + 1)
     for fold in range(folds if folds > 1 else 0):
         test = torch.from_numpy(pose % folds == fold)
-        refitted, held_out = _without(core, test), sample.of(test)
-        trained = _train(refitted, error, sample.of(~test), domain, options)
+        here = test[sample.frame]
+        refitted, held_out = _without(core, test), sample.of(here)
+        trained = _train(refitted, error, sample.of(~here), domain, options)
         for row, (network, best) in enumerate([(None, refitted.solution.parameters), trained]):
             off = _distance_to_plane(error, held_out, best, network).square()
             for image in torch.unique(held_out.frame).tolist():

@@ -67,9 +67,8 @@ class FramePixels:
     normal_tool: Tensor
     offset_tool: Tensor
 
-    def of(self, frames: Tensor) -> "FramePixels":
-        """Return the pixels of some frames, given as a mask over all frames."""
-        chosen = frames[self.frame]
+    def of(self, chosen: Tensor) -> "FramePixels":
+        """Return some of the pixels, given as a mask (M,)."""
         pixels = Pixels(*(values[chosen] for values in self.pixels))
         rest = self.ray[chosen], self.normal_tool[chosen], self.offset_tool[chosen]
         return FramePixels(self.frame[chosen], pixels, *rest)

@@ -112,7 +112,7 @@ def calibrate(
         seen = misfit_pixels(data, fitted, found.frames)
         if seen is None:
             return found
-        assumed = assumptions(seen, fitted, data.first.camera)
+        assumed = assumptions(seen, fitted)
         misfit = find_misfit(seen, fitted)
     return replace(found, fit=replace(fitted, misfit=misfit, assumptions=assumed))
 
