@@ -9,5 +9,6 @@ from tofcorr.comparison.options import EvaluationOptions
 MODELS = [{"name": name, "model": model} for name, model in (("E0", E0), ("EA", EA), ("EB", EB))]
 
 
-def options(**changes: Any) -> EvaluationOptions:
-    return EvaluationOptions.from_mapping({"models": MODELS, "folds": 4} | changes, "test")
+def options(*models: dict[str, Any], **changes: Any) -> EvaluationOptions:
+    values = {"models": list(models) or MODELS, "folds": 4} | changes
+    return EvaluationOptions.from_mapping(values, "test")

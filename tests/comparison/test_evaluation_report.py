@@ -1,13 +1,10 @@
 """What an evaluation prints and writes, and what it refuses."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 from comparison.evaluated import MODELS, options
 
-from tofcorr.cli.calibrate import evaluate_command as command
 from tofcorr.comparison.evaluate import (
     EvaluationResult,
     main_pairs,
@@ -16,9 +13,7 @@ from tofcorr.comparison.evaluate import (
 )
 from tofcorr.comparison.experiment import Experiment
 from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
-from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.options import dump_yaml
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.errors import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -30,6 +25,11 @@ from tofcorr.pixels.dataset import Dataset
         ({"folds": 1}, "one fold leaves nothing"),
         ({"fold": 6}, "Did you mean 'folds'"),
         ({"outlier_window_mm": -1.0}, "outlier_window_mm"),
+        ({"models": [{"name": "a", "split": {"seed": 1}}]}, "'split' cannot differ from model"),
+        ({"models": [{"name": "a", "device": "cuda"}]}, "'device' cannot differ from model"),
+        ({"models": [{"config": "ea_rubost"}]}, "Did you mean 'ea_robust'"),
+        ({"models": [{"config": 3}]}, "'config' is the name or the file of a training"),
+        ({"models": [{"name": "a", "weight": {}}]}, "Did you mean 'weights'"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(changes: dict[str, Any], message: str) -> None:
@@ -62,21 +62,3 @@ def test_tables_have_the_papers_layout(evaluation: Experiment) -> None:
     lines = half.text().splitlines()
     assert len({line.index("before") + 6 for line in lines if "before" in line}) == 1
     assert len({len(line) for line in lines[2:6]}) == 1
-
-
-@pytest.mark.parametrize(
-    ("config", "kind"),
-    [
-        ({"models": MODELS, "folds": 40}, CalibrationDataError),
-        ({"models": MODELS, "fold": 4}, ConfigError),
-    ],
-)
-def test_the_command_leaves_nothing_behind_when_it_refuses(
-    config: dict[str, Any], kind: type[Exception], dataset: Dataset, tmp_path: Path
-) -> None:
-    (tmp_path / "config.yaml").write_text(dump_yaml(config))
-    arguments = {"--config": tmp_path / "config.yaml", "--recording": dataset.first.path}
-    given = [str(word) for pair in arguments.items() for word in pair]
-    result = CliRunner().invoke(command, [*given, "--out", str(tmp_path / "report")])
-    assert isinstance(result.exception, kind)
-    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]

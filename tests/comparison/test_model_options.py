@@ -1,14 +1,11 @@
 """The models of a comparison: from where their options come, and what is refused."""
 
 from pathlib import Path
-from typing import Any
 
-import pytest
-from comparison.asked import options
+from comparison.evaluated import options
 from synthetic_scene import EA
 
 from tofcorr.comparison.options import EvaluationOptions
-from tofcorr.errors import ConfigError
 
 
 def test_a_shipped_training_configuration_gives_its_name_and_every_option() -> None:
@@ -40,21 +37,6 @@ def test_the_resolved_configuration_can_be_read_again() -> None:
     assert [again.training(model) for model in again.models] == [
         asked.training(model) for model in asked.models
     ]
-
-
-@pytest.mark.parametrize(
-    ("model", "message"),
-    [
-        ({"name": "a", "split": {"seed": 1}}, "'split' cannot differ from model to model"),
-        ({"name": "a", "device": "cuda"}, "'device' cannot differ from model to model"),
-        ({"config": "ea_rubost"}, "Did you mean 'ea_robust'"),
-        ({"config": 3}, "'config' is the name or the file of a training configuration"),
-        ({"name": "a", "weight": {}}, "Did you mean 'weights'"),
-    ],
-)
-def test_a_model_that_makes_no_sense_is_refused(model: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        options(model)
 
 
 def test_a_model_of_a_training_file_is_read_from_there(tmp_path: Path) -> None:

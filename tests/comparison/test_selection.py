@@ -63,6 +63,11 @@ def test_models_of_equal_error_and_complexity_are_ranked_by_name() -> None:
         assert (ranking.best, ranking.winner) == ("a", "a")
 
 
+def test_the_ranking_does_not_depend_on_the_order_of_the_models() -> None:
+    errors, complexity = drawn(0, 0.0, 0.01, 0.02), {"m0": 20, "m1": 10, "m2": 5}
+    assert rank(errors, complexity, 6) == rank(dict(reversed(errors.items())), complexity, 6)
+
+
 def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None:
     wrong = sum(rank(drawn(seed, 0, 0), {"m0": 1, "m1": 2}, 6).ties == [] for seed in range(200))
     assert wrong <= 10

@@ -5,12 +5,14 @@ from functools import cache
 import numpy as np
 import pytest
 from drift.few_walls import FEW, Walls, sensor
-from simulated_walls import fitted, simulated_wall
+from simulated_walls import EA, fitted, simulated_wall
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import Reference, estimate_reference
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.run import calibration_state
 
 
 @pytest.fixture(scope="session")
@@ -20,19 +22,9 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Fit]:
 
 
 @pytest.fixture(scope="session")
-def reference(calibrated: tuple[Dataset, Fit]) -> Reference:
+def reference(calibrated: tuple[Dataset, Fit], state: CalibrationState) -> Reference:
     dataset, fit = calibrated
-    assert fit.weights is not None
-    assert fit.weights.noise is not None
-    found = estimate_reference(
-        dataset,
-        np.arange(dataset.num_frames),
-        fit.model,
-        fit.domain,
-        fit.weights.noise.coefficients,
-        twist=True,
-        walls_are_known=True,
-    )
+    found = estimate_reference(dataset, np.arange(dataset.num_frames), fit, state.noise)
     assert found is not None
     return found
 
@@ -52,16 +44,5 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Walls:
 
 @pytest.fixture(scope="session")
 def state(calibrated: tuple[Dataset, Fit]) -> CalibrationState:
-    dataset, fit = calibrated
-    best = fit.solution.parameters
-    return CalibrationState(
-        name="EA",
-        error_model=fit.options,
-        domain=fit.domain,
-        coefficients=best.coefficients,
-        tool_from_camera=best.tool_from_camera,
-        hand_eye_estimated=True,
-        camera=dataset.first.camera,
-        depth_kind=dataset.first.depth_kind,
-        covariance=fit.covariance.matrix[6:, 6:],
-    )
+    options = TrainingOptions.from_mapping({"name": "EA", "model": EA}, "test")
+    return calibration_state(calibrated[0], options, calibrated[1])

@@ -1,10 +1,8 @@
 """The linear form of an image is its derivative; the functions of the form keep to their scale."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from simulated_walls import fitted, simulated_wall
 
@@ -12,7 +10,7 @@ from tofcorr.correction.model import HandEye
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import Pixels
 from tofcorr.fit.linear_image import CLASSES, LinearPixels, form_classes, form_functions, linearised
-from tofcorr.fit.reference import Reference, estimate_reference
+from tofcorr.fit.reference import estimate_reference
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.sample import pixels_of_image
@@ -77,37 +75,17 @@ def test_the_columns_are_derivatives_of_the_residual(tmp_path: Path) -> None:
     torch.testing.assert_close(at.unknowns[:, 6], -at.gain)
 
 
-def referenced(folder: Path) -> Callable[[], Reference]:
+def test_the_poses_errors_are_measured(tmp_path: Path) -> None:
     robot = {"repeatability_mm": 1.5, "repeatability_mrad": 0.2}
-    dataset = simulated_wall(folder, 5, robot=robot)
-    fit, frames = fitted(dataset), np.arange(dataset.num_frames)
-
-    def estimated() -> Reference:
-        found = estimate_reference(
-            dataset, frames, fit.model, fit.domain, None, twist=True, walls_are_known=True
-        )
-        assert found is not None
-        return found
-
-    return estimated
-
-
-def test_the_poses_errors_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    estimated = referenced(tmp_path / "wall")
-    found = estimated()
+    dataset = simulated_wall(tmp_path / "wall", 5, robot=robot)
+    found = estimate_reference(dataset, np.arange(dataset.num_frames), fitted(dataset), None)
+    assert found is not None
     assert found.poses == 30
     # A standard deviation of 30 poses is known to 13 %; three of these.
     assert 0.9e-3 < float(found.random_variance[2].sqrt()) < 2.1e-3
     values = torch.linalg.eigvalsh(found.covariance)
     assert float(values.min()) > -1e-12 * float(values.max())
-    # Had these images departed less from each other, they would tell more; poses err as before.
-    monkeypatch.setattr("tofcorr.fit.reference.scatter", lambda sums, estimate: found.scatter / 100)
-    closer = estimated()
-    torch.testing.assert_close(closer.random_variance, found.random_variance)
-    torch.testing.assert_close(closer.covariance, found.covariance)
+    # These images depart less from each other than their noise lets expect: they tell more.
+    assert found.scatter < 1
     assert found.covariance_within is not None
-    assert closer.covariance_within is not None
-    gained = torch.linalg.eigvalsh(found.covariance_within - closer.covariance_within)
-    assert float(gained.min()) > -1e-9 * float(values.max())
-    less = closer.covariance_within.trace() / found.covariance_within.trace()
-    assert float(less) < 0.99
+    assert float(found.covariance_within.trace()) < float(found.covariance.trace())

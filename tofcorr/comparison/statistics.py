@@ -8,10 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tofcorr.estimation.robust import student_quantile, student_tail
+from tofcorr.fit.problem import LEVEL
 from tofcorr.training.report import number_or_none
-
-_LEVEL = 0.05
-"""What every interval of a comparison leaves out, and the level of its tests; the usual one."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class Estimate:
     @property
     def significant(self) -> bool:
         """Whether the interval excludes zero."""
-        return self.p_value < _LEVEL
+        return self.p_value < LEVEL
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -71,7 +69,7 @@ def estimate(values: np.ndarray, overlap: float = 0.0) -> Estimate:
     error = deviation * sqrt(1 / len(values) + overlap)
     # Two columns that are equal in every split have no difference to test.
     p_value = 2 * student_tail(abs(mean) / error, dof) if error > 0 else float(mean == 0)
-    half_width = student_quantile(1 - _LEVEL / 2, dof) * error
+    half_width = student_quantile(1 - LEVEL / 2, dof) * error
     return Estimate(mean, deviation, error, half_width, p_value, dof)
 
 

@@ -27,6 +27,7 @@ from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.linear import Curvature, GroupSums, inverse, reduced
 from tofcorr.estimation.robust import f_tail, student_quantile
 from tofcorr.fit.linear_image import BOWS, linearised, wall_moves
+from tofcorr.fit.problem import LEVEL
 from tofcorr.fit.reference import ImageSums, Reference, own_noise, repeated
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
@@ -187,7 +188,7 @@ class OffsetSums:
         offsets = (value + scores / expected).tolist()
         return Offset(
             value=value,
-            half_width=student_quantile(0.975, freedom) * math.sqrt(variance),
+            half_width=student_quantile(1 - LEVEL / 2, freedom) * math.sqrt(variance),
             images=[one._replace(offset=x) for one, x in zip(self._images, offsets, strict=True)],
             disagreement=disagreement,
             disagrees=disagrees,

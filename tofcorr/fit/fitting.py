@@ -240,14 +240,12 @@ def _on_walls(
     return problem, solve(problem, found.walls.seen_by(moments), held=held)
 
 
-def solve(problem: Problem, moments: ImageMoments, folds: int = 6, *, held: bool = True) -> Core:
+def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core:
     """Find the hand-eye transform and the coefficients that minimise the loss of the moments.
 
     Args:
         problem: What to fit.
         moments: Of its frames, with exactly the model's image columns.
-        folds: Of the cross-validation that chooses the strength of a penalty; poses go to them in
-            turn, with all their images.
         held: Whether directions that the images do not determine are looked for, and held.
 
     Raises:
@@ -271,7 +269,8 @@ def solve(problem: Problem, moments: ImageMoments, folds: int = 6, *, held: bool
         symbols = [symbol for term in frame_terms for symbol in term.symbols]
         moments = moments.with_conditions(functions.T, symbols)
     start, poses = _start(problem, moments, model), problem.poses()
-    held_out = [(poses % folds == k).nonzero()[:, 0].tolist() for k in range(folds)]
+    # Six folds choose the strength of a penalty; poses go to them in turn, with all their images.
+    held_out = [(poses % 6 == k).nonzero()[:, 0].tolist() for k in range(6)]
     penalties = with_strengths(penalties_of(model), moments, start, held_out)
     strengths = {one.name: float(one.strength) for one in penalties}
     chosen = iter([strengths[term.symbols[0]] for term, _ in model.penalised()])
@@ -467,23 +466,20 @@ def _expected_moments(
     core: Core,
     weights: PixelWeights | None,
     noise: DistanceNoise,
-    pixels: int = 50_000,
-    fewest_frames: int = 16,
 ) -> ImageMoments:
     """Return what the noise adds to the moments, estimated from some frames and pixels.
 
-    The shift of so many pixels is known far better than it needs to be.
+    The shift of about 50 000 pixels of 16 evenly spread frames is known far better than it needs to
+    be.
 
     Args:
         problem: What was fitted.
         core: At the least loss.
         weights: Of the pixels.
         noise: Of a measured distance.
-        pixels: About how many are read.
-        fewest_frames: In at least so many evenly spread frames.
     """
     data, error = problem.dataset, ErrorModel(core.options, problem.domain)
-    count = min(max(fewest_frames, pixels // (error.height * error.width)), len(problem.frames))
+    count = min(max(16, 50_000 // (error.height * error.width)), len(problem.frames))
     chosen = np.unique(np.linspace(0, len(problem.frames) - 1, count).astype(int))
     rays, number = data.ray_directions().flatten(0, 1), iter(chosen.tolist())
     gram = torch.zeros_like(core.moments.gram)
@@ -491,7 +487,7 @@ def _expected_moments(
         weight = torch.ones_like(batch.radial_distance) if weights is None else weights(batch)
         for k in range(len(batch.indices)):
             used = batch.valid[k].flatten().nonzero()[:, 0]
-            some = used[:: max(1, len(used) * len(chosen) // pixels)]
+            some = used[:: max(1, len(used) * len(chosen) // 50_000)]
             at = pixels_of_image(batch, k, some)
             # Without amplitude the variance is infinite; no camera errs by more than this prior.
             variance = noise.variance(at.amplitude).clamp(max=PRIOR_SIGMA**2)
@@ -502,15 +498,16 @@ def _expected_moments(
     return replace(core.moments, gram=gram)
 
 
-def _slopes(error: ErrorModel, pixels: Pixels, step: float = 1e-4) -> Tensor:
+def _slopes(error: ErrorModel, pixels: Pixels) -> Tensor:
     """Return the derivatives of the distance and of the model's columns by the distance, (C, M).
 
     Differences over steps of 0.1 mm: torch's forward mode imports torch.compile, which takes longer
     than a fit.
     """
+    distance, step = pixels.radial_distance, 1 / 10_000
     with torch.no_grad():
         near, far = (
-            error.columns_at(pixels._replace(radial_distance=pixels.radial_distance + shift))
+            error.columns_at(pixels._replace(radial_distance=distance + shift))
             for shift in (-step, step)
         )
     return torch.cat([torch.ones_like(far[:1]), (far - near) / (2 * step)])

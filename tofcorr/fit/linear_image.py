@@ -17,9 +17,8 @@ effect of survey sampling (Kish 1965).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from numpy.polynomial.legendre import legvander
@@ -58,9 +57,9 @@ def form_functions(domain: Domain, pixels: Pixels, gain: Tensor) -> list[Tensor]
         The functions of each kind, shape (H, M); H is 0 where no amplitude was calibrated.
     """
     functions = {
-        "distance": _cosines(domain.radial_distance.scale(pixels.radial_distance)),
+        "distance": partial(_cosines, domain.radial_distance.scale(pixels.radial_distance)),
         "amplitude": lambda orders: gain.new_zeros(0, len(gain)),
-        "place": _place(domain, pixels),
+        "place": partial(_place, domain, pixels),
         "angle": lambda orders: torch.stack([(4 + 4 * gain) ** k for k in range(1, orders + 1)]),
     }
     if domain.amplitude is not None:
@@ -69,7 +68,7 @@ def form_functions(domain: Domain, pixels: Pixels, gain: Tensor) -> list[Tensor]
         # The logarithms of the range, mapped onto [-1, 1].
         width = math.log(max(high, low) / low) or 1.0
         scaled = 2 * (pixels.amplitude.clamp(min=low) / low).log() / width - 1
-        functions["amplitude"] = _cosines(scaled)
+        functions["amplitude"] = partial(_cosines, scaled)
     found = []
     for variables, orders in _KINDS.items():
         first, *second = (functions[name](one) for name, one in zip(variables, orders, strict=True))
@@ -85,27 +84,19 @@ def form_classes(domain: Domain) -> Tensor:
     return torch.repeat_interleave(torch.arange(CLASSES), counts)
 
 
-def _cosines(scaled: Tensor) -> Callable[[int], Tensor]:
-    """Return the function that gives cos(k pi (s + 1) / 2) / k for k from 1, (orders, M)."""
-
-    def functions(orders: int) -> Tensor:
-        order = torch.arange(1, orders + 1).to(scaled)[:, None]
-        return torch.cos(order * (math.pi / 2) * (scaled + 1)) / order
-
-    return functions
+def _cosines(scaled: Tensor, orders: int) -> Tensor:
+    """Return cos(k pi (s + 1) / 2) / k for k from 1, shape (orders, M)."""
+    order = torch.arange(1, orders + 1).to(scaled)[:, None]
+    return torch.cos(order * (math.pi / 2) * (scaled + 1)) / order
 
 
-def _place(domain: Domain, pixels: Pixels) -> Callable[[int], Tensor]:
-    """Return the function that gives polynomials of the place up to a total degree, (H, M)."""
-
-    def functions(highest: int) -> Tensor:
-        row, column = (
-            _legendre(2 * at / max(size - 1, 1) - 1, highest)
-            for at, size in ((pixels.rows, domain.height), (pixels.columns, domain.width))
-        )
-        return torch.stack([row[i] * column[j] for i, j in _degrees(highest)])
-
-    return functions
+def _place(domain: Domain, pixels: Pixels, highest: int) -> Tensor:
+    """Return polynomials of the place up to a total degree, shape (H, M)."""
+    row, column = (
+        _legendre(2 * at / max(size - 1, 1) - 1, highest)
+        for at, size in ((pixels.rows, domain.height), (pixels.columns, domain.width))
+    )
+    return torch.stack([row[i] * column[j] for i, j in _degrees(highest)])
 
 
 def _legendre(scaled: Tensor, degree: int) -> Tensor:

@@ -27,7 +27,7 @@ from tofcorr.estimation.linear import AddedColumns, Curvature, NormalEquations, 
 from tofcorr.estimation.robust import student_quantile
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.linear_image import LinearPixels, linearised
-from tofcorr.fit.problem import Fit, Shift
+from tofcorr.fit.problem import LEVEL, Fit, Shift
 from tofcorr.geometry.rays import moved_rays, phase_from_radial_distance, plane_in_frame, tangents
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import draw_pixels, thinned
@@ -252,13 +252,12 @@ def probes(seen: MisfitPixels) -> Probes:
     return found
 
 
-def find_misfit(seen: MisfitPixels, fit: Fit, level: float = 0.05) -> Shift | None:
+def find_misfit(seen: MisfitPixels, fit: Fit) -> Shift | None:
     """Look for an error that a fitted model lacks and that matters to the hand-eye transform.
 
     Args:
         seen: Some pixels of the frames, fitted or held out, beside the fitted model.
         fit: The fitted model, its hand-eye transform estimated.
-        level: Largest probability of a misfit by chance; that the interval leaves out.
 
     Returns:
         The least likely to be chance of those that would move the transform out of its interval.
@@ -269,7 +268,7 @@ def find_misfit(seen: MisfitPixels, fit: Fit, level: float = 0.05) -> Shift | No
     # known beside them.
     if len(seen.pose.unique()) < 16:
         return None
-    half = student_quantile(1 - level / 2, fit.covariance.degrees_of_freedom)
+    half = student_quantile(1 - LEVEL / 2, fit.covariance.degrees_of_freedom)
     half = half * fit.hand_eye_covariance.diagonal().clamp(min=0).sqrt()
     finer, others = finer_forms(seen), probes(seen)
     groups = _shifts(seen, fit, others, finer), _shifts(seen, fit, finer, {})
@@ -279,7 +278,7 @@ def find_misfit(seen: MisfitPixels, fit: Fit, level: float = 0.05) -> Shift | No
         counting = [
             one._replace(p_value=p_value)
             for one in group
-            if (p_value := min(1.0, tried * (one.p_value or 0.0))) < level
+            if (p_value := min(1.0, tried * (one.p_value or 0.0))) < LEVEL
             and bool((one.twist.abs() > half).any())
             and max(one.size) > _LEAST
         ]

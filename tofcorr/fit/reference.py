@@ -20,9 +20,7 @@ import torch
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
 from torch import Tensor
 
-from tofcorr.correction.model import CalibrationModel
 from tofcorr.correction.state import CalibrationState, Float64
-from tofcorr.error_terms.base import Domain
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import (
     Classes,
@@ -50,6 +48,7 @@ from tofcorr.fit.linear_image import (
     linearised,
     wall_moves,
 )
+from tofcorr.fit.problem import Fit
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.options import Count, NonNegativeNumber, Number, Options
 from tofcorr.pixels.dataset import Dataset
@@ -286,26 +285,19 @@ _RANDOM = torch.tensor([0, 0, 1] + [2] * BOWS + [3] * (SHAPES - BOWS))
 def estimate_reference(
     dataset: Dataset,
     frames: np.ndarray,
-    model: CalibrationModel,
-    domain: Domain,
+    fit: Fit,
     noise: tuple[float, float, float] | None,
-    *,
-    twist: bool,
-    walls_are_known: bool,
-    most_frames: int = 200,
 ) -> Reference | None:
     """Return how far the camera may be from what a fitted model says, frame by frame.
+
+    Of more than 200 frames, evenly spread ones are looked at. With more, or with more pixels, what
+    the form leaves out is known no better, because it is the same in all.
 
     Args:
         dataset: The recordings, without the pixels that the fit left out.
         frames: Global numbers of the frames, fitted or held out.
-        model: The fitted model.
-        domain: The calibrated ranges; pixels outside are not looked at.
+        fit: The fitted model; pixels outside of its ranges are not looked at.
         noise: a, b, c of the variance of a measured distance; None: all pixels weigh the same.
-        twist: Whether the hand-eye transform was estimated.
-        walls_are_known: Whether the planes are right; otherwise each wall's place is unknown.
-        most_frames: Of more, evenly spread ones are looked at. With more, or with more pixels, what
-            the form leaves out is known no better, because it is the same in all.
 
     Returns:
         The reference; None with fewer than three poses, and where the equations have no solution:
@@ -314,10 +306,12 @@ def estimate_reference(
     rays = dataset.ray_directions()
     dataset = dataset.without(off_the_wall(rays))
     noise = noise if dataset.has_amplitude else None
+    model, domain, twist = fit.model, fit.domain, fit.solution.parameters.hand_eye_is_free
     hand_eye, poses = model.hand_eye().detach(), dataset.column("world_from_tool")
     groups, names = dataset.pose_groups(), dataset.targets
-    frames = frames[:: max(-(-len(frames) // most_frames), 1)]
-    walls = [] if walls_are_known else sorted(set(names[frames].tolist()))
+    frames = frames[:: max(-(-len(frames) // 200), 1)]
+    # Where the planes may be wrong, each wall's place is unknown.
+    walls = [] if fit.walls is None else sorted(set(names[frames].tolist()))
     sums = ImageSums(noise)
     for batch in dataset.batches(frames):
         inside = batch.valid & domain.holds(batch.radial_distance, batch.amplitude)

@@ -15,12 +15,12 @@ from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.regularisation import total_weight
 from tofcorr.estimation.robust import student_tail
 from tofcorr.estimation.solvers import minimise
-from tofcorr.fit.problem import Core, Problem, ResidualOptions
+from tofcorr.fit.problem import LEVEL, Core, Problem, ResidualOptions
 from tofcorr.pixels.sample import FramePixels, draw_pixels
 
 
 def fit_residual(
-    problem: Problem, core: Core, error: ErrorModel, options: ResidualOptions, level: float = 0.05
+    problem: Problem, core: Core, error: ErrorModel, options: ResidualOptions
 ) -> tuple[str, ResidualNetwork | None, Parameters]:
     """Train a network on what a core leaves, and decide by cross-validation whether it stays.
 
@@ -30,8 +30,6 @@ def fit_residual(
         error: Its error model, with its fixed pattern if it has one; its coefficients are not
             looked at.
         options: Size, training, decision.
-        level: A network is kept if so large a gain would arise by chance with less than this
-            probability.
 
     Returns:
         The decision in one sentence; the network, trained on all images, None if it was dropped;
@@ -56,7 +54,7 @@ def fit_residual(
     gain = np.array([np.nanmean((square[0] - square[1])[pose == one]) for one in seen])
     p_value = _p_value(gain)
     network, best = None, core.solution.parameters
-    if options.keep == "always" or p_value < level:
+    if options.keep == "always" or p_value < LEVEL:
         network, best = _train(core, error, sample, domain, options)
     without, with_network = (1e3 * float(np.nanmean(row)) ** 0.5 for row in square)
     words = (

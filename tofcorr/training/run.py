@@ -52,16 +52,7 @@ _LOG = logging.getLogger(__name__)
 
 def run_reference(calibration: Calibration, state: CalibrationState) -> Reference | None:
     """Return what a later check must know of the frames, fitted and held out; None: unknown."""
-    fit = calibration.fit
-    return estimate_reference(
-        calibration.data,
-        calibration.frames,
-        fit.model,
-        fit.domain,
-        state.noise,
-        twist=state.hand_eye_estimated,
-        walls_are_known=fit.walls is None,
-    )
+    return estimate_reference(calibration.data, calibration.frames, calibration.fit, state.noise)
 
 
 def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> CalibrationState:
