@@ -15,7 +15,7 @@ from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.fit.fitting import fit, fit_hand_eye
+from tofcorr.fit.fitting import fit
 from tofcorr.geometry.rays import plane_in_frame, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.metrics import frame_errors
@@ -63,11 +63,9 @@ def test_hand_eye_only_is_the_fit_of_the_hand_eye_without_any_term(
     dataset: Dataset, evaluation: Experiment, domain: Domain
 ) -> None:
     train = np.setdiff1d(np.arange(dataset.num_frames), evaluation.splits["half"]["half"])
-    alone = fit_hand_eye(
-        dataset, train, TrainingOptions(name="x", model=ErrorModelOptions()), domain
-    )
-    found = evaluation.hand_eye[HAND_EYE_ONLY]
-    np.testing.assert_allclose(found, alone.tool_from_camera, atol=1e-6)
+    none = TrainingOptions(name="x", model=ErrorModelOptions())
+    alone = fit(dataset, train, none, domain).hand_eye_only.tool_from_camera
+    np.testing.assert_allclose(evaluation.hand_eye[HAND_EYE_ONLY], alone, atol=1e-6)
 
 
 def test_errors_along_the_ray_and_in_z_are_those_of_the_true_distance(

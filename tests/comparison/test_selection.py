@@ -8,7 +8,7 @@ import pytest
 from simulated_walls import EA, simulated_wall
 
 from tofcorr.comparison.options import SelectionOptions
-from tofcorr.comparison.select import rank_models
+from tofcorr.comparison.select import select
 from tofcorr.comparison.statistics import rank
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.pixels.dataset import Dataset
@@ -93,7 +93,7 @@ def test_bands_of_distance_do_not_overlap(wall: Dataset) -> None:
 
 
 def test_the_model_that_holds_the_truth_is_chosen(wall: Dataset) -> None:
-    selection = rank_models(wall, options())
+    selection = select(wall.recordings, options())
     assert selection.decisive.winner == "EA"
     assert selection.decisive.ties == []
     assert len(selection.experiment.models) == 6 + 3 + 2

@@ -11,7 +11,7 @@ from synthetic_scene import EA, Scene, write_scene
 
 from tofcorr.comparison.experiment import ModelFitter, held_out_experiment
 from tofcorr.comparison.options import SelectionOptions
-from tofcorr.comparison.select import rank_models
+from tofcorr.comparison.select import select
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels.dataset import Dataset
@@ -128,7 +128,7 @@ def test_a_wall_that_no_training_image_shows_is_warned_of(recording: Recording) 
         "by": ["target"],
     }
     asked = SelectionOptions.from_mapping(values, "test")
-    found = rank_models(Dataset((recording,)), asked)
+    found = select(recording, asked, force=True)
     assert any(
         "no training image shows the wall 'white'" in text for text in found.experiment.warnings
     )

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.plausibility.examine import vet
-from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import number_or_none
 
@@ -224,43 +223,25 @@ def select(
         dataset = Dataset(opened(recordings))
         planes = resolved_planes(options.planes, dataset.recordings)
         inspection = vet(dataset, planes, force=force)
-        found = rank_models(dataset, options, inspection)
-        result = replace(found, headline=inspection.headline)
+        found = held_out_experiment("", dataset, options, inspection)
+        complexity = {
+            model.name: _complexity(found.options.training(model), found.fitter.domain, dataset)
+            for model in found.options.models
+        }
+        rankings = {}
+        for by, groups in found.errors.items():
+            errors = {
+                name: _by_pose(dataset, [one[name]["to_plane"] for one in groups], options)
+                for name in complexity
+            }
+            rankings[by] = rank(errors, complexity, len(groups))
+        # What the page says of the models is what was asked for.
+        result = SelectionResult(rankings, found, options, inspection.headline)
         if folder is not None:
             (folder / "selection.md").write_text(result.markdown(), encoding="utf-8")
             numbers = json.dumps(result.to_mapping(), indent=1, allow_nan=False)
             (folder / "selection.json").write_text(f"{numbers}\n", encoding="utf-8")
     return result
-
-
-def rank_models(
-    dataset: Dataset, options: SelectionOptions, inspection: Inspection | None = None
-) -> SelectionResult:
-    """Fit every model without each group of frames, and rank by the errors on the group.
-
-    Args:
-        dataset: The recordings.
-        options: Models and groupings.
-        inspection: What was odd about the recordings. Frames that disagree with all others are
-            left out, as a training leaves them out, and garbage is met as there; None: neither.
-
-    Raises:
-        CalibrationDataError: No grouping is possible, or a model needs what a recording lacks.
-    """
-    found = held_out_experiment("", dataset, options, inspection)
-    complexity = {
-        model.name: _complexity(found.options.training(model), found.fitter.domain, dataset)
-        for model in found.options.models
-    }
-    rankings = {}
-    for by, groups in found.errors.items():
-        errors = {
-            name: _by_pose(dataset, [one[name]["to_plane"] for one in groups], options)
-            for name in complexity
-        }
-        rankings[by] = rank(errors, complexity, len(groups))
-    # What the page says of the models is what was asked for.
-    return SelectionResult(rankings, found, options)
 
 
 def _by_pose(dataset: Dataset, groups: list[FrameErrors], options: SelectionOptions) -> np.ndarray:

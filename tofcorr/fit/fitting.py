@@ -29,7 +29,7 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.base import Domain, Term
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
+from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import Curvature, solvable
 from tofcorr.estimation.moments import (
@@ -98,7 +98,7 @@ def fit(
         watcher: Called after each iteration of the solver.
         resumed: Where an interrupted fit stood; None starts anew.
         moments: Those of the frames with exactly the model's image columns, if they are known
-            from an earlier pass; weighted by noise where the options say so, but not robustly.
+            from an earlier pass, where all pixels weigh the same.
 
     Raises:
         CalibrationDataError: The recordings lack an input of the model, the images do not
@@ -106,7 +106,11 @@ def fit(
     """
     with solvable(dataset.first.path, "fit"), thread_number(1):
         problem = Problem(dataset, np.asarray(frames), options, domain, watcher, resumed)
-        problem, core, weights = _solved(problem, moments)
+        weights = None
+        if moments is None:
+            moments, weights = prepare(problem)
+        problem, core = _on_walls(problem, moments)
+        refuse_diverged(core.solution.parameters)
         optimum, prior, poses = core.solution.parameters, core.total_prior, problem.poses()
         # At the least loss, where the gradients of the poses sum to zero.
         covariance = jackknife_covariance(core.moments, optimum, prior, poses, problem.estimated)
@@ -135,28 +139,6 @@ def fit(
         )
 
 
-def fit_model(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, options: FitOptions, domain: Domain
-) -> CalibrationModel:
-    """Return the model that `fit` finds, without its covariance; arguments and errors as there."""
-    with solvable(dataset.first.path, "fit"), thread_number(1):
-        problem = Problem(dataset, np.asarray(frames), options, domain)
-        return _completed(*_solved(problem))[2]
-
-
-def fit_hand_eye(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, options: FitOptions, domain: Domain
-) -> Parameters:
-    """Fit the hand-eye transform alone, on the planes as recorded and without any error term.
-
-    Arguments and errors are those of `fit`; the terms of the options are not used.
-    """
-    with solvable(dataset.first.path, "fit"), thread_number(1):
-        none = options.model_copy(update={"model": ErrorModelOptions(terms=())})
-        problem = Problem(dataset, np.asarray(frames), none, domain)
-        return hand_eye_alone(problem, prepare(problem)[0])
-
-
 def hand_eye_alone(problem: Problem, moments: ImageMoments) -> Parameters:
     """Fit the hand-eye transform alone to moments of the problem's frames.
 
@@ -178,20 +160,6 @@ def _minimum(
 ) -> Solution:
     """Minimise the point-to-plane loss of the moments with the solver that the options name."""
     return minimise(MomentObjective(moments, prior), start, problem.options.solver, watcher)
-
-
-def _solved(
-    problem: Problem, moments: ImageMoments | None = None
-) -> tuple[Problem, Core, PixelWeights | None]:
-    """Take all steps to the fitted core; return it, the problem on its walls, and the weights."""
-    if moments is None:
-        moments, weights = prepare(problem)
-    else:
-        noise = problem.options.weights.noise
-        weights = first_weights(problem.dataset, problem.frames, noise, "none")
-    problem, core = _on_walls(problem, moments)
-    refuse_diverged(core.solution.parameters)
-    return problem, core, weights
 
 
 def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:

@@ -138,8 +138,7 @@ class Inspection:
 
     def __repr__(self) -> str:
         """Return the findings, the worst first, and what was measured."""
-        found = sorted(self.findings, key=lambda one: SEVERITIES.index(one.severity))
-        lines = [f"{one.severity:<11}{one.sentence}" for one in found]
+        lines = [f"{one.severity:<11}{one.sentence}" for one in self.findings]
         numbers = [f"  {name:<44}{value:>10.4g}" for name, value in self.numbers.items()]
         said = lines or ["Nothing odd was found."]
         return "\n".join([", ".join(self.recordings), *said, *numbers])

@@ -19,7 +19,7 @@ from tofcorr.diagnosis.rerun.simulator import (
 from tofcorr.diagnosis.sums.observations import TINY, Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.model import Pixels
-from tofcorr.fit.fitting import fit_hand_eye, fit_model
+from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.observables.compare import Observables, compare_observables
@@ -338,7 +338,7 @@ def _tested(
     options = FitOptions(model=study.fit.model.options, hand_eye=hand_eye)
     dataset = Dataset((recording_of(observations, torch.where(use, distance, torch.nan), pose),))
     domain = covered_domain(dataset, training)
-    trained = fit_model(dataset, training, options, domain)
+    trained = fit(dataset, training, options, domain).model
     measured, width = observations.measured, observations.distance_images.shape[2]
     pixels = Pixels(
         measured,
@@ -351,7 +351,7 @@ def _tested(
         corrected = torch.where(use, measured - trained.error.error_at(pixels), torch.nan)
     if free:
         real = Dataset((recording_of(observations, corrected, pose),))
-        pose = fit_hand_eye(real, training, options, domain).tool_from_camera
+        pose = fit(real, training, options, domain).hand_eye_only.tool_from_camera
     left = corrected - predicted_distance(observations, pose)
     tested = torch.from_numpy(np.isin(observations.frame.numpy(), test))
     weights = study.fit.share * tested
