@@ -32,4 +32,4 @@ def white_wall(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Forty poses before a white wall."""
     folder = tmp_path_factory.mktemp("white") / "recording"
     shots = {"shots": [{"target": "white", "poses": 40}]}
-    return diagnosed_recordings.recorded(folder, 1, changes=shots)
+    return diagnosed_recordings.recorded(folder, 73, changes=shots)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import diagnosed_recordings
 import numpy as np
 import pytest
 
@@ -9,6 +10,13 @@ from tofcorr.data.recording import Recording
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 from tofcorr.plausibility.finding import Finding
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder = tmp_path_factory.mktemp("few") / "recording"
+    changes = {"shots": [{"target": "checkerboard", "poses": 19}]}
+    return diagnosed_recordings.recorded(folder, 73, changes=changes)
 
 
 def _of_remounting(recording: Recording, poses: int, *, knocked: bool) -> list[Finding]:
@@ -26,9 +34,9 @@ def _of_remounting(recording: Recording, poses: int, *, knocked: bool) -> list[F
     return [one for one in examine(Dataset((fewer,))).findings if one.check == "remounting"]
 
 
-def test_a_camera_that_moved_is_found_with_sixteen_poses(white_wall: Recording) -> None:
+def test_a_camera_that_moved_is_found_with_sixteen_poses(recording: Recording) -> None:
     """It was looked for from twenty on, and a hand-eye transform 24 mm off was `usable`."""
-    (found,) = _of_remounting(white_wall, 16, knocked=True)
+    (found,) = _of_remounting(recording, 16, knocked=True)
     assert found.severity == "doubtful"
     assert "as if the camera had moved on the tool" in found.sentence
 
@@ -40,7 +48,7 @@ def test_a_camera_that_moved_is_found_with_sixteen_poses(white_wall: Recording) 
         (19, "19 distinct poses are too few to see whether some poses are of another frame"),
     ],
 )
-def test_what_few_poses_cannot_show_is_said(white_wall: Recording, poses: int, words: str) -> None:
-    (found,) = _of_remounting(white_wall, poses, knocked=False)
+def test_what_few_poses_cannot_show_is_said(recording: Recording, poses: int, words: str) -> None:
+    (found,) = _of_remounting(recording, poses, knocked=False)
     assert found.severity == "note"
     assert found.sentence.startswith(words)
