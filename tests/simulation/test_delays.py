@@ -1,13 +1,10 @@
 """Delays become distance errors one to one."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from simulation.small import expected_frames, small
 
-from tofcorr.errors import ConfigError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.signal import (
     AmplitudeDelayOptions,
@@ -93,15 +90,3 @@ def test_curve_is_constant_beyond_its_knots_and_differentiable_within() -> None:
 
 def test_lattice_of_one_point_is_flat() -> None:
     assert image_from_lattice(((0.25,),), 3, 4).eq(0.25).all()
-
-
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        ({"knots": [0, 1, 2], "values_m": [0, 1]}, "3 knots but 2 values_m"),
-        ({"knots": [0, 2, 1], "values_m": [0, 1, 2]}, "the knots must increase"),
-    ],
-)
-def test_broken_table_is_refused(table: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        small(sensor={"delays": {"measured": {"distance": table}}})

@@ -7,20 +7,31 @@ import pytest
 from simulation.small import files_in, small
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.simulator import simulate
 
 
-def test_unknown_effect_is_named_with_its_nearest() -> None:
-    with pytest.raises(ConfigError, match=r"effects\[0\]: there is no effect 'wigglin'"):
-        build_effects([{"name": "wigglin"}])
-    with pytest.raises(ConfigError, match=r"effects\[0\]: 'name' is missing"):
-        build_effects([{"amplitude_mm": 3}])
-
-
-def test_simulation_with_an_unknown_effect_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="there is no effect"):
-        simulate(small(effects=[{"name": "gremlins"}]), tmp_path / "deep/r")
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"effects": [{"name": "wigglin"}]}, r"\[0\]: there is no effect 'wigglin'. Did you mean"),
+        (
+            {"effects": [{"name": "gremlins"}]},
+            r"no effect 'gremlins'. Known effects: ambient_light",
+        ),
+        ({"effects": [{"amplitude_mm": 3}]}, r"effects\[0\]: 'name' is missing"),
+        ({"shots": [{"target": "grey"}]}, r"no target 'grey' \(known: white, checkerboard\)"),
+        (
+            {"robot": {"distance_m": [3.0, 4.0], "farthest_pixel_m": 2.0}},
+            "no pose found where the wall fills the image",
+        ),
+    ],
+    ids=["near miss", "unknown effect", "no name", "target", "pose"],
+)
+def test_what_cannot_be_simulated_leaves_nothing_behind(
+    sections: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        simulate(small(**sections), tmp_path / "deep/r")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -51,8 +62,20 @@ def test_more_frames_than_planned_are_refused(tmp_path: Path) -> None:
             {"sensor": {"delays": {"measured": {"pixel": {"values_m": [[0.0, 0.0], [0.0]]}}}}},
             "all rows must have the same length",
         ),
+        (
+            {"sensor": {"delays": {"measured": {"distance": {"knots": [0, 1], "values_m": [0]}}}}},
+            "2 knots but 1 values_m",
+        ),
+        (
+            {
+                "sensor": {
+                    "delays": {"measured": {"distance": {"knots": [1, 0], "values_m": [0, 1]}}}
+                }
+            },
+            "the knots must increase",
+        ),
     ],
-    ids=["distances", "motion", "normal", "harmonics", "map"],
+    ids=["distances", "motion", "normal", "harmonics", "map", "knots", "order of knots"],
 )
 def test_options_that_contradict_themselves_are_refused(
     sections: dict[str, Any], message: str

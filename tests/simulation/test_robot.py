@@ -6,7 +6,6 @@ import pytest
 import torch
 from simulation.small import expected_frames, planned, small
 
-from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.simulation.options import CameraMountOptions, MountGuessOptions
@@ -128,8 +127,3 @@ def test_speed_is_unknown_across_long_gaps() -> None:
     times = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1], dtype=torch.float64)
     known = ~tool_twists(times, poses).isnan().any(-1)
     assert known.tolist() == [True, True, True, False, False]
-
-
-def test_pose_that_cannot_be_is_said_so() -> None:
-    with pytest.raises(ConfigError, match="no pose found where the wall fills the image"):
-        planned(small(robot={"distance_m": [3.0, 4.0], "farthest_pixel_m": 2.0}))

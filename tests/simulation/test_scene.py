@@ -6,12 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.errors import ConfigError
 from tofcorr.simulation.scene import (
     CheckerboardTarget,
     UniformTarget,
     seen_reflectivity,
-    target_named,
     world_from_plane,
 )
 
@@ -74,8 +72,3 @@ def test_plane_frame_lies_in_the_plane(normal: tuple[float, float, float]) -> No
     rotation = frame[:3, :3]
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64))
     assert torch.linalg.det(rotation).item() == pytest.approx(1.0)
-
-
-def test_unknown_target_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"no target 'grey' \(known: white\)"):
-        target_named({"white": UniformTarget()}, "grey")

@@ -167,16 +167,12 @@ class Eye(nn.Module):
         if image is None:
             return
         refuse_other_than_tensor(name, image)
-        size = list(self.radial_of_depth.shape)
-        if image.dim() < 2 or list(image.shape[-2:]) != size:
+        height, width = self.radial_of_depth.shape
+        if image.shape != depth.shape or list(image.shape[-2:]) != [height, width]:
             raise FrameError(
-                f"{name}: expected shape (..., {size[0]}, {size[1]}), the size of the camera; got "
-                f"{list(image.shape)}. Render with the intrinsics of the sensor."
-            )
-        if image.shape != depth.shape:
-            raise FrameError(
-                f"{name}: expected the shape of true_depth, {list(depth.shape)}; got "
-                f"{list(image.shape)}."
+                f"{name}: expected shape (..., {height}, {width}), the size of the camera, for all "
+                f"images of a scene; got {list(image.shape)}. Render with the intrinsics of the "
+                "sensor."
             )
         if not image.is_floating_point():
             raise FrameError(f"{name}: expected floating point, got {image.dtype}.")
