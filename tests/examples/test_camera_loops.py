@@ -15,16 +15,9 @@ from examples.stand_ins import load_example
 DEPTH_SCALE = 0.00025
 
 
-class _Frame(SimpleNamespace):
-    """A frame of pyrealsense2; one without data is false."""
-
-    data: np.ndarray | None
-
-    def __bool__(self) -> bool:
-        return self.data is not None
-
-    def get_data(self) -> np.ndarray | None:
-        return self.data
+def _frame(data: np.ndarray | None) -> Any:
+    """Return a frame of pyrealsense2; one without data is false."""
+    return None if data is None else SimpleNamespace(get_data=lambda: data)
 
 
 class _Pipeline:
@@ -47,8 +40,8 @@ class _Pipeline:
         depth, infrared = frame(self.count)
         infrared8 = None if self.count == 1 else (infrared // 4).astype(np.uint8)
         return SimpleNamespace(
-            get_depth_frame=lambda: _Frame(data=(depth * 4).astype(np.uint16)),
-            get_infrared_frame=lambda: _Frame(data=infrared8),
+            get_depth_frame=lambda: _frame((depth * 4).astype(np.uint16)),
+            get_infrared_frame=lambda: _frame(infrared8),
         )
 
     def stop(self) -> None:

@@ -20,22 +20,20 @@ from tofcorr.sensor.degrade import degrade
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 
-NOISE = {"floor_m": 0.002, "correlation_px": 0.5}
-EFFECTS = [{"name": "warm_up", "heat_120s": 0.05}, {"name": "pixel", "x1_y0": 0.004}]
+OWN = {
+    "camera": CAMERA.section(),
+    "depth_kind": "z",
+    "modulation_frequency_hz": None,
+    "error": {"coefficients": {"distance": {"c0": 0.02}}},
+    "effects": [{"name": "warm_up", "heat_120s": 0.05}, {"name": "pixel", "x1_y0": 0.004}],
+    "noise": {"floor_m": 0.002, "correlation_px": 0.5},
+    "dropouts": {"base_share": 0.2},
+    "validity": {"radial_distance_m": [0.4, 3.0]},
+}
 
 
 def sensor(**changes: object) -> SensorFile:
-    own = {
-        "camera": CAMERA.section(),
-        "depth_kind": "z",
-        "modulation_frequency_hz": None,
-        "error": {"coefficients": {"distance": {"c0": 0.02}}},
-        "effects": EFFECTS,
-        "noise": NOISE,
-        "dropouts": {"base_share": 0.2},
-        "validity": {"radial_distance_m": [0.4, 3.0]},
-    }
-    return sensor_file(**own | changes)
+    return sensor_file(**OWN | changes)
 
 
 @pytest.fixture
@@ -43,14 +41,9 @@ def ideal(tmp_path: Path) -> Recording:
     generator = np.random.default_rng(3)
     images = small_images(generator)
     del images["raw"]
-    write_recording(
-        tmp_path / "ideal",
-        camera=CAMERA,
-        depth_kind="radial",
-        rows=frame_rows(generator),
-        **images,
-    )
-    return Recording.open(tmp_path / "ideal")
+    rows, folder = frame_rows(generator), tmp_path / "ideal"
+    write_recording(folder, camera=CAMERA, depth_kind="radial", rows=rows, **images)
+    return Recording.open(folder)
 
 
 def test_all_but_the_images_stays_and_the_ideal_depth_is_kept(
@@ -64,12 +57,10 @@ def test_all_but_the_images_stays_and_the_ideal_depth_is_kept(
     assert sum(counted) == ideal.num_frames
     csv = [(each.path / "frames.csv").read_bytes() for each in (ideal, found)]
     assert csv[0] == csv[1]
-    assert found.true_depth is not None
-    np.testing.assert_array_equal(found.true_depth, ideal.depth)
+    np.testing.assert_array_equal(found.require("true_depth", "this test"), ideal.depth)
     there = np.isfinite(ideal.depth) & (ideal.depth > 0)
-    assert ideal.amplitude is not None
-    assert found.amplitude is not None
-    np.testing.assert_array_equal(found.amplitude, np.where(there, ideal.amplitude, 0.0))
+    lit, light = (each.require("amplitude", "this test") for each in (found, ideal))
+    np.testing.assert_array_equal(lit, np.where(there, light, 0.0))
     returned = np.isfinite(found.depth)
     assert not returned[~there].any()
     assert done.valid_share == pytest.approx(returned.sum() / there.sum())
@@ -139,56 +130,45 @@ def test_frames_of_another_hand_eye_transform_are_named(ideal: Recording, tmp_pa
     """Its errors and its hand-eye transform were found together."""
     other = np.array(ideal.tool_from_camera)
     other[0, 3] += 0.02
+    # A quarter turn about the optical axis: no identity, which would say nothing.
+    turned = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    mounted = replace(ideal, tool_from_camera=ideal.tool_from_camera @ turned)
     for number, found in enumerate((other, ideal.tool_from_camera)):
-        rows = {"tool_from_camera": found.tolist(), "depth_kind": "radial"}
-        mounted = replace(ideal, tool_from_camera=ideal.tool_from_camera @ _turned())
-        rows["tool_from_camera"] = (found @ _turned()).tolist()
+        own = sensor(tool_from_camera=(found @ turned).tolist(), depth_kind="radial")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            degrade(sensor(**rows), mounted, tmp_path / str(number))
+            degrade(own, mounted, tmp_path / str(number))
         said = [str(one.message) for one in caught if "tool_from_camera" in str(one.message)]
         assert len(said) == 1 - number
         assert all("20.0 mm and 0.00 degrees" in sentence for sentence in said)
 
 
-def _turned() -> np.ndarray:
-    """A quarter turn about the optical axis: no identity, which would say nothing."""
-    turned = np.eye(4)
-    turned[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
-    return turned
-
-
-def rendered(folder: Path, depth: np.ndarray, amplitude: np.ndarray) -> Recording:
-    """Write frames of a simulator."""
-    generator = np.random.default_rng(4)
-    rows = frame_rows(generator)
+def rendered(folder: Path, depth: float, amplitude: float) -> Recording:
+    """Write even frames of a simulator."""
+    rows = frame_rows(np.random.default_rng(4))
     shape = (len(rows), CAMERA.height, CAMERA.width)
+    depths, lights = (np.full(shape, value, np.float32) for value in (depth, amplitude))
     write_recording(
-        folder,
-        camera=CAMERA,
-        depth_kind="z",
-        rows=rows,
-        depth=np.broadcast_to(depth, shape).astype(np.float32),
-        amplitude=np.broadcast_to(amplitude, shape).astype(np.float32),
+        folder, camera=CAMERA, depth_kind="z", rows=rows, depth=depths, amplitude=lights
     )
     return Recording.open(folder)
 
 
 def test_depth_in_millimetres_is_said(tmp_path: Path) -> None:
     # It was degraded without a word: "100.0 % of the pixels are valid".
-    metres = rendered(tmp_path / "metres", np.array(1.2), np.array(100.0))
+    metres = rendered(tmp_path / "metres", 1.2, 100.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         done = degrade(sensor(effects=[]), metres, tmp_path / "good")
     assert done.covered_share == 1.0
-    millimetres = rendered(tmp_path / "millimetres", np.array(1200.0), np.array(100.0))
+    millimetres = rendered(tmp_path / "millimetres", 1200.0, 100.0)
     with pytest.warns(UserWarning, match=r"0 % .* 0\.4 to 3 m; .* Is the depth in metres\?"):
         done = degrade(sensor(effects=[]), millimetres, tmp_path / "far")
     assert done.covered_share == 0.0
 
 
 def test_a_reflectivity_of_8_bits_is_refused(tmp_path: Path) -> None:
-    ideal = rendered(tmp_path / "ideal", np.array(1.2), np.array(200.0))
+    ideal = rendered(tmp_path / "ideal", 1.2, 200.0)
     with pytest.raises(CalibrationDataError, match=r"a share from 0 to 1, .* got 200; divide"):
         degrade(sensor(), ideal, tmp_path / "out", amplitude_is="reflectivity")
     assert not (tmp_path / "out").exists()
