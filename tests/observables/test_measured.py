@@ -7,24 +7,30 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy_camera import REFERENCE, Camera, record
+from numpy_camera import REFERENCE, Camera, Truth, record
 from scipy.ndimage import gaussian_filter1d
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
 from tofcorr.estimation.noise import NoiseModel, filter_width, neighbour_correlation
 from tofcorr.observables.dropouts import DropoutModel, dropouts_of
-from tofcorr.observables.noise import level_of_repeats, noise_of
+from tofcorr.observables.noise import NoiseMeasurement, level_of_repeats, noise_of
 from tofcorr.observables.read import observe, pose_groups
 
 AMPLITUDES = np.array([300.0, 1000.0, 2000.0])
 
 
+def drawn_and_measured(
+    folder: Path, camera: Camera, seed: int, **how: int
+) -> tuple[Truth, NoiseMeasurement]:
+    truth = record(folder, camera, seed, **how)
+    return truth, noise_of(observe(truth.recording))
+
+
 @pytest.mark.parametrize("repeats", [1, 4])
 def test_noise_curve_follows_the_camera_at_every_amplitude(repeats: int, tmp_path: Path) -> None:
     camera = Camera(times=1.7)
-    recording = record(tmp_path / "wall", camera, 1, repeats=repeats).recording
-    noise = noise_of(observe(recording))
+    _, noise = drawn_and_measured(tmp_path / "wall", camera, 1, repeats=repeats)
     assert noise.source == ("neighbours" if repeats == 1 else "repeats")
     measured = noise.curve.temporal_sigma(np.ones(3), AMPLITUDES)
     # 24 x 1280 pixels in 24 bins: 2 % of each, and the curve's shape.
@@ -33,8 +39,7 @@ def test_noise_curve_follows_the_camera_at_every_amplitude(repeats: int, tmp_pat
 
 def test_noise_at_the_edges_of_squares_is_measured_not_extrapolated(tmp_path: Path) -> None:
     """A third of these pixels, the darker ones, has no second difference: 9 % were lost here."""
-    truth = record(tmp_path / "one", Camera(), 0)
-    found = noise_of(observe(truth.recording))
+    truth, found = drawn_and_measured(tmp_path / "one", Camera(), 0)
     assert found.temporal_m == pytest.approx(truth.noise, rel=0.03)
     assert np.isfinite(found.variance).mean() > 0.99
 
@@ -64,19 +69,18 @@ def test_a_camera_that_mixes_frames_is_known_and_its_single_frame_too(
     repeats: int, poses: int, within: float, tmp_path: Path
 ) -> None:
     """By two poses, too: fewer than three were taken to show none, and noise was too small."""
-    camera = Camera(mixed_frames=0.6)
-    mixing = record(tmp_path / "mixed", camera, 5, repeats=repeats, poses=poses)
-    found = noise_of(observe(mixing.recording))
-    assert found.frame_correlation == pytest.approx(0.6, abs=within)
-    assert found.temporal_m == pytest.approx(mixing.noise, rel=within)
-    fresh = record(tmp_path / "fresh", Camera(), 5, repeats=repeats, poses=poses)
-    assert noise_of(observe(fresh.recording)).frame_correlation == 0.0
+    how = {"repeats": repeats, "poses": poses}
+    truth, mixing = drawn_and_measured(tmp_path / "mixed", Camera(mixed_frames=0.6), 5, **how)
+    assert mixing.frame_correlation == pytest.approx(0.6, abs=within)
+    assert mixing.temporal_m == pytest.approx(truth.noise, rel=within)
+    _, fresh = drawn_and_measured(tmp_path / "fresh", Camera(), 5, **how)
+    assert fresh.frame_correlation == 0.0
 
 
 @pytest.mark.parametrize("repeats", [1, 4])
 def test_filtered_noise_and_fixed_pattern_are_told_apart(repeats: int, tmp_path: Path) -> None:
     camera = Camera(filter_px=0.8, pattern=1e-3)
-    noise = noise_of(observe(record(tmp_path / "wall", camera, 2, repeats=repeats).recording))
+    _, noise = drawn_and_measured(tmp_path / "wall", camera, 2, repeats=repeats)
     assert noise.pattern_m == pytest.approx(1e-3, rel=0.1)
     assert noise.curve.correlation_px == pytest.approx(0.8, abs=0.08)
     measured = noise.curve.temporal_sigma(np.ones(3), AMPLITUDES)
@@ -86,8 +90,7 @@ def test_filtered_noise_and_fixed_pattern_are_told_apart(repeats: int, tmp_path:
 @pytest.mark.parametrize("seed", [3, 4])
 def test_a_pattern_without_noise_is_all_of_the_noise(seed: int, tmp_path: Path) -> None:
     """Less the pattern, neighbours leave a little more than nothing, or less (3): it stopped."""
-    truth = record(tmp_path / "still", Camera(times=0.0, pattern=4e-3), seed)
-    noise = noise_of(observe(truth.recording))
+    _, noise = drawn_and_measured(tmp_path / "still", Camera(times=0.0, pattern=4e-3), seed)
     assert noise.temporal_m < 1e-6
     whole = noise.curve.sigma(np.ones(3), AMPLITUDES)
     np.testing.assert_allclose(whole, noise.pattern_m, rtol=1e-3)
@@ -156,8 +159,8 @@ def test_the_amplitude_of_a_missing_pixel_that_states_none_follows_from_its_neig
     drawn = record(tmp_path / "drawn", Camera(threshold=400.0), 4).recording
     # On a wall of one reflectivity the light falls off with distance and angle alone.
     white = np.flatnonzero(drawn.frames.target == "white")
-    rows, depth, amplitude = drawn.frames.rows(), drawn.depth[white], drawn.amplitude
-    assert amplitude is not None
+    rows, depth = drawn.frames.rows(), drawn.depth[white]
+    amplitude = drawn.require("amplitude", "this test")
     stated = np.where(np.isnan(depth), 0.0, amplitude[white]).astype(np.float32)
     write_recording(
         tmp_path / "stated",
