@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -109,17 +110,14 @@ def observe(recording: Recording) -> Observed:
     whole, *patterns = (_BetweenPoses(shape) for _ in range(1 + len(AXES) * (1 + len(LAGS))))
     shared = {key: patterns.pop(0) for key in product(AXES, (0, *LAGS))}
     maps = np.zeros((2, *shape))
-    tables, temporal, within, repeated, between, counts = ([] for _ in range(6))
+    tables, sums, repeated, between, counts = ([] for _ in range(5))
     for number, images in enumerate(_iterate_poses(recording)):
-        residual, weight = _clipped(images.residual, images.amplitude)
-        whole.add(known_mean(residual), weight, images.place)
-        second = {axis: second_differences(residual, images.amplitude, axis) for axis in AXES}
-        sums = _of_neighbours(images, residual, weight, second, shared)
-        temporal.append(sums[0])
-        within.append(sums[1])
+        residual = images.residual
+        whole.add(known_mean(residual), images.weight, images.place)
+        sums.append(_of_neighbours(images, shared))
         repeated.append(_repeated_variance(residual))
         between.append(_frame_differences(residual))
-        tables.append(_rows(images, residual, second, (number, names.index(images.target)), shape))
+        tables.append(_rows(images, number, names.index(images.target), shape))
         maps[:, *images.place] += images.missing.sum(0), images.on_target.sum(0)
         counts.append([len(residual), images.missing.any(), images.saturated.sum()])
     table = np.concatenate(tables).view(np.recarray)
@@ -128,12 +126,13 @@ def observe(recording: Recording) -> Observed:
             f"{recording.path}: no image has 100 usable pixels on the target, as noise needs."
         )
     repeats, losing, saturated = np.array(counts).T
+    temporal, within = np.stack(sums, axis=1)
     return Observed(
         recording=recording,
         table=table,
         repeats=repeats,
-        temporal=np.array(temporal),
-        within=np.array(within),
+        temporal=temporal,
+        within=within,
         pattern=whole.variance(),
         shared=np.reshape([each.variance() for each in shared.values()], (len(AXES), -1)),
         between_frames=between,
@@ -151,7 +150,8 @@ class _PoseImages:
 
     Attributes:
         residual: Measured distance less the smooth surface of the mean image, and less the offset
-            of the frame, shape (R, h, w), metres; NaN where not usable.
+            of the frame, without gross outliers, shape (R, h, w), metres; NaN where not usable.
+        weight: Of the pixels, by the noise of their brightness, shape (h, w), 1/m^2.
         amplitude: Counts, shape (R, h, w), as recorded; None if not recorded.
         on_target: Where the pixels look at the target, shape (R, h, w), bool.
         missing: Pixels on the target without a distance, shape (R, h, w), bool.
@@ -163,6 +163,7 @@ class _PoseImages:
     """
 
     residual: np.ndarray
+    weight: np.ndarray
     amplitude: np.ndarray | None
     on_target: np.ndarray
     missing: np.ndarray
@@ -171,6 +172,11 @@ class _PoseImages:
     cosine: np.ndarray
     target: str
     place: tuple[slice, slice]
+
+    @cached_property
+    def second(self) -> dict[int, np.ndarray]:
+        """Second differences by axis, as of `second_differences`."""
+        return {axis: second_differences(self.residual, self.amplitude, axis) for axis in AXES}
 
 
 def _iterate_poses(recording: Recording) -> Iterator[_PoseImages]:
@@ -204,8 +210,10 @@ def _iterate_poses(recording: Recording) -> Iterator[_PoseImages]:
             known = [one[np.isfinite(one)] for one in around]
             offsets = [np.median(one) if len(one) else 0.0 for one in known]
             around = around - np.array(offsets)[:, None, None]
+        residual, weight = _clipped(around + of_mean, amplitude)
         yield _PoseImages(
-            residual=around + of_mean,
+            residual=residual,
+            weight=weight,
             amplitude=amplitude,
             on_target=on_target,
             missing=on_target & ~(np.isfinite(distance) & (np.nan_to_num(distance) > 0)),
@@ -413,13 +421,7 @@ def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: i
     return found
 
 
-def _of_neighbours(
-    images: _PoseImages,
-    residual: np.ndarray,
-    weight: np.ndarray,
-    second: dict[int, np.ndarray],
-    shared: dict[tuple[int, int], _BetweenPoses],
-) -> np.ndarray:
+def _of_neighbours(images: _PoseImages, shared: dict[tuple[int, int], _BetweenPoses]) -> np.ndarray:
     """Sum over neighbours along each axis, at each lag, what `Observed` says.
 
     Returns:
@@ -427,6 +429,7 @@ def _of_neighbours(
         differences in one image, where there is a second difference too; shape (2, 3, 2, 2). What
         poses share of both kinds of differences is added to `shared`.
     """
+    residual, weight, second = images.residual, images.weight, images.second
     sums = np.zeros((2, 3, len(AXES), len(LAGS)))
     deviation = residual - known_mean(residual)
     for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
@@ -449,17 +452,11 @@ def _of_neighbours(
     return sums
 
 
-def _rows(
-    images: _PoseImages,
-    residual: np.ndarray,
-    second: dict[int, np.ndarray],
-    numbers: tuple[int, int],
-    shape: tuple[int, int],
-) -> np.recarray:
+def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -> np.recarray:
     """Return the rows of the sampled pixels of a pose that look at the target.
 
     The sample is the same in every image, so that two recordings can be compared pixel by pixel.
-    `numbers` are those of pose and target, `shape` is that of the image.
+    `shape` is that of the image.
     """
     seen = np.zeros(shape, dtype=bool)
     seen[images.place] = images.on_target.any(0)
@@ -470,7 +467,7 @@ def _rows(
         each - side.start for each, side in zip(divmod(pixel, shape[1]), images.place, strict=True)
     )
     chosen = (slice(None), *at)
-    values, on_target = residual[chosen], images.on_target[chosen]
+    values, on_target = images.residual[chosen], images.on_target[chosen]
     known = np.isfinite(values)
     amplitude = raw = np.full(len(pixel), np.nan)
     if images.amplitude is not None:
@@ -480,17 +477,19 @@ def _rows(
     squares = np.nansum((values - known_mean(values)) ** 2, axis=0)
     distance, cosine = images.distance[at], images.cosine[at]
     columns = {
-        "pose": np.full(len(pixel), numbers[0]),
+        "pose": np.full(len(pixel), pose),
         "pixel": pixel,
         "distance": distance,
         "cosine": cosine,
         "signal": cosine / distance**2,
-        "target": np.full(len(pixel), numbers[1]),
+        "target": np.full(len(pixel), target),
         "amplitude": amplitude,
         "raw_amplitude": raw,
         "of_repeats": quotient(squares, known.sum(0) - 1),
-        "of_neighbours": known_mean(np.stack([known_mean(second[k] ** 2)[at] for k in AXES])),
-        "of_nearest": _of_nearest(residual, images.amplitude)[at],
+        "of_neighbours": known_mean(
+            np.stack([known_mean(images.second[k] ** 2)[at] for k in AXES])
+        ),
+        "of_nearest": _of_nearest(images.residual, images.amplitude)[at],
         "frames": on_target.sum(0),
         "missing": images.missing[chosen].sum(0),
         "saturated": images.saturated[chosen].sum(0),
