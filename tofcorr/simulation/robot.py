@@ -165,10 +165,7 @@ def _draw_timestamps(
 
 
 def _draw_conditions(
-    options: ConditionOptions,
-    timestamps: list[float],
-    stops: list[int],
-    generator: torch.Generator,
+    options: ConditionOptions, timestamps: list[float], stops: list[int], generator: torch.Generator
 ) -> dict[str, Tensor]:
     """Return the conditions of the frames, each (F,); frames of a pose share exposure and light."""
     num_poses = max(stops) + 1

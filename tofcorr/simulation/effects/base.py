@@ -9,7 +9,6 @@ metres, and `columns`, the derivative of `shift` at zero: the effect's columns i
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -208,10 +207,6 @@ class FrameEffect(CatalogueEffect):
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the shift of each pixel's frame, shape (M,), metres."""
         return inputs.of_frame(self.shifts(inputs.facts, coefficients))
-
-    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the derivative of `shift`, shape (M, K): frames are differentiated."""
-        return inputs.of_frame(by_parameters(partial(self.shifts, inputs.facts), coefficients))
 
     def on_delay(self, state: FrameState) -> None:
         """Delay the frame, given those before it."""

@@ -4,13 +4,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import moved_rays
-from tofcorr.simulation.effects.base import (
-    CatalogueEffect,
-    Coefficient,
-    distance_to,
-    plane_in_camera,
-)
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, plane_in_camera
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.hooks import FrameState
 
@@ -31,17 +25,13 @@ class LensEffect(CatalogueEffect):
     source = "Brown 1971, close-range camera calibration"
     remedy = "strong tilts in four directions at several distances; calibrate the lens again"
     fixed_terms = (
-        Coefficient("focal_x", "1", 0.02),
-        Coefficient("focal_y", "1", 0.02),
-        Coefficient("centre_x_px", "px", 3.0),
-        Coefficient("centre_y_px", "px", 3.0),
+        *(Coefficient(f"focal_{axis}", "1", 0.02) for axis in "xy"),
+        *(Coefficient(f"centre_{axis}_px", "px", 3.0) for axis in "xy"),
         Coefficient("radial_2", "1", 0.05),
         Coefficient("radial_4", "1", 0.1),
-        Coefficient("tangential_x", "1", 0.01),
-        Coefficient("tangential_y", "1", 0.01),
+        *(Coefficient(f"tangential_{axis}", "1", 0.01) for axis in "xy"),
         Coefficient("skew", "1", 0.01),
-        Coefficient("prism_x", "1", 0.01),
-        Coefficient("prism_y", "1", 0.01),
+        *(Coefficient(f"prism_{axis}", "1", 0.01) for axis in "xy"),
     )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
@@ -49,22 +39,12 @@ class LensEffect(CatalogueEffect):
 
         n . (d v) = n . (d' v') for the unit rays v and v' and the normal n.
         """
-        normal, distance = _surfaces(inputs)
+        normal = inputs.normals_camera
+        if normal is None:
+            normal = plane_in_camera(inputs, inputs.facts)[0][inputs.frame]
         rays = true_rays(inputs.rays, coefficients, _focal(inputs.camera))
         facing = (inputs.rays * normal).sum(-1) / (rays * normal).sum(-1)
-        return distance * (facing - 1)
-
-    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the derivative of `shift`, shape (M, K), metres: rays that move, at the true."""
-        normal, distance = _surfaces(inputs)
-        rays, focal = inputs.rays, _focal(inputs.camera)
-        moves = _changes(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2], focal)
-        rays = true_rays(rays, coefficients, focal)
-        true = -(distance + self.shift(inputs, coefficients)) / (rays * normal).sum(-1)
-        moved = [
-            moved_rays(rays, normal, true, move, "radial") for move in zip(*moves, strict=True)
-        ]
-        return torch.stack(moved, dim=-1)
+        return inputs.radial_distance * (facing - 1)
 
     def on_pose(self, state: FrameState) -> None:
         """Bend the rays."""
@@ -89,14 +69,6 @@ def true_rays(rays: Tensor, coefficients: Tensor, focal: float) -> Tensor:
 
 def _focal(camera: CameraIntrinsics) -> float:
     return (camera.matrix[0][0] + camera.matrix[1][1]) / 2
-
-
-def _surfaces(inputs: EffectInputs) -> tuple[Tensor, Tensor]:
-    """Return the normals (M, 3) that the rays meet, in the camera frame, and distances (M,)."""
-    if inputs.normals_camera is not None:
-        return inputs.normals_camera, inputs.radial_distance
-    normal, _ = plane_in_camera(inputs, inputs.facts)
-    return normal[inputs.frame], distance_to(inputs, inputs.facts)
 
 
 def _changes(x: Tensor, y: Tensor, focal: float) -> tuple[list[Tensor], list[Tensor]]:

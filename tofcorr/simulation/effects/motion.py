@@ -36,12 +36,7 @@ class MotionEffect(CatalogueEffect):
     needs = (VELOCITY, FREQUENCY)
     fixed_terms = tuple(  # Time between samples, of the first, and half of a read-out.
         Coefficient(name, "s", 0.1)
-        for name in (
-            "sample_interval_s",
-            "first_sample_s",
-            "half_of_rows_s",
-            "half_of_columns_s",
-        )
+        for name in ("sample_interval_s", "first_sample_s", "half_of_rows_s", "half_of_columns_s")
     )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:

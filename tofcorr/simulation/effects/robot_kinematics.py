@@ -10,6 +10,7 @@ from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
 from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs
+from tofcorr.simulation.effects.numerics import small_motion
 from tofcorr.simulation.hooks import FrameFacts
 
 # A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:
@@ -73,7 +74,8 @@ class RobotKinematicsEffect(GeometryEffect):
         shift = away @ c[:9].reshape(3, 3).T + away.square().sum(1, keepdim=True) * c[9:12]
         shift = shift + torch.linalg.cross(base, position) + c[28] * position
         turn = away @ c[12:21].reshape(3, 3).T + base + _bracket_turn(rotation, c[29:32])
-        true = se3.assemble(small_rotation(turn) @ rotation, position + shift)
+        turned = small_motion(torch.cat([torch.zeros_like(turn), turn], dim=1))[:, :3, :3]
+        true = se3.assemble(turned @ rotation, position + shift)
         return replace(facts, world_from_tool=true)
 
 
@@ -95,12 +97,6 @@ def _bracket_turn(rotation: Tensor, c: Tensor) -> Tensor:
     down = -rotation[:, 2, :]  # In the frame of the tool.
     turn = torch.linalg.cross(c.expand_as(down), down)
     return (rotation @ turn[:, :, None])[:, :, 0]
-
-
-def small_rotation(turn: Tensor) -> Tensor:
-    """Return exp of small rotation vectors (F, 3) to second order, exact to 1e-7 at 10 mrad."""
-    skew = (turn[:, :, None, None] * se3.GENERATORS[3:, :3, :3].to(turn)).sum(1)
-    return torch.eye(3).to(turn) + skew + skew @ skew / 2
 
 
 class BacklashEffect(GeometryEffect):

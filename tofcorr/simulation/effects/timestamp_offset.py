@@ -3,13 +3,12 @@
 from dataclasses import replace
 from typing import ClassVar, Self
 
-import torch
 from torch import Tensor
 
-from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
 from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs, known
+from tofcorr.simulation.effects.numerics import small_motion
 from tofcorr.simulation.hooks import FrameFacts
 
 
@@ -74,11 +73,5 @@ class TimestampOffsetEffect(GeometryEffect):
         late = c[0] + c[1] * (facts.timestamp - shape.middle_s) / shape.half_s
         if shape.knows_exposure:
             late = late + c[2] * known(facts, "integration_time")
-        later = facts.world_from_tool @ _small_motion(twist * late[:, None])
+        later = facts.world_from_tool @ small_motion(twist * late[:, None])
         return replace(facts, world_from_tool=later)
-
-
-def _small_motion(twist: Tensor) -> Tensor:
-    """Return exp of twists (F, 6) to second order, exact to 1e-6 m at 10 cm, shape (F, 4, 4)."""
-    matrix = (twist[:, :, None, None] * se3.GENERATORS.to(twist)).sum(1)
-    return torch.eye(4).to(twist) + matrix + matrix @ matrix / 2
