@@ -290,8 +290,7 @@ def _size(
         return known
     if depth > _DEEPEST:
         raise ConfigError(
-            f"{where}: lists and mappings are nested more than {_DEEPEST} levels deep in line "
-            f"{line}."
+            f"{where}: lists and mappings nested more than {_DEEPEST} levels deep in line {line}."
         )
     size, keys, sizes[event.anchor] = 1, set[str](), None
     for number, child in enumerate(further if isinstance(event, yaml.CollectionStartEvent) else ()):
@@ -310,8 +309,7 @@ def _size(
         size += _size(child, further, sizes, where, depth + 1)
         if size > _MOST_NODES:
             raise ConfigError(
-                f"{where}: more than {_MOST_NODES} values once its aliases are written out; "
-                "the limit keeps a small file from filling the memory."
+                f"{where}: more than {_MOST_NODES} values once its aliases are written out."
             )
     sizes[event.anchor] = size
     return size
@@ -395,8 +393,7 @@ def apply_changes(
         names = key.split(".")
         if not equals or not all(names):
             raise ConfigError(
-                f"'{one_line(change)}': expected KEY=VALUE with a dotted key, "
-                "such as solver.max_iterations=30."
+                f"'{one_line(change)}': expected KEY=VALUE, such as solver.max_iterations=30."
             )
         value = parse_yaml(text, f"'{one_line(change)}'")
         values = _replaced(values, defaults, names, 0, value)

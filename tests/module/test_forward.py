@@ -200,7 +200,7 @@ def test_a_cropped_frame_and_an_unknown_condition_are_refused() -> None:
         module(torch.ones(5, 7).numpy())  # pyright: ignore[reportArgumentType]
     with pytest.raises(ConfigError, match=r"camera: expected a tofcorr.CameraIntrinsics, got str"):
         DepthCorrection("wall")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(FrameError, match="expected the shape of depth"):
+    with pytest.raises(FrameError, match="expected depth's shape"):
         module(torch.ones(5, 7), torch.ones(1, 5, 7))
     with pytest.raises(FrameError, match="'exposure' is no condition"):
         module(torch.ones(5, 7), exposure=1.0)

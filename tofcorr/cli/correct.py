@@ -138,8 +138,7 @@ def export_command(run: Path, name: str, out: Path, device: str) -> None:
     if device != "cpu" and not (FORMATS[name].for_device and torch.cuda.is_available()):
         compiled = " and ".join(one.name for one in FORMATS.values() if one.for_device)
         raise ConfigError(
-            f"--device {device}: only {compiled} is compiled for a device, and only for a GPU that "
-            "this machine has; the other formats run on any."
+            f"--device {device}: only {compiled} is for one device, and this machine must have it."
         )
     _refuse_useless(run)
     state = load_calibration(run / STATE_FILE)
@@ -157,6 +156,5 @@ def _refuse_useless(run: Path) -> None:
     report = json.loads(file.read_text(encoding="utf-8"))
     if report["verdict"] == DO_NOT_USE:
         raise CalibrationDataError(
-            f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']} Train with --force to "
-            "export it all the same."
+            f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']} Train with --force, if so."
         )

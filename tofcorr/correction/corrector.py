@@ -512,14 +512,12 @@ def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> N
     """
     if depth.dim() not in (2, 3) or list(depth.shape[-2:]) != [height, width]:
         raise ValueError(
-            f"depth: expected shape ({height}, {width}) or (B, {height}, {width}), the size of the "
-            f"calibrated camera; got {list(depth.shape)}. Was the frame cropped, binned or "
-            "transposed?"
+            f"depth: expected shape ({height}, {width}) of the camera, or a batch of it; got "
+            f"{list(depth.shape)}. Was the frame cropped, binned or transposed?"
         )
     if list(amplitude.shape) != list(depth.shape):
         raise ValueError(
-            f"amplitude: expected the shape of depth, {list(depth.shape)}; "
-            f"got {list(amplitude.shape)}."
+            f"amplitude: expected depth's shape {list(depth.shape)}, got {list(amplitude.shape)}."
         )
     if depth.dtype != torch.float32 or amplitude.dtype != torch.float32:
         raise ValueError(

@@ -55,8 +55,7 @@ class LookupTable:
         """
         if depth.shape[-2:] != self.offset.shape or amplitude.shape != depth.shape:
             raise ValueError(
-                f"depth and amplitude: expected the camera's {self.offset.shape}, or a batch of "
-                f"them; got {depth.shape} and {amplitude.shape}."
+                f"expected the camera's {self.offset.shape}; got {depth.shape}, {amplitude.shape}."
             )
         validity = self.metadata["validity"]
         depth = np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
@@ -127,8 +126,7 @@ def _refuse_other_arrays(
     )
     if not fits:
         raise CalibrationDataError(
-            f"{path}: is damaged: its arrays do not fit each other and the metadata, or hold "
-            f"numbers that are not finite; shapes {shapes}."
+            f"{path}: is damaged: its arrays do not fit each other, or are not finite: {shapes}."
         )
     if metadata.lut.sha256 not in (None, digest_of(arrays)):
         raise CalibrationDataError(f"{path}: its arrays were changed after they were written.")

@@ -155,8 +155,7 @@ def refuse_other_than_tensor(name: str, frame: object) -> None:
     """
     if not isinstance(frame, Tensor):
         raise FrameError(
-            f"{name}: expected a torch tensor, got {type(frame).__name__}. Make one with "
-            "torch.tensor(array), or torch.full(shape, number)."
+            f"{name}: expected a torch tensor, got {type(frame).__name__}: use torch.as_tensor."
         )
 
 
@@ -224,8 +223,7 @@ class CameraGeometry(nn.Module):
             )
         if amplitude is not None and amplitude.shape != depth.shape:
             raise FrameError(
-                f"amplitude: expected the shape of depth, {list(depth.shape)}; got "
-                f"{list(amplitude.shape)}."
+                f"amplitude: expected depth's shape {[*depth.shape]}, got {[*amplitude.shape]}."
             )
 
 
@@ -464,7 +462,6 @@ def required_amplitude(amplitude: Tensor | None) -> Tensor:
     """
     if amplitude is None:
         raise FrameError(
-            "amplitude: the model has a term of the amplitude and got no amplitudes; pass them, or "
-            "choose terms without amplitude."
+            "amplitude: the model has a term of the amplitude; pass it, or choose other terms."
         )
     return amplitude

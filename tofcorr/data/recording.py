@@ -259,10 +259,11 @@ class Recording:
     def _check_images(self, *, contents: bool) -> None:
         present = [name for name in IMAGE_ARRAYS if getattr(self, name) is not None]
         for name in present:
-            if len(getattr(self, name)) != self.num_frames:
+            count = len(getattr(self, name))
+            if count != self.num_frames:
+                file = self.path / f"{name}.npy"
                 raise CalibrationDataError(
-                    f"{self.path / name}.npy: has {len(getattr(self, name))} frames; "
-                    f"frames.csv has {self.num_frames} rows."
+                    f"{file}: has {count} frames; frames.csv has {self.num_frames} rows."
                 )
         for name in present if contents else ():
             for indices in frame_chunks(self.num_frames, getattr(self, name)[:1].nbytes):

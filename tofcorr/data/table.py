@@ -231,8 +231,7 @@ def _check_unit_length(vectors: np.ndarray, name: str, path: Path) -> np.ndarray
         length = np.sqrt((vectors**2).sum(axis=1))
     for frame in np.flatnonzero(~(np.abs(length - 1) <= UNIT_LENGTH_TOLERANCE))[:1]:
         raise CalibrationDataError(
-            f"{path}: frame {frame}: the {name} has length {length[frame]:.6g}; "
-            "expected 1 to within 0.001."
+            f"{path}: frame {frame}: the {name} has length {length[frame]:.6g}, not 1 to 0.001."
         )
     return length
 

@@ -140,8 +140,7 @@ class RecordingWriter:
         """
         if (row is None) != (self._rows_from is not None):
             raise CalibrationDataError(
-                f"{self.path}: frame {self._num_frames}: a row is needed for each frame, "
-                "unless the rows are another recording's."
+                f"{self._here()}: expected a row of each frame, or of none after `like`."
             )
         if row is not None:
             self._check_pose(row)
@@ -182,15 +181,16 @@ class RecordingWriter:
             with writing_to(self.path):
                 self._finish()
 
+    def _here(self) -> str:
+        return f"{self.path}: frame {self._num_frames}"
+
     def _check_pose(self, row: FrameRow) -> None:
         """Refuse a pose that has no quaternion; the reader checks everything else."""
         try:
             pose = np.asarray(row.world_from_tool, dtype=np.float64)
             refuse_unless_rigid(pose, UNIT_LENGTH_TOLERANCE)
         except ValueError as error:
-            raise CalibrationDataError(
-                f"{self.path}: frame {self._num_frames}, world_from_tool: {error}."
-            ) from None
+            raise CalibrationDataError(f"{self._here()}, world_from_tool: {error}.") from None
 
     def _write_images(self, images: Mapping[str, np.ndarray]) -> None:
         if self._num_frames == 0:
@@ -204,13 +204,11 @@ class RecordingWriter:
         if images.keys() != self._streams.keys():
             differing = ", ".join(sorted(images.keys() ^ self._streams.keys()))
             raise CalibrationDataError(
-                f"{self.path}: frame {self._num_frames}: {differing} must be given "
-                "for all frames or for none."
+                f"{self._here()}: {differing} must be given for all frames or for none."
             )
         frames = {}
         for name, image in images.items():
-            where = f"{self.path}: frame {self._num_frames}, {name}"
-            frames[name] = self._streams[name].convert(image, where)
+            frames[name] = self._streams[name].convert(image, f"{self._here()}, {name}")
             if name in IMAGE_ARRAYS:
                 IMAGE_ARRAYS[name].check(frames[name][None], [self._num_frames], self.path)
         for name, frame in frames.items():

@@ -126,8 +126,7 @@ class Domain:
         """
         if self.amplitude is None or self.normalised_amplitude is None:
             raise CalibrationDataError(
-                "The intensity term needs amplitude.npy, which the recording does not have: "
-                "record amplitudes, or choose a model without an amplitude term."
+                "The intensity term needs amplitude.npy: record amplitudes, or choose other terms."
             )
         return max(self.amplitude.high * LOG_FLOOR, 1e-30)
 
@@ -279,9 +278,8 @@ class DescribedModule(nn.Module):
             expected, found = own.get(key), stored.get(key)
             if found != json.loads(json.dumps(expected)):
                 raise StateError(
-                    f"{type(self).__name__}: the state is of another model: its '{key}' is "
-                    f"{found}, this module's is {expected}. Build the module as the saved one was "
-                    "built."
+                    f"{type(self).__name__}: the state is of another model: its '{key}' is {found}"
+                    f", not {expected}. Build the module as the saved one was built."
                 )
 
     def register_interval(self, prefix: str, interval: Interval) -> None:
@@ -503,8 +501,7 @@ class ConditionTerm(Term):
         self.index: int = CONDITIONS.index(condition)
         if condition not in domain.conditions:
             raise CalibrationDataError(
-                f"The model has a term of the {condition.replace('_', ' ')}, which is not known of "
-                "every frame: add the column to frames.csv, or choose a model without that term."
+                f"A term needs every frame's {condition.replace('_', ' ')}: add it to frames.csv."
             )
         for name, number in zip(("low", "high", "mean"), domain.conditions[condition], strict=True):
             self.register_number(name, number)

@@ -205,8 +205,7 @@ class Periodic(SignalTerm):
     def __init__(self, options: PeriodicOptions, domain: Domain) -> None:
         if domain.modulation_frequency is None:
             raise CalibrationDataError(
-                "The periodic term needs modulation_frequency_hz, which the recording does not "
-                "state: add it to recording.yaml, or choose a spline."
+                "periodic needs modulation_frequency_hz: add it to recording.yaml, or use a spline."
             )
         orders = [options.fundamental * k for k in range(1, options.harmonics + 1)]
         names = [f"{function}{order}" for order in orders for function in ("sin", "cos")]

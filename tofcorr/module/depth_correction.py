@@ -276,8 +276,7 @@ class DepthCorrection(FrameCorrection):
             is_scripted = any("/code/" in name for name in archive.namelist())
         if is_scripted:
             raise CalibrationDataError(
-                f"{path}: is a corrector in TorchScript, which holds no parameters to fit: use it "
-                "by torch.jit.load, or load the run folder that it was written in."
+                f"{path}: holds nothing to fit: use torch.jit.load, or load the run folder."
             )
         values = read_values(path, FORMAT)
         if values is None:

@@ -99,7 +99,7 @@ def test_what_pt2_compiles_corrects_as_the_corrector(name: str, depth_kind: Any)
 REFUSED: dict[str, tuple[Callable[[Tensor, Tensor], Frames], str]] = {
     "cropped": (lambda d, a: (d[:, :4], a[:, :4]), r"expected shape \(5, 7\)"),
     "one row": (lambda d, a: (d[0, 0], a[0, 0]), r"expected shape \(5, 7\)"),
-    "other amplitude": (lambda d, a: (d, a[0]), "expected the shape of depth"),
+    "other amplitude": (lambda d, a: (d, a[0]), "expected depth's shape"),
     "float64": (lambda d, a: (d.double(), a), "expected float32, got float64 and float32"),
     "uint16": (lambda d, a: ((1e3 * d).to(torch.uint16), a), "expected float32, got uint16 and"),
 }

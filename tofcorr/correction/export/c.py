@@ -40,8 +40,7 @@ def export_c(corrector: DepthCorrector, path: Path | str, reference: Calibration
     name = c_name(path.stem)
     if path.suffix != ".c" or name != path.stem:
         raise ConfigError(
-            f"{path}: expected a name such as {name}.c, of letters, digits and underscores: the "
-            "functions in C are called as the file."
+            f"{path}: expected a name such as {name}.c, of letters, digits and underscores."
         )
     compiler = c_compiler()
     sources = c_sources(reference, corrector.metadata(), name)
@@ -65,8 +64,7 @@ def c_compiler() -> str:
     found = next(filter(None, map(shutil.which, (*given[:1], "cc", "gcc", "clang"))), None)
     if found is None:
         raise ConfigError(
-            "The c export is compiled and compared with the model, and no C compiler was found: "
-            "install gcc or clang."
+            "The c export is compiled, and no C compiler was found: install gcc or clang."
         )
     return found
 

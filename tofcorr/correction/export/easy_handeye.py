@@ -36,8 +36,7 @@ def export_easy_handeye(
     path = Path(path)
     if path.suffix not in (".yaml", ".calib"):
         raise ConfigError(
-            f"{path}: easy_handeye loads files that end in .yaml, easy_handeye2 files that end in "
-            ".calib; choose one of the two endings."
+            f"{path}: expected .yaml, which easy_handeye loads, or .calib, for easy_handeye2."
         )
     mount = Mount(reference, "easy_handeye")
     frames, still = mount.frames, mount.frames.eye_to_hand

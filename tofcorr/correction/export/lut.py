@@ -39,8 +39,7 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
     """
     if reference.residual is not None:
         raise ConfigError(
-            f"The model {reference.name} has a residual network, a function of distance, "
-            "amplitude, row and column at once: a look-up table cannot hold it. Export "
+            f"A look-up table cannot hold the residual network of {reference.name}: export "
             "torchscript, pt2 or onnx instead."
         )
     metadata = json.loads(corrector.metadata())

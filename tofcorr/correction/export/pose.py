@@ -115,8 +115,7 @@ def write_pose(
         apart = float(np.abs(found - mount.transform).max())
         if not apart < _TOLERANCE:
             raise ExportError(
-                f"{path}: the transform that was written differs from the calibration by "
-                f"{apart:.1e}; nothing was written."
+                f"{path}: would state a transform that is off by {apart:.1e}; nothing was written."
             )
 
 

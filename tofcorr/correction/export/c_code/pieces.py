@@ -49,8 +49,7 @@ def pieces_of(term: SignalTerm, limits: Domain, most_pieces: int = 4096) -> Piec
             return found
     name = term.options.kind
     raise ConfigError(
-        f"The term {name} changes too quickly over distance or amplitude for the c export, which "
-        "holds a term as cubic pieces: export torchscript, pt2 or onnx instead."
+        f"The term {name} changes too quickly for the c export: export torchscript, pt2 or onnx."
     )
 
 
