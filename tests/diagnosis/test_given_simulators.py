@@ -230,7 +230,7 @@ def test_an_error_names_the_function_and_no_scratch_folder(observations: Observa
     with pytest.raises(CalibrationDataError) as refusal:
         simulator.simulate(observations, OPTIONS)
     assert str(refusal.value).startswith(
-        "the frames that the function returned: frame 0, amplitude"
+        "the frames that the function returned/amplitude.npy: frame 0, row 0"
     )
     with pytest.raises(CalibrationDataError, match=r"Use tensor\.detach\(\)"):
         PythonSimulator(lambda _: torch.ones(shape, requires_grad=True)).simulate(

@@ -76,10 +76,10 @@ def test_conditions_agree_with_the_runtime_frame_by_frame(kind: str) -> None:
     assert not valid[1].any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("leading", [(), (1,), (2, 3)], ids=str)
-def test_leading_dimensions_do_not_change_a_frame(kind: str, leading: tuple[int, ...]) -> None:
-    module = module_of(kind)
+def test_leading_dimensions_do_not_change_a_frame(
+    module: DepthCorrection, leading: tuple[int, ...]
+) -> None:
     depth, amplitude = frames(leading)
     given = conditions(leading)
     found = module(depth, amplitude, **given)
@@ -128,9 +128,7 @@ def test_frames_are_never_written_into() -> None:
     assert all(torch.equal(module.state_dict()[name], value) for name, value in state.items())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_missing_return_gives_nan_and_is_not_valid(kind: str) -> None:
-    module = module_of(kind)
+def test_a_missing_return_gives_nan_and_is_not_valid(module: DepthCorrection) -> None:
     depth, amplitude = frames()
     found = module(with_missing(depth), amplitude)
     expected = module(depth, amplitude)

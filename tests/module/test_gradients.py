@@ -49,9 +49,7 @@ class _Points(torch.nn.Module):
         return self.module.points_tool(depth, amplitude, **given)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_parameter_receives_a_gradient(kind: str) -> None:
-    module = module_of(kind)
+def test_every_parameter_receives_a_gradient(module: DepthCorrection) -> None:
     # Every function of a spline needs a pixel somewhere on its pieces.
     u = torch.rand(2, 60, 5, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     depth, amplitude = 0.5 + 2.5 * u[0], 10.0 + 890.0 * u[1]
@@ -61,9 +59,7 @@ def test_every_parameter_receives_a_gradient(kind: str) -> None:
         assert bool((parameter.grad != 0).all()), name
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_missing_returns_have_no_gradient_and_spoil_no_other(kind: str) -> None:
-    module = module_of(kind)
+def test_missing_returns_have_no_gradient_and_spoil_no_other(module: DepthCorrection) -> None:
     depth, amplitude = frames()
     weights = torch.linspace(0.5, 1.5, 35).reshape(5, 7).clone()
     weights[0, :5] = 0.0
@@ -94,9 +90,7 @@ def test_missing_returns_have_no_gradient_and_spoil_no_other(kind: str) -> None:
     assert not gradient[..., 0, :5].any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_copies_and_pickles_are_identical_and_independent(kind: str) -> None:
-    module = module_of(kind)
+def test_copies_and_pickles_are_identical_and_independent(module: DepthCorrection) -> None:
     depth, amplitude = frames()
     expected = module(depth, amplitude).detach()
     stored = io.BytesIO()
@@ -114,9 +108,7 @@ def test_copies_and_pickles_are_identical_and_independent(kind: str) -> None:
         assert one.labels() == module.labels()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_vmap_over_frames_and_over_parameters_agrees_with_a_loop(kind: str) -> None:
-    module = module_of(kind)
+def test_vmap_over_frames_and_over_parameters_agrees_with_a_loop(module: DepthCorrection) -> None:
     depth, amplitude = frames((3,))
     found = vmap(module)(depth, amplitude)
     torch.testing.assert_close(found, module(depth, amplitude), rtol=0, atol=1e-14)
@@ -148,9 +140,7 @@ def test_vmap_over_hand_eyes_agrees_with_a_loop() -> None:
         torch.testing.assert_close(one, points(twist))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_loss_is_the_mean_squared_distance_to_the_planes(kind: str) -> None:
-    module = module_of(kind)
+def test_the_loss_is_the_mean_squared_distance_to_the_planes(module: DepthCorrection) -> None:
     batch = wall_batch(module)
     assert batch.conditions is not None
     given = {

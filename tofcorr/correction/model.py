@@ -116,13 +116,11 @@ class CalibrationModel(nn.Module):
             Distances to the plane, shape (B, H, W), metres; positive on the normal's side.
 
         Raises:
-            ValueError: The model depends on the amplitude and got none.
+            FrameError: The model depends on the amplitude and got none.
         """
-        if amplitude is None:
-            if self.error.needs_amplitude():
-                raise ValueError("The error model has an amplitude term: expected amplitudes.")
-            amplitude = radial_distance
-        corrected = radial_distance - self.error(radial_distance, amplitude, conditions)
+        needed = self.error.needs_amplitude()
+        strength = required_amplitude(amplitude) if needed else radial_distance
+        corrected = radial_distance - self.error(radial_distance, strength, conditions)
         tool_from_camera = self.hand_eye()
         cosine = projected(ray_directions, product(normal_tool, tool_from_camera[:3, :3]))
         origin_to_plane = (normal_tool * tool_from_camera[:3, 3]).sum(-1) + offset_tool

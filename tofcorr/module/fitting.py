@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.estimation.solvers import Watcher
@@ -10,11 +10,9 @@ from tofcorr.pixels.dataset import Dataset, resolved_planes, split_frames
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.training.calibration import TrainingOptions, calibrate
-from tofcorr.training.judgement import against_garbage, frames_left_out
+from tofcorr.training.judgement import against_garbage, frames_left_out, report_text
 from tofcorr.training.report import training_report
 from tofcorr.training.run import calibration_state
-
-_HEADINGS = ("before", "hand-eye only", "after")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +46,7 @@ class FitReport:
         train_frames: Numbers of the frames fitted.
         test_frames: Numbers of the frames held out.
         warnings: What to know before the result is trusted, one sentence each.
+        text: All of it as lines, with a verdict.
     """
 
     model: str
@@ -60,35 +59,14 @@ class FitReport:
     rotation_se_deg: tuple[float, ...]
     stopped: str
     iterations: int
-    train_frames: tuple[int, ...] = field(default=())
-    test_frames: tuple[int, ...] = field(default=())
-    warnings: tuple[str, ...] = field(default=())
+    train_frames: tuple[int, ...]
+    test_frames: tuple[int, ...]
+    warnings: tuple[str, ...]
+    text: str
 
     def __repr__(self) -> str:
-        """Return the errors as a table, the hand-eye transform and the warnings."""
-        frames = self.test_frames if self.held_out else self.train_frames
-        kind = "held-out" if self.held_out else "fitted"
-        lines = [
-            f"{self.model}: {self.stopped} after {self.iterations} iterations, "
-            f"{len(self.train_frames)} frames fitted",
-            f"{f'error of {len(frames)} {kind} frames, mm':<34}{'mean abs':>10}{'rms':>10}",
-        ]
-        for name, error in zip(_HEADINGS, self._stages(), strict=True):
-            lines.append(f"  {name:<32}{error.mean_abs:>10.2f}{error.rms:>10.2f}")
-        position = [1e3 * row[3] for row in self.tool_from_camera[:3]]
-        lines.append(f"hand-eye: t = {_numbers(position, 1)} mm")
-        lines.append(
-            f"  standard errors: {_numbers(self.translation_se_mm, 2)} mm, "
-            f"{_numbers(self.rotation_se_deg, 3)} deg"
-        )
-        return "\n".join([*lines, *(f"warning: {text}" for text in self.warnings)])
-
-    def _stages(self) -> tuple[ErrorMM, ErrorMM, ErrorMM]:
-        return self.before, self.hand_eye_only, self.after
-
-
-def _numbers(values: tuple[float, ...] | list[float], digits: int) -> str:
-    return "(" + ", ".join(f"{value:.{digits}f}" for value in values) + ")"
+        """Return what `tofcorr train` prints."""
+        return self.text
 
 
 def fit_to(
@@ -131,6 +109,7 @@ def fit_to(
         train_frames=tuple(told["frames"]["train"]),
         test_frames=tuple(told["frames"]["test"]),
         warnings=tuple(filter(None, [inspection.headline, *told["warnings"]])),
+        text=report_text(told),
     )
     return calibration_state(found.data, options, found.fit), report
 
