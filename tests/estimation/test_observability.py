@@ -11,6 +11,7 @@ import pytest
 import torch
 from simulated_walls import fitted, simulated_wall, true_hand_eye
 
+import tofcorr
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import MomentObjective
 from tofcorr.estimation.uncertainty import (
@@ -21,7 +22,7 @@ from tofcorr.estimation.uncertainty import (
 )
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.judgement import warnings
+from tofcorr.training.judgement import judge
 from tofcorr.training.report import observability_summary
 from tofcorr.training.support import recording_support, shortcomings
 
@@ -61,7 +62,8 @@ def warned(walls: dict[str, Dataset], fits: FitOf) -> Callable[[str], str]:
 def _warned(dataset: Dataset, result: Fit) -> str:
     best = result.solution.parameters.tool_from_camera
     support = recording_support(dataset, np.arange(dataset.num_frames), best)
-    return "\n".join(warnings(result, NO_ERRORS, support, np.nan, robot_moves=dataset.moves))
+    inspection = tofcorr.inspect(dataset.first)
+    return "\n".join(judge(result, NO_ERRORS, support, inspection, robot_moves=dataset.moves)[2])
 
 
 @pytest.mark.parametrize(
@@ -83,7 +85,7 @@ def test_a_good_recording_gives_no_warning(warned: Callable[[str], str]) -> None
     assert warned("good") == ""
 
 
-@pytest.mark.parametrize(("left", "said"), [(1.02, "is enough"), (1.2, "do not use it")])
+@pytest.mark.parametrize(("left", "said"), [(1.02, "is enough"), (1.2, "makes them worse")])
 def test_only_a_correction_that_clearly_does_harm_is_advised_against(
     walls: dict[str, Dataset], fits: FitOf, left: float, said: str
 ) -> None:
@@ -95,7 +97,9 @@ def test_only_a_correction_that_clearly_does_harm_is_advised_against(
     }
     fit, wall = fits("good"), walls["good"]
     support = recording_support(wall, np.arange(3), fit.solution.parameters.tool_from_camera)
-    assert said in warnings(fit, errors, support, np.nan, robot_moves=True)[0]
+    found = judge(fit, errors, support, tofcorr.inspect(wall.first), robot_moves=True)
+    assert said in found[2][0]
+    assert (found[0] == "do not use") == (left > 1.1)
 
 
 def test_without_tilt_four_directions_are_undetermined(

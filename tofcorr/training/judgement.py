@@ -17,6 +17,7 @@ from tofcorr.training.support import Support, hardly_tilted, shortcomings, worst
 Training = TypeVar("Training", bound=TrainingOptions)
 Verdict = Literal["good", "usable", "do not use"]
 DO_NOT_USE: Verdict = "do not use"
+_VERDICTS: tuple[Verdict, ...] = (DO_NOT_USE, "usable", "good")
 
 # What a verdict and the warnings compare with; errors are root mean squares.
 #
@@ -81,124 +82,171 @@ def left_out_mapping(frames: Iterable[int], inspection: Inspection) -> list[dict
     return [{"frame": frame, "off_mm": 1e3 * off} for frame, off in outlying if frame in chosen]
 
 
-def _rms(errors: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Return the RMS errors of the fit, held out, and held out with the hand-eye alone; or NaN."""
-    stages = ("after", "train"), ("after", "test"), ("hand_eye_only", "test")
-    found = [errors[stage][half]["rms"] for stage, half in stages]
-    fitted, held_out, bare = (math.nan if one is None else one for one in found)
-    return fitted, held_out, bare
-
-
 def judge(
-    fit: Fit, errors: Mapping[str, Any], support: Support, inspection: Inspection
-) -> tuple[Verdict, str]:
-    """Return the verdict and its reason: the first of what speaks against a run, or for it.
+    fit: Fit,
+    errors: Mapping[str, Any],
+    support: Support,
+    inspection: Inspection,
+    *,
+    robot_moves: bool,
+) -> tuple[Verdict, str, list[str]]:
+    """Return the verdict, its reason, and what a user must know before trusting the result.
+
+    The reason is the first of what speaks against a run, or for it. What has one cause is said
+    once.
 
     Args:
         fit: The fitted model.
         errors: The `error_mm` of the report.
         support: What the fitted frames cover.
         inspection: What was odd about the recordings; its noise of a pixel is the floor.
+        robot_moves: Whether a robot moved the camera.
     """
-    look, (fitted, held_out, bare) = inspection.look, _rms(errors)
-    noise = 1e3 * look.noise
-    compared = [] if math.isnan(bare) else [f"{bare:.1f} mm with the hand-eye alone"]
-    compared += [f"{noise:.1f} mm noise of a pixel"] if math.isfinite(noise) else []
-    measured = f"Held-out frames are off by {np.nan_to_num(held_out):.1f} mm RMS"
-    measured += f" ({', '.join(compared)})" if compared else ""
-    error = fitted if math.isnan(held_out) else held_out
-    against: list[tuple[bool, str]] = [
-        *((True, one.sentence) for one in inspection.impossible),
-        (
-            fit.solution.stopped == "not_finite",
-            "The loss became NaN or infinite, so the parameters are those of the last point before "
-            "that, and no fit: choose a smaller model, and see `tofcorr inspect`.",
-        ),
-        *((True, one.sentence) for one in inspection.findings if one.spoils),
-        (
-            # Shorter distances have smaller noise, so that unknown walls move nearer. No camera's
-            # error grows by a third of the distance.
-            fit.walls is not None and fit.gain < 2 / 3,
+    free = fit.solution.parameters.hand_eye_is_free
+    needed = shortcomings(support, moves=free, with_intensity=fit.model.error.needs_amplitude())
+    said = [*_of_errors(fit, errors, 1e3 * inspection.look.noise), *_of_directions(fit)]
+    frontal = hardly_tilted(support)
+    said.extend(("usable", one) if one == frontal else ("good", one) for one in needed)
+    if beyond := beyond_noise(errors["after"]["test"]["rms"], 1e3 * inspection.look.noise_rms):
+        said.append(("usable", beyond))
+    # From n images a standard error is known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
+    if (images := fit.moments.num_images) < 10:
+        few = f"Only {images} images were fitted; standard errors are rough below 10."
+        said.append(("good", few))
+    if fit.residual:
+        said.append(("good", fit.residual))
+    if not robot_moves:
+        said.append(("good", "No robot moves: the hand-eye transform is held at the identity."))
+    odd: list[tuple[Verdict, str]] = [
+        (DO_NOT_USE, one.sentence)
+        for one in inspection.findings
+        if one.spoils or one.severity == "impossible"
+    ]
+    if inspection.headline:
+        odd.append(("usable", inspection.headline))
+    known = f"the hand-eye transform is determined to {1e3 * _WEAK:g} mm and mrad"
+    if all(one.sigma <= _WEAK for one in fit.observability.directions):
+        known = "every direction is determined"
+    first = dict(reversed([*odd, *said]))
+    first["good"] = f"{_measured(errors, 1e3 * inspection.look.noise)}, and {known}."
+    verdict: Verdict = min(first, key=_VERDICTS.index)
+    return verdict, first[verdict], [sentence for _, sentence in said]
+
+
+def _measured(errors: Mapping[str, Any], noise: float) -> str:
+    """Return how far held-out frames are off, compared with the hand-eye alone and with noise."""
+    held_out, bare = (errors[stage]["test"]["rms"] for stage in ("after", "hand_eye_only"))
+    if held_out is None:
+        return "No frame was held out: the errors given are those of the fit itself"
+    compared = f"{bare:.1f} mm with the hand-eye alone"
+    compared += f", {noise:.1f} mm noise of a pixel" if math.isfinite(noise) else ""
+    return f"Held-out frames are off by {held_out:.1f} mm RMS ({compared})"
+
+
+def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tuple[Verdict, str]]:
+    """Yield what the errors say of a fit.
+
+    Args:
+        fit: The fitted model.
+        errors: The `error_mm` of the report.
+        noise: Of a pixel, millimetres; NaN: unknown.
+    """
+    halves = ("after", "train"), ("after", "test"), ("hand_eye_only", "test")
+    found = [errors[stage][half]["rms"] for stage, half in halves]
+    fitted, held_out, bare = (math.nan if one is None else one for one in found)
+    error, measured = fitted if math.isnan(held_out) else held_out, _measured(errors, noise)
+    if fit.solution.stopped == "not_finite":
+        yield (
+            DO_NOT_USE,
+            f"{fit.solution.message} Choose a smaller model, or see `tofcorr inspect`.",
+        )
+    # Shorter distances have smaller noise, so that unknown walls move nearer. No camera's error
+    # grows by a third of the distance.
+    if fit.walls is not None and fit.gain < 2 / 3:
+        yield (
+            DO_NOT_USE,
             f"Where 1 m is measured, the fit leaves {fit.gain:.2f} m: from few poses, or at one "
             "distance, errors that grow with the distance cannot be told from a nearer wall. "
             "Record poses nearer and farther, or measure the wall's plane.",
-        ),
-        (
-            # No model can foresee noise: below a tenth of it a fit has collapsed.
-            np.nan_to_num(fitted) < noise / 10,
-            f"The fit leaves {np.nan_to_num(fitted):.2g} mm where one pixel has {noise:.1f} mm of "
-            "noise: too few different frames, so that the model could take every point to the "
-            "camera.",
-        ),
-        (held_out > _WORSE * bare, f"{measured}: the depth correction makes them worse."),
-        (
-            held_out > _NO_GAIN * bare and held_out > 3 * noise,
-            f"{measured}: the correction gains nothing, so poses or planes are wrong.",
-        ),
-        (
-            # No application bears 30 mm, the raw error of most cameras, or eight times the noise.
-            error > max(30, 8 * np.nan_to_num(noise)),
-            f"Frames are off by {error:.0f} mm RMS after the fit: the model does not describe "
-            "them.",
-        ),
-    ]
-    free, lacking = fit.solution.parameters.hand_eye_is_free, fit.misfit
-    frontal, beyond = hardly_tilted(support), beyond_noise(held_out, 1e3 * look.noise_rms)
-    reservations: list[tuple[bool, str]] = [
-        (inspection.headline is not None, inspection.headline or ""),
-        *((max(one.size) > _WEAK, one.lacking()) for one in (lacking,) if one is not None),
-        (math.isnan(held_out), _NOTHING_HELD_OUT),
-        (not fit.solution.converged, fit.solution.message),
-        (
-            held_out > _OVERFITTED * np.nan_to_num(fitted),
-            f"{measured}, much more than the {np.nan_to_num(fitted):.1f} mm of the fit itself.",
-        ),
-        *((free, sentence) for sentence in _of_hand_eye(fit)),
-        (free and frontal is not None, frontal or ""),
-        (beyond is not None, beyond or ""),
-    ]
-    for reason in (sentence for counts, sentence in against if counts):
-        return DO_NOT_USE, reason
-    for reason in (sentence for counts, sentence in reservations if counts):
-        return "usable", reason
-    if all(one.sigma <= _WEAK for one in fit.observability.directions):
-        return "good", f"{measured}, and every direction is determined."
-    known = f"the hand-eye transform is determined to {1e3 * _WEAK:g} mm and mrad"
-    return "good", f"{measured}, and {known}."
-
-
-_NOTHING_HELD_OUT = "No frame was held out: the errors given are those of the fit itself."
-
-
-def _of_hand_eye(fit: Fit) -> Iterator[str]:
-    """Yield in what the hand-eye transform is uncertain."""
-    more = "record more tilts and distances."
-    for one in fit.observability.directions:
-        if one.is_undetermined:
-            yield f"The images do not determine {one.in_words()}: {more}"
-        elif one.sigma > _WEAK and any(name.startswith(("t_", "w_")) for name in one.shares):
-            known = f"{1e3 * one.sigma:.0f} mm (or mrad)"
-            yield f"The standard error of {one.in_words()} is {known}: {more}"
-    covariance = fit.hand_eye_covariance
-    shift, turn = (worst_sigma(covariance[axes, axes]) for axes in (slice(3), slice(3, 6)))
-    if max(shift, turn) > _WEAK:
+        )
+    # No model can foresee noise: below a tenth of it a fit has collapsed.
+    if not fitted >= noise / 10 and math.isfinite(noise):
         yield (
-            f"The hand-eye transform is known to {1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad "
-            f"only, along its worst axes: {more}"
+            DO_NOT_USE,
+            f"The fit leaves {fitted:.2g} mm where one pixel has {noise:.1f} mm of noise: too few "
+            "different frames, so that the model could take every point to the camera.",
+        )
+    if held_out > _WORSE * bare:
+        yield DO_NOT_USE, f"{measured}: the depth correction makes them worse."
+    elif held_out > _NO_GAIN * bare and held_out > 3 * noise:
+        yield DO_NOT_USE, f"{measured}: the correction gains nothing, so poses or planes are wrong."
+    elif held_out > bare:
+        yield "good", f"{measured}: the hand-eye transform is enough for this camera."
+    # No application bears 30 mm, the raw error of most cameras, or eight times the noise.
+    if error > max(30, 8 * noise):
+        off = f"Frames are off by {error:.0f} mm RMS after the fit"
+        yield DO_NOT_USE, f"{off}: the model does not describe them."
+    if math.isnan(held_out):
+        yield "usable", f"{measured}."
+    if held_out > _OVERFITTED * fitted:
+        own = f"much more than the {fitted:.1f} mm of the fit itself"
+        yield "usable", f"{measured}, {own}: record more views, or choose a smaller model."
+
+
+def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
+    """Yield what a fit lacks, and in what it is uncertain: the three weakest directions by name."""
+    solution, free = fit.solution, fit.solution.parameters.hand_eye_is_free
+    if fit.misfit is not None:
+        yield "usable" if max(fit.misfit.size) > _WEAK else "good", fit.misfit.lacking()
+    if not solution.converged and solution.stopped != "not_finite":
+        yield "usable", solution.message
+    curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
+    weak = [one for one in fit.observability.directions if one.sigma > _WEAK]
+    of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
+    others = [one for one in weak if not set(one.shares) <= curves]
+    if undetermined := [one.in_words() for one in others if one.is_undetermined]:
+        yield (
+            "usable" if free else "good",
+            f"The images do not determine {'; '.join(undetermined)}: a prior of "
+            f"{1e3 * PRIOR_SIGMA:g} mm and {1e3 * PRIOR_SIGMA:g} mrad around the starting guess is "
+            "used instead. Record more tilts and distances.",
+        )
+    if uncertain := [one for one in others if not one.is_undetermined]:
+        of_hand_eye = any(name.startswith(("t_", "w_")) for one in uncertain for name in one.shares)
+        words = "; ".join(f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in uncertain[:3])
+        yield (
+            "usable" if free and of_hand_eye else "good",
+            f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad): {words}.",
+        )
+    if free:
+        covariance = fit.hand_eye_covariance
+        shift, turn = (worst_sigma(covariance[axes, axes]) for axes in (slice(3), slice(3, 6)))
+        if max(shift, turn) > _WEAK:
+            yield (
+                "usable",
+                f"The hand-eye transform is known to {1e3 * shift:.1f} mm and {1e3 * turn:.1f} "
+                "mrad only, along its worst axes: record more tilts and distances.",
+            )
+    if of_curves:
+        yield (
+            "good",
+            "Parts of the curves are set by the smoothing penalty, not by data, with standard "
+            f"deviations of up to {1e3 * max(of_curves):.0f} mm: the recording does not hold those "
+            "combinations of distance and amplitude.",
         )
 
 
-def beyond_noise(held_out: float, noise: float) -> str | None:
+def beyond_noise(held_out: float | None, noise: float) -> str | None:
     """Return one sentence about an error that neither the model nor noise explains; None: small.
 
     Poses of an ordinary robot scatter by less than 1.5 mm, and edges raise the noise by a tenth:
     what is beyond, as a root of the difference of squares, is then below 0.6 times the noise.
 
     Args:
-        held_out: RMS error of held-out frames, millimetres; NaN: no frame was held out.
+        held_out: RMS error of held-out frames, millimetres; None: no frame was held out.
         noise: Noise of their pixels, root mean square, millimetres; NaN: unknown.
     """
-    beyond = math.sqrt(max(held_out**2 - noise**2, 0.0))
+    beyond = math.sqrt(max((held_out or 0.0) ** 2 - noise**2, 0.0))
     if not beyond > max(1.5, 0.6 * noise):
         return None
     return (
@@ -206,99 +254,6 @@ def beyond_noise(held_out: float, noise: float) -> str | None:
         "planes scatter so much, or the camera has an error that this model lacks, which may move "
         "the hand-eye transform by more than its standard errors; `tofcorr diagnose` tells which."
     )
-
-
-def warnings(
-    fit: Fit,
-    errors: Mapping[str, Any],
-    support: Support,
-    noise_mm: float,
-    *,
-    robot_moves: bool,
-) -> list[str]:
-    """Return what a user must know before trusting the result, one sentence each.
-
-    The gravest come first; what has one cause is said once.
-
-    Args:
-        fit: The fitted model.
-        errors: The `error_mm` of the report.
-        support: What the frames fitted cover.
-        noise_mm: Noise of the pixels, root mean square; NaN: unknown.
-        robot_moves: Whether a robot moved the camera.
-    """
-    undetermined, *uncertain = _uncertain_directions(fit)
-    free, images = fit.solution.parameters.hand_eye_is_free, fit.moments.num_images
-    # From n images a standard error is known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
-    few = f"Only {images} images were fitted; standard errors are rough below 10."
-    found = [
-        None if fit.solution.converged else fit.solution.message,
-        _compared(*_rms(errors)),
-        None if fit.misfit is None else fit.misfit.lacking(),
-        beyond_noise(_rms(errors)[1], noise_mm),
-        undetermined,
-        *shortcomings(support, moves=free, with_intensity=fit.model.error.needs_amplitude()),
-        few if images < 10 else None,
-        *uncertain,
-        fit.residual,
-        None
-        if robot_moves
-        else "No robot pose changes: the hand-eye transform is held at the identity.",
-    ]
-    return [sentence for sentence in found if sentence]
-
-
-def _uncertain_directions(fit: Fit, named: int = 3) -> tuple[str | None, str | None, str | None]:
-    """Return sentences: undetermined directions, weak ones, and those of curves without pixels.
-
-    Args:
-        fit: The fitted model.
-        named: Weak directions named, the weakest first; all are in report.json.
-    """
-    curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
-    weak = [one for one in fit.observability.directions if one.sigma > _WEAK]
-    of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
-    others = [one for one in fit.observability.directions if not set(one.shares) <= curves]
-    free = "; ".join(one.in_words() for one in others if one.is_undetermined)
-    weak = [one for one in others if one.sigma > _WEAK and not one.is_undetermined]
-    words = [f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in weak[:named]]
-    more = f"; and {len(weak) - len(words)} more" if len(weak) > len(words) else ""
-    number = "1 direction" if len(of_curves) == 1 else f"{len(of_curves)} directions"
-    verb = "is" if len(of_curves) == 1 else "are"
-    return (
-        f"The images do not determine {free}: a prior of {1e3 * PRIOR_SIGMA:g} mm and "
-        f"{1e3 * PRIOR_SIGMA:g} mrad around the starting guess is used instead."
-        if free
-        else None,
-        f"Standard errors above {1e3 * _WEAK:g} mm (or mrad): {'; '.join(words)}{more}."
-        if words
-        else None,
-        f"{number} of the curves {verb} set by the smoothing penalty, not by data, "
-        f"with a standard deviation of up to {1e3 * max(of_curves):.0f} mm: the recording does not "
-        "hold those combinations of distance and amplitude."
-        if of_curves
-        else None,
-    )
-
-
-def _compared(fitted: float, held_out: float, bare: float) -> str | None:
-    """Compare the held-out error with that of the fit and of the hand-eye alone."""
-    if math.isnan(held_out):
-        return _NOTHING_HELD_OUT
-    if held_out > _OVERFITTED * fitted:
-        return (
-            f"The held-out error ({held_out:.1f} mm RMS) is much larger than that of the fit "
-            f"({fitted:.1f} mm): record more views, or choose a smaller model."
-        )
-    compared = f"({held_out:.1f} mm RMS) than the hand-eye alone ({bare:.1f} mm)"
-    if held_out > _WORSE * bare:
-        return f"The depth correction makes held-out frames worse {compared}: do not use it."
-    if held_out > bare:
-        return (
-            f"The depth correction leaves no less on held-out frames {compared}: this camera has "
-            "hardly an error that the model describes, and the hand-eye transform is enough."
-        )
-    return None
 
 
 def report_text(report: Mapping[str, Any], most_warnings: int = 5) -> str:
@@ -312,8 +267,10 @@ def report_text(report: Mapping[str, Any], most_warnings: int = 5) -> str:
     # The errors as aligned columns, millimetres.
     lines.append(f"{report['model']:<16}{'train':>18}{'held out':>20}")
     lines.append(f"{'mm':<16}{'mean abs':>9}{'RMS':>9}{'mean abs':>11}{'RMS':>9}")
-    for stage, text in error_cells(report, unknown="-").items():
+    for stage, halves in report["error_mm"].items():
         name = stage.replace("hand_eye", "hand-eye").replace("_", " ")
+        errors = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
+        text = ["-" if one is None else f"{one:.2f}" for one in errors]
         lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
@@ -332,18 +289,6 @@ def report_text(report: Mapping[str, Any], most_warnings: int = 5) -> str:
     if len(found) > most_warnings:
         lines.append(f"{len(found) - most_warnings} more warnings are in report.json.")
     return "\n".join([*lines, f"Verdict: {report['verdict']}. {report['reason']}"])
-
-
-def error_cells(report: Mapping[str, Any], unknown: str) -> dict[str, list[str]]:
-    """Return mean absolute and RMS errors, fitted and held out, of each stage as text, mm."""
-    columns = [(half, kind) for half in ("train", "test") for kind in ("mean_abs", "rms")]
-    return {
-        stage: [
-            unknown if (one := halves[half][kind]) is None else f"{one:.2f}"
-            for half, kind in columns
-        ]
-        for stage, halves in report["error_mm"].items()
-    }
 
 
 def _hand_eye_lines(report: Mapping[str, Any]) -> Iterator[str]:

@@ -19,7 +19,7 @@ from tofcorr.geometry import se3
 from tofcorr.pixels.sample import sample_pixels
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.figures import ends_of, error_images, error_picture, frames_to_show, profile
-from tofcorr.training.judgement import error_cells
+from tofcorr.training.judgement import report_text
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -68,7 +68,9 @@ class RunMonitor:
             for values in self._scalars(calibration):
                 writer.add_scalar(*values)
             if report:
-                writer.add_text("report", "\n\n".join(_in_markdown(report)))
+                # Four spaces keep the lines of a table as they are.
+                lines = [report["message"], *report_text(report).splitlines()]
+                writer.add_text("report", "\n".join(f"    {line}" for line in lines))
             if figures:
                 _write_figures(writer, calibration)
 
@@ -212,15 +214,3 @@ def loss_parts(
             for target in np.unique(targets)
         },
     }
-
-
-def _in_markdown(report: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the paragraphs of a report's text: why the solver stopped, errors, warnings."""
-    yield f"**{report['model']}**: {report.get('message', report['stopped'])}"
-    lines = ["| error [mm] | train mean abs. | train RMS | test mean abs. | test RMS |"]
-    lines.append("| :-- | --: | --: | --: | --: |")
-    for stage, cells in error_cells(report, unknown="–").items():
-        lines.append(f"| {stage.replace('_', ' ')} | {' | '.join(cells)} |")
-    yield "\n".join(lines)
-    if report.get("warnings"):
-        yield "\n".join(f"- {text}" for text in report["warnings"])

@@ -20,7 +20,7 @@ from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import Calibration, TrainingOptions
-from tofcorr.training.judgement import judge, left_out_mapping, warnings
+from tofcorr.training.judgement import judge, left_out_mapping
 from tofcorr.training.support import Support, recording_support
 from tofcorr.version import __version__
 
@@ -143,9 +143,7 @@ def training_report(
     hand_eye = solution.parameters.tool_from_camera
     support = recording_support(data, calibration.train, hand_eye)
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
-    verdict, reason = judge(fit, errors, support, inspection)
-    noise_mm = 1e3 * inspection.look.noise_rms
-    found = warnings(fit, errors, support, noise_mm, robot_moves=data.moves)
+    verdict, reason, found = judge(fit, errors, support, inspection, robot_moves=data.moves)
     rms = np.sqrt(after.squared / np.maximum(after.count, 1))
     advice, pool = None, None
     if options.advice:
