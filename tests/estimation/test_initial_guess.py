@@ -8,11 +8,11 @@ from synthetic_scene import EA, make_scene
 from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.solvers import (
     initial_parameters,
-    plane_normals_camera,
     rotation_from_normals,
     with_linear_part,
 )
 from tofcorr.geometry import se3
+from tofcorr.geometry.rays import planes_through
 
 
 def test_planes_are_fitted_to_the_points_of_each_image(generator: torch.Generator) -> None:
@@ -20,7 +20,11 @@ def test_planes_are_fitted_to_the_points_of_each_image(generator: torch.Generato
     moments = scene.moments()
     expected = moments.normal_tool @ scene.truth.tool_from_camera[:3, :3]
     # Second moments of 1 m^2 tell a spread of 0.01 m^2 to 1e-14.
-    torch.testing.assert_close(plane_normals_camera(moments), expected, rtol=0.0, atol=1e-12)
+    points = moments.gram[:, [0, 1, 2, -1]][:, :, [0, 1, 2, -1]]
+    found, offset = planes_through(points, torch.zeros(3).double())
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-12)
+    lever = moments.normal_tool @ scene.truth.tool_from_camera[:3, 3]
+    torch.testing.assert_close(offset, moments.offset_tool + lever, rtol=0.0, atol=1e-12)
 
 
 def test_error_free_data_give_the_hand_eye_from_nothing(generator: torch.Generator) -> None:

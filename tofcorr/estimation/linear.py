@@ -120,17 +120,24 @@ def solved(
         right: The right-hand side.
         ridge: Share of each curvature that is added to it, as Marquardt's damping is.
     """
-    scale = matrix.diagonal(dim1=-2, dim2=-1).clamp(min=_TINY).rsqrt()
-    unit = matrix * scale[..., :, None] * scale[..., None, :]
+    scale, unit = _scaled(matrix)
     damped = unit + ridge * torch.eye(unit.shape[-1]).to(unit)
     return scale * torch.linalg.solve(damped, (right * scale)[..., None])[..., 0]
 
 
-def inverse(matrix: Float[Tensor, "P P"]) -> Float[Tensor, "P P"]:
+def inverse(matrix: Float[Tensor, "*B P P"]) -> Float[Tensor, "*B P P"]:
     """Return the inverse of a positive definite matrix, scaled to a unit diagonal before."""
-    scale = matrix.diagonal().clamp(min=_TINY).rsqrt()
-    unit = matrix * scale[:, None] * scale + ROUNDING * torch.eye(len(scale)).to(matrix)
-    return torch.cholesky_inverse(torch.linalg.cholesky(unit)) * scale[:, None] * scale
+    scale, unit = _scaled(matrix)
+    factor = torch.linalg.cholesky(unit + ROUNDING * torch.eye(unit.shape[-1]).to(unit))
+    return torch.cholesky_inverse(factor) * scale[..., :, None] * scale[..., None, :]
+
+
+def _scaled(
+    matrix: Float[Tensor, "*B P P"],
+) -> tuple[Float[Tensor, "*B P"], Float[Tensor, "*B P P"]]:
+    """Return factors of the unknowns, and the matrix that they give a unit diagonal."""
+    scale = matrix.diagonal(dim1=-2, dim2=-1).clamp(min=_TINY).rsqrt()
+    return scale, matrix * scale[..., :, None] * scale[..., None, :]
 
 
 class Curvature:
@@ -146,8 +153,7 @@ class Curvature:
     """
 
     def __init__(self, matrix: Float[Tensor, "*B P P"]) -> None:
-        self.scale = matrix.diagonal(dim1=-2, dim2=-1).clamp(min=_TINY).rsqrt()
-        unit = matrix * self.scale[..., :, None] * self.scale[..., None, :]
+        self.scale, unit = _scaled(matrix)
         self.values, self.vectors = torch.linalg.eigh(unit)
         largest = self.values.amax(dim=-1, keepdim=True)
         self.resolved: Bool[Tensor, "*B P"] = self.values > RESOLVED * largest
@@ -358,12 +364,9 @@ def reduced(sums: GroupSums, noise: Tensor, random_precision: Tensor) -> tuple[T
     Returns:
         Normal equations of each group in the shared unknowns: precision (G, P, P), right (G, P).
     """
-    within, cross = _of_effects(sums, noise, random_precision)
-    # Turns and shifts have other units than shapes: scaled, nothing is lost to rounding.
-    scale = within.diagonal(dim1=1, dim2=2).rsqrt()[:, :, None]
-    solved = scale * torch.linalg.solve(within * scale * scale.mT, scale * cross)
+    spread, cross = _of_effects(sums, noise, random_precision)
     others = [*range(sums.unknowns), -1]
-    left = sums.products[:, others][:, :, others] - cross.mT @ solved
+    left = sums.products[:, others][:, :, others] - cross.mT @ spread @ cross
     left = left / noise[:, None, None]
     return left[:, :-1, :-1], left[:, :-1, -1]
 
@@ -418,8 +421,7 @@ def random_effects(sums: GroupSums, found: Estimate) -> tuple[Tensor, Tensor]:
         Two tensors of shape (G, R).
     """
     noise, precision = found.variances.noise, 1 / found.variances.random
-    within, cross = _of_effects(sums, torch.full_like(sums.size, noise), precision)
-    spread = torch.linalg.inv(within)
+    spread, cross = _of_effects(sums, torch.full_like(sums.size, noise), precision)
     lever, right = (spread @ cross).tensor_split([sums.unknowns], dim=2)
     effects = right[:, :, 0] - lever @ found.mean
     uncertainty = noise * spread.diagonal(dim1=1, dim2=2)
@@ -460,13 +462,11 @@ def _by_class(squares: Tensor, known: Tensor, of: Tensor, believed: Tensor) -> T
 
 
 def _of_effects(sums: GroupSums, noise: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the products of the effects with themselves, with their prior, and with X and y."""
+    """Return the inverse of the effects' products and their prior, and their products with X, y."""
     first, last = sums.unknowns, sums.unknowns + sums.random
     rows = sums.products[:, first:last]
-    own = rows[:, :, first:last]
-    ridge = ROUNDING * own.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None]
-    within = own + (noise[:, None] * precision + ridge).diag_embed()
-    return within, torch.cat([rows[:, :, :first], rows[:, :, last:]], dim=2)
+    within = rows[:, :, first:last] + (noise[:, None] * precision).diag_embed()
+    return inverse(within), torch.cat([rows[:, :, :first], rows[:, :, last:]], dim=2)
 
 
 @contextmanager

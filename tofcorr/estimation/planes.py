@@ -172,22 +172,3 @@ def estimate_walls(
     assert isinstance(end, _WithWalls)
     found = Parameters(end.tool_from_camera, end.coefficients, end.hand_eye_is_free)
     return found, end.walls
-
-
-def plane_through(
-    points: Float[Tensor, "4 4"], viewpoint: Float[Tensor, "3"]
-) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
-    """Return the plane n . x + d = 0 of least squared distances.
-
-    Args:
-        points: Sum of (x, 1)(x, 1)^T over the points, shape (4, 4), metres.
-        viewpoint: A point that the normal shall face, shape (3,).
-
-    Returns:
-        The unit normal (3,) and the offset d (), metres.
-    """
-    mean = points[:3, 3] / points[3, 3]
-    spread = points[:3, :3] / points[3, 3] - mean[:, None] * mean[None, :]
-    normal = torch.linalg.eigh(spread).eigenvectors[:, 0]
-    normal = torch.where(normal @ (viewpoint - mean) < 0, -normal, normal)
-    return normal, -(normal @ mean)

@@ -25,6 +25,7 @@ from tofcorr.estimation.moments import (
     Parameters,
 )
 from tofcorr.geometry import se3
+from tofcorr.geometry.rays import planes_through
 from tofcorr.options import Options
 
 Stopped = Literal["converged", "iteration_limit", "line_search_failed", "not_finite", "interrupted"]
@@ -175,25 +176,12 @@ def initial_parameters(
             the identity.
     """
     guess = torch.eye(4, dtype=torch.float64) if guess is None else guess.to(torch.float64)
-    normals = plane_normals_camera(moments)
+    # The camera is the origin. Points have the entries x, y, z and 1.
+    points = moments.gram[:, [0, 1, 2, -1]][:, :, [0, 1, 2, -1]]
+    normals, _ = planes_through(points, torch.zeros(3, dtype=torch.float64))
     rotation = rotation_from_normals(moments.normal_tool, normals, guess[:3, :3])
     zero = torch.zeros(moments.num_coefficients, dtype=torch.float64)
     return with_linear_part(moments, Parameters(se3.assemble(rotation, guess[:3, 3]), zero))
-
-
-def plane_normals_camera(moments: ImageMoments) -> Float[Tensor, "N 3"]:
-    """Fit a plane to the raw points of each image, from its moments.
-
-    Returns:
-        Unit normals in the camera frame, on the camera's side of the plane, shape (N, 3).
-    """
-    points = moments.gram / moments.gram[:, -1:, -1:].clamp(min=torch.finfo(torch.float64).tiny)
-    mean = points[:, -1, :3]
-    covariance = points[:, :3, :3] - mean[:, :, None] * mean[:, None, :]
-    normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
-    # The camera is the origin: it lies at signed distance -n.mean, which must be positive.
-    facing = torch.where((normal * mean).sum(-1) > 0, -1.0, 1.0)
-    return normal * facing[:, None]
 
 
 def rotation_from_normals(

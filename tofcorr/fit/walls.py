@@ -9,7 +9,8 @@ import torch
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.planes import Walls, plane_through
+from tofcorr.estimation.planes import Walls
+from tofcorr.geometry.rays import planes_through
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import pixels_of_image
 
@@ -152,12 +153,7 @@ def walls_alone(
             points[wall] += pose @ (own.T @ own) @ pose.T
             viewpoint[wall] += pose[:3, 3] / int((index == wall).sum())
     seen = points[:, 3, 3] >= 3
-    planes = [plane_through(points[wall], viewpoint[wall]) for wall in seen.nonzero()[:, 0]]
+    normal, offset = planes_through(points[seen], viewpoint[seen])
     kept = torch.from_numpy(index)
-    walls = Walls(
-        torch.stack([normal for normal, _ in planes]) if planes else torch.zeros(0, 3).double(),
-        torch.stack([offset for _, offset in planes]) if planes else torch.zeros(0).double(),
-        kept[seen[kept]],
-        poses[torch.from_numpy(frames)][seen[kept]],
-    )
+    walls = Walls(normal, offset, kept[seen[kept]], poses[torch.from_numpy(frames)][seen[kept]])
     return FoundWalls(of_frame, names, walls, numbers[seen.numpy()])

@@ -163,6 +163,27 @@ def plane_in_frame(
     return normal, offset + (normal_world * translation).sum(-1)
 
 
+def planes_through(
+    points: Float[Tensor, "*batch 4 4"], viewpoint: Float[Tensor, "*#batch 3"]
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
+    """Return the planes n . x + d = 0 of least squared distances.
+
+    Args:
+        points: Sums of (x, 1)(x, 1)^T over the points, shape (..., 4, 4), metres.
+        viewpoint: Points that the normals shall face, shape (..., 3).
+
+    Returns:
+        Unit normals (..., 3) and offsets (...), metres.
+    """
+    mean = points / points[..., 3:, 3:].clamp(min=torch.finfo(points.dtype).tiny)
+    centre = mean[..., 3, :3]
+    spread = mean[..., :3, :3] - centre[..., :, None] * centre[..., None, :]
+    normal = torch.linalg.eigh(spread).eigenvectors[..., 0]
+    facing = (normal * (viewpoint - centre)).sum(-1, keepdim=True)
+    normal = torch.where(facing < 0, -normal, normal)
+    return normal, -(normal * centre).sum(-1)
+
+
 def ray_plane_distance(
     ray_directions: Float[Tensor, "H W 3"],
     normal: Float[Tensor, "*batch 3"],
