@@ -114,13 +114,13 @@ def followed(folder: Path, seed: int, robot: dict[str, Any]) -> dict[str, float]
     assert pool is not None
     advised, _ = advise(first, pool, before)
     at_random = random.choice(len(pool.target), len(advised), replace=False).tolist()
-    worst = {"before": before.observability.worst_sigma}
+    worst = {"before": before.observability.directions[0].sigma}
     generator = torch.Generator().manual_seed(seed)
     for name, chosen in (("advised", advised), ("random", at_random)):
         targets = [pool.target[k] for k in chosen]
         more = taken(folder / name, seed, pool.world_from_tool[chosen], targets, generator)
         both = Dataset((first.first, more.first))
-        worst[name] = fitted(both).observability.worst_sigma
+        worst[name] = fitted(both).observability.directions[0].sigma
     return worst
 
 

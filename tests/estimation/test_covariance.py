@@ -5,7 +5,7 @@ import torch
 from synthetic_scene import EA, Scene, make_scene
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
+from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.solvers import minimise
 from tofcorr.estimation.uncertainty import Covariance, jackknife_covariance
 from tofcorr.geometry import se3
@@ -49,7 +49,6 @@ def test_the_standard_errors_are_those_of_the_refits() -> None:
     num = len(refits)
     expected = ((num - 1) / num * (refits - refits.mean(dim=0)).square().sum(dim=0)).sqrt()
     torch.testing.assert_close(covariance.standard_errors, expected, rtol=0.03, atol=0.0)
-    assert covariance.undetermined_directions == 0
 
 
 def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(
@@ -67,19 +66,6 @@ def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(
     # 40 draws of 14 parameters: the mean square of t variables of 19 degrees of freedom is
     # 19 / 17, give or take a tenth.
     assert 0.8 < float(torch.stack(ends).square().mean()) < 1.7
-
-
-def test_undetermined_directions_are_counted() -> None:
-    scene = make_scene(torch.Generator().manual_seed(0), EA)
-    moments = scene.moments()
-    same_wall = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(14, 3)
-    untilted = ImageMoments(
-        moments.gram, same_wall, moments.offset_tool, moments.count, moments.symbols
-    )
-    # Seen under one normal, t_x, t_y and the rotation about the normal change nothing, and the
-    # depth along the normal is not told from ... only these three are exactly undetermined.
-    camera_looks_along_z = Parameters(torch.eye(4, dtype=torch.float64), scene.truth.coefficients)
-    assert jackknife_covariance(untilted, camera_looks_along_z).undetermined_directions == 3
 
 
 def test_two_poses_are_too_few() -> None:

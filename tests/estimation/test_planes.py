@@ -76,7 +76,7 @@ def test_not_knowing_the_wall_costs_certainty(wall: Dataset, found: Fit) -> None
     ratio = found.covariance.standard_errors[:6] / known.covariance.standard_errors[:6]
     assert float(ratio.min()) > 0.9
     assert float(ratio[2]) > 1.5
-    assert found.observability.worst_sigma > known.observability.worst_sigma
+    assert found.observability.directions[0].sigma > known.observability.directions[0].sigma
 
 
 def test_without_tilt_the_unknown_wall_is_undetermined_with_t_z_and_the_constant(

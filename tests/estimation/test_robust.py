@@ -92,9 +92,8 @@ def test_the_image_that_stands_out_is_named() -> None:
     rms = 0.005 * np.exp(0.2 * random.normal(size=40))
     rms[17] = 0.05
     (found,) = outlying_images(np.arange(100, 140), rms)
-    assert found.frame == 117
-    assert found.rms_mm == pytest.approx(50.0)
-    assert found.z > 3.5
+    assert (found["frame"], found["rms_mm"]) == (117, pytest.approx(50.0))
+    assert found["z"] > 3.5
 
 
 def test_equal_images_hold_no_outlier() -> None:

@@ -12,7 +12,7 @@ from tofcorr.estimation.accumulator import Design
 from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.advice import PosePool, advise, choose_views, draw_pool, predicted_moments
+from tofcorr.training.advice import PosePool, advise, choose_views, draw_pool
 from tofcorr.training.support import worst_sigma
 
 
@@ -38,11 +38,12 @@ def test_predicted_moments_of_the_recorded_poses_are_those_measured(
 ) -> None:
     dataset, fit = wall
     white = torch.from_numpy(np.flatnonzero(dataset.targets == "white"))
-    normal, offset = planes_in_tool(dataset.first)
     design = Design(fit.model.error, fit.domain, dataset.ray_directions())
+    names = "world_from_tool", "normal_world", "offset"
+    pose, normal, offset = (dataset.column(name)[white] for name in names)
     brightness = torch.zeros(len(white), 2, dtype=torch.float64)
-    hand_eye = fit.solution.parameters.tool_from_camera
-    predicted = predicted_moments(design, hand_eye, normal[white], offset[white], brightness)
+    poses = PosePool(pose, normal, offset, [], brightness, torch.zeros(0))
+    predicted = poses.moments(design, fit.solution.parameters.tool_from_camera)
     predicted = predicted.columns(["c0", "c1", "r^1"])
     measured = fit.moments.images(white).columns(["c0", "c1", "r^1"])
     # The camera reads some 2 % too far; the prediction knows nothing of errors.
@@ -68,7 +69,7 @@ def test_the_worst_sigma_never_grows_with_a_view(wall: tuple[Dataset, Fit], pool
     worst = [advice["worst_sigma_mm_or_mrad"]]
     worst += [pose["worst_sigma_mm_or_mrad"] for pose in advice["poses"]]
     assert worst == sorted(worst, reverse=True)
-    assert worst[0] == pytest.approx(1e3 * fit.observability.worst_sigma)
+    assert worst[0] == pytest.approx(1e3 * fit.observability.directions[0].sigma)
 
 
 def test_poses_of_the_pool_see_the_wall_at_the_distance_they_state(

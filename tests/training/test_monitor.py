@@ -12,10 +12,9 @@ from training.trained import Trained
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.sample import distance_to_plane, errors_along_ray, sample_pixels, thinned
+from tofcorr.pixels.sample import errors_along_ray, sample_pixels, thinned
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.figures import coloured
-from tofcorr.training.monitor import loss_parts
 
 STAGES = ("before", "hand_eye_only", "after")
 
@@ -60,29 +59,6 @@ def test_loss_hand_eye_and_every_coefficient_are_shown_by_iteration(
         float(moved), rel=1e-5
     )
     assert _scalar(shown, "hand_eye_since_start/rotation_deg")[0] == 0.0
-
-
-def test_the_rms_shown_and_its_parts_are_those_of_the_pixels(
-    trained: Trained, shown: EventAccumulator
-) -> None:
-    data, found = trained.data, trained.result.calibration
-    errors, targets = found.errors["after"], data.targets[found.train]
-    frames = {"all": found.train} | {
-        f"target_{name}": found.train[targets == name] for name in np.unique(targets)
-    }
-    for name, own in frames.items():
-        assert _scalar(shown, f"rms_mm/{name}")[-1] == pytest.approx(errors.rms_mm(own), rel=1e-6)
-    parts = loss_parts(found.fit.moments, found.fit.solution.parameters, targets)
-    between = within = count = 0.0
-    for batch in data.batches(found.train):
-        residual = distance_to_plane(found.fit.model, batch, data.ray_directions())
-        for image, valid in zip(residual, batch.valid, strict=True):
-            used = image[valid]
-            between += len(used) * float(used.mean()) ** 2
-            within += float((used - used.mean()).square().sum())
-            count += len(used)
-    assert parts["between_images"] == pytest.approx(1e3 * (between / count) ** 0.5, rel=1e-6)
-    assert parts["within_images"] == pytest.approx(1e3 * (within / count) ** 0.5, rel=1e-6)
 
 
 def test_error_images_distributions_and_the_report_are_there(

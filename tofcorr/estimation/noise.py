@@ -169,10 +169,6 @@ class DistanceNoise(NamedTuple):
         """a, b and c."""
         return self.floor, self.shot, self.readout
 
-    def to_mapping(self) -> dict[str, float | str]:
-        """Return plain values, for reports."""
-        return self._asdict()
-
 
 def fit_noise(
     differences: Float[Tensor, "S"], amplitude: Float[Tensor, "S"], source: Source

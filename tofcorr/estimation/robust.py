@@ -5,7 +5,7 @@ each fit of a plane is a linear one. Its unit normal towards the camera is -g / 
 distance from it 1 / |g|.
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -82,29 +82,19 @@ def robust_scale(residuals: Float[Tensor, "S"]) -> float:
     return sigma_from_mad(float(residuals.abs().median()))
 
 
-class ImageOutlier(NamedTuple):
-    """An image whose error is much larger than that of the others.
-
-    Attributes:
-        frame: Its global number.
-        rms_mm: Its error.
-        z: How many robust standard deviations the logarithm of its error is above the median.
-    """
-
-    frame: int
-    rms_mm: float
-    z: float
-
-
 def outlying_images(
     frames: np.ndarray, rms: np.ndarray, threshold: float = 3.5
-) -> list[ImageOutlier]:
+) -> list[dict[str, Any]]:
     """Return the images whose error is much larger than that of the others, the largest first.
 
     Args:
         frames: Global numbers, shape (N,).
         rms: Their root mean square errors, shape (N,), metres.
         threshold: Of the robust z score; Iglewicz and Hoaglin (1993) advise 3.5.
+
+    Returns:
+        Of each its global number, its error in millimetres, and how many robust standard deviations
+        the logarithm of its error is above the median.
     """
     usable = np.isfinite(rms) & (rms > 0)
     logarithm = np.log(rms[usable])
@@ -115,11 +105,11 @@ def outlying_images(
     if not spread > 0:
         return []
     found = [
-        ImageOutlier(int(frame), float(1e3 * error), float(z))
+        {"frame": int(frame), "rms_mm": float(1e3 * error), "z": float(z)}
         for frame, error, z in zip(frames[usable], rms[usable], deviation / spread, strict=True)
         if z > threshold
     ]
-    return sorted(found, key=lambda outlier: -outlier.z)
+    return sorted(found, key=lambda outlier: -outlier["z"])
 
 
 def deviation(

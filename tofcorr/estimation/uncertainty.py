@@ -46,14 +46,12 @@ class Covariance:
     Attributes:
         matrix: Shape (P, P); metres and radians for the hand-eye (camera axes), metres for the
             coefficients.
+            The variance of directions that the images do not determine is not in it.
         jackknife: The parameters' shift when one pose is left out, shape (G, P).
-        undetermined_directions: How many directions the images do not determine; their variance
-            is not in `matrix`.
     """
 
     matrix: Float[Tensor, "P P"]
     jackknife: Float[Tensor, "G P"]
-    undetermined_directions: int
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -99,7 +97,7 @@ def jackknife_covariance(
     if prior is not None:
         gain = curvature.inverse[:size, :size] @ (prior.variance * prior.factor.T)
         matrix = matrix + gain @ gain.T
-    return Covariance(matrix, shift, int((~curvature.resolved).sum()))
+    return Covariance(matrix, shift)
 
 
 def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
@@ -188,11 +186,6 @@ class Observability(NamedTuple):
     def undetermined(self) -> list[Direction]:
         """The directions that the images do not determine."""
         return [direction for direction in self.directions if direction.is_undetermined]
-
-    @property
-    def worst_sigma(self) -> float:
-        """The weakest direction's sigma, metres or radians."""
-        return self.directions[0].sigma
 
 
 def observability(

@@ -67,7 +67,7 @@ class PixelWeights:
     def to_mapping(self) -> dict[str, Any]:
         """Return how pixels are weighted, for the report."""
         return {
-            "noise": None if self.noise is None else self.noise.to_mapping(),
+            "noise": None if self.noise is None else self.noise._asdict(),
             "robust": self.loss,
             "scale_mm": None if self.model is None else 1e3 * self.scale,
         }

@@ -60,12 +60,39 @@ class PosePool:
     described: Tensor
 
     def moments(
-        self, design: Design, tool_from_camera: Tensor, pixel_share: float, enough: int = 4000
+        self, design: Design, tool_from_camera: Tensor, pixel_share: float = 1.0, enough: int = 4000
     ) -> ImageMoments:
-        """Return the moments to expect of a camera without error; see `predicted_moments`."""
+        """Return the moments that views of a checkerboard would have if the camera had no error.
+
+        Args:
+            design: The columns.
+            tool_from_camera: The hand-eye transform, shape (4, 4).
+            pixel_share: Share of the pixels that are usable.
+            enough: Larger images, which are smooth, are predicted from about this many pixels.
+        """
+        step = max(1, round((design.ray_directions[..., 0].numel() / enough) ** 0.5))
+        design = copy(design)
+        design.ray_directions = rays = design.ray_directions[::step, ::step]
+        design.pixel_functions = design.pixel_functions[:, ::step, ::step]
+        accumulator = MomentAccumulator(design)
+        # Squares of four pixels a side; only their contrast matters.
+        rows, columns = (torch.arange(size) // 4 for size in rays.shape[:2])
+        bright, parts = (rows[:, None] + columns) % 2, []
         planes = plane_in_frame(self.normal_world, self.offset, self.world_from_tool)
-        brightness = self.brightness
-        return predicted_moments(design, tool_from_camera, *planes, brightness, pixel_share, enough)
+        normal, offset = plane_in_frame(*planes, tool_from_camera.expand(len(planes[1]), 4, 4))
+        for chunk in torch.arange(len(offset)).split(max(1, CHUNK_PIXELS // bright.numel())):
+            distance = ray_plane_distance(rays, normal[chunk], offset[chunk])
+            cosine = -torch.einsum("hwa,ba->bhw", rays, normal[chunk])
+            batch = FrameBatch(
+                indices=chunk,
+                radial_distance=distance,
+                amplitude=self.brightness[chunk][:, bright].exp() * cosine / distance.square(),
+                valid=distance.isfinite() & (cosine > 0),
+                normal_tool=planes[0][chunk],
+                offset_tool=planes[1][chunk],
+            )
+            parts.append(accumulator(batch, torch.full_like(distance, pixel_share * step**2)))
+        return concatenate(parts)
 
 
 def draw_views(
@@ -303,53 +330,6 @@ def advise(
         before, after = 1e3 * spreads[0, :6], 1e3 * spreads[-1, :6]
         advice["hand_eye_sigma_mm_or_mrad"] = {"before": before.tolist(), "after": after.tolist()}
     return order, advice
-
-
-def predicted_moments(
-    design: Design,
-    tool_from_camera: Tensor,
-    normal_tool: Tensor,
-    offset_tool: Tensor,
-    brightness: Tensor,
-    pixel_share: float = 1.0,
-    enough: int = 4000,
-) -> ImageMoments:
-    """Return the moments that views of a checkerboard would have if the camera had no error.
-
-    Args:
-        design: The columns.
-        tool_from_camera: The hand-eye transform, shape (4, 4).
-        normal_tool: The wall's unit normals in the tool frame, shape (M, 3).
-        offset_tool: Its offsets in the tool frame, shape (M,), metres.
-        brightness: Logarithms of the normalised amplitude A D^2 / cosine of the dark and of the
-            bright squares, shape (M, 2).
-        pixel_share: Share of the pixels that are usable.
-        enough: Larger images, which are smooth, are predicted from about this many pixels.
-    """
-    step = max(1, round((design.ray_directions[..., 0].numel() / enough) ** 0.5))
-    design = copy(design)
-    design.ray_directions = rays = design.ray_directions[::step, ::step]
-    design.pixel_functions = design.pixel_functions[:, ::step, ::step]
-    accumulator = MomentAccumulator(design)
-    # Squares of four pixels a side; only their contrast matters.
-    rows, columns = (torch.arange(size) // 4 for size in rays.shape[:2])
-    bright = (rows[:, None] + columns) % 2
-    parts = []
-    for chunk in torch.arange(len(offset_tool)).split(max(1, CHUNK_PIXELS // bright.numel())):
-        normal = normal_tool[chunk] @ tool_from_camera[:3, :3]
-        offset = normal_tool[chunk] @ tool_from_camera[:3, 3] + offset_tool[chunk]
-        distance = ray_plane_distance(rays, normal, offset)
-        cosine = -torch.einsum("hwa,ba->bhw", rays, normal)
-        batch = FrameBatch(
-            indices=chunk,
-            radial_distance=distance,
-            amplitude=brightness[chunk][:, bright].exp() * cosine / distance.square(),
-            valid=distance.isfinite() & (cosine > 0),
-            normal_tool=normal_tool[chunk],
-            offset_tool=offset_tool[chunk],
-        )
-        parts.append(accumulator(batch, torch.full_like(distance, pixel_share * step**2)))
-    return concatenate(parts)
 
 
 def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[list[int], Tensor]:

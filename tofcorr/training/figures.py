@@ -193,10 +193,8 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
     for stage, error in sample.errors_mm.items():
         label, colour = _STAGES.get(stage, (stage, "k"))
         draw_profile(panels[0], x, error, colour, label)
-    for chosen, colour, label in (
-        (~tested, "tab:blue", "fitted"),
-        (tested, "tab:green", "held out"),
-    ):
+    halves = (~tested, "tab:blue", "fitted"), (tested, "tab:green", "held out")
+    for chosen, colour, label in halves:
         if chosen.any():
             draw_profile(panels[1], x[chosen], last[chosen], colour, label, ends)
     titles = "All stages: mean, and one standard deviation", "After correction"
@@ -283,10 +281,8 @@ def points_figure(calibration: Calibration, frame: int, points: int = 4000) -> "
     figure.suptitle(f"Frame {frame}, {data.targets[frame]}: points and plane, height stretched")
     low, high = ends_of(np.concatenate([cloud[:, 2] for cloud in clouds.values()]))
     for k, (stage, cloud) in enumerate(clouds.items()):
-        axes, (label, colour) = (
-            figure.add_subplot(1, len(clouds), k + 1, projection="3d"),
-            _STAGES[stage],
-        )
+        axes = figure.add_subplot(1, len(clouds), k + 1, projection="3d")
+        label, colour = _STAGES[stage]
         x, y = np.meshgrid(*(np.array([one.min(), one.max()]) for one in cloud[:, :2].T))
         axes.plot_surface(x, y, np.zeros_like(x), color=("0.5", 0.3))  # type: ignore[attr-defined]
         shown = cloud[(cloud[:, 2] >= low) & (cloud[:, 2] <= high)]

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from tofcorr.estimation.moments import ImageMoments, Parameters, residual_vectors
+from tofcorr.estimation.moments import Parameters
+from tofcorr.estimation.regularisation import total_weight
 from tofcorr.estimation.solvers import Solution
 from tofcorr.geometry import se3
 from tofcorr.pixels.sample import sample_pixels
@@ -82,10 +82,7 @@ class RunMonitor:
         """
         if not self.iterations:
             return
-        moments, targets = calibration.fit.moments, calibration.data.targets[calibration.train]
-        start, last = self.iterations[0].parameters, self.iterations[-1].iterations
-
-        before = start.tool_from_camera
+        moments, before = calibration.fit.moments, self.iterations[0].parameters.tool_from_camera
         # TensorBoard allows no ^ in a tag; c^1 of the column must not become c1.
         tags = [f"coefficients_mm/{name.replace('^', '_to_the_')}" for name in moments.symbols]
 
@@ -95,20 +92,19 @@ class RunMonitor:
             turned = torch.rad2deg(se3.rotation_angle(before[:3, :3].T @ after[:3, :3]))
             names = ("t_x_mm", "t_y_mm", "t_z_mm", "rotation_deg")
             moved = zip(names, [*shift, float(turned)], strict=True)
-            parts = loss_parts(moments, now, targets)
             return {
                 **{f"hand_eye_since_start/{name}": value for name, value in moved},
                 **dict(zip(tags, (1e3 * now.coefficients).tolist(), strict=True)),
-                **{f"rms_mm/{name}": value for name, value in parts.items()},
             }
 
         for iteration, when in zip(self.iterations, self._times, strict=True):
             left = math.log10(max(iteration.step_left, sys.float_info.min))
             own = {"convergence/loss_m2": iteration.loss, "convergence/log10_step_left_se": left}
+            own["convergence/rms_mm"] = 1e3 * math.sqrt(iteration.loss / total_weight(moments))
             for tag, value in (own | state(iteration.parameters)).items():
                 yield tag, value, iteration.iterations, when
         for tag, value in state(calibration.fit.solution.parameters).items():
-            yield tag, value, last + 1, self._times[-1]
+            yield tag, value, self.iterations[-1].iterations + 1, self._times[-1]
 
 
 @contextmanager
@@ -174,43 +170,3 @@ def _write_figures(
     image, words = error_picture(*error_images(calibration, frames_to_show(calibration)))
     writer.add_image("frames/error_before_and_after", image, dataformats="HWC")
     writer.add_text("frames/error_before_and_after", words)
-
-
-def loss_parts(
-    moments: ImageMoments, parameters: Parameters, targets: np.ndarray
-) -> dict[str, float]:
-    """Split the loss by target, and into a share between images and a share within them.
-
-    The share between images is that of the images' mean residuals, which errors of pose, hand-eye
-    and plane cause. The share within is that of the residuals less each image's mean. The squares
-    of both add up to that of `all`.
-
-    Args:
-        moments: Moments of the images.
-        parameters: Where to evaluate the loss.
-        targets: Each image's target, shape (N,), text.
-
-    Returns:
-        Root mean square distances to the plane in mm: `all`, `between_images`, `within_images`,
-        and `target_NAME` for each target.
-    """
-    p = residual_vectors(moments, parameters)
-    by_pixel = torch.einsum("nqr,nr->nq", moments.gram, p)
-    squares = (by_pixel * p).sum(dim=1).clamp(min=0)
-    weight = moments.gram[:, -1, -1]
-    # The last column is the constant 1, so its row of G p is the sum of the residuals.
-    between = by_pixel[:, -1].square() / weight.clamp(min=sys.float_info.min)
-
-    def rms_mm(of_images: Tensor, among: Tensor) -> float:
-        return 1e3 * float((of_images[among].sum() / weight[among].sum()).sqrt())
-
-    every = torch.ones_like(weight, dtype=torch.bool)
-    return {
-        "all": rms_mm(squares, every),
-        "between_images": rms_mm(between, every),
-        "within_images": rms_mm((squares - between).clamp(min=0), every),
-        **{
-            f"target_{target}": rms_mm(squares, torch.from_numpy(targets == target))
-            for target in np.unique(targets)
-        },
-    }

@@ -179,7 +179,7 @@ def training_report(
         "left_out": left_out_mapping({*inspection.outlying} - {*calibration.frames}, inspection),
         "weights": None if fit.weights is None else fit.weights.to_mapping(),
         "walls": None if fit.walls is None else fit.walls.summary(),
-        "outlying_images": [one._asdict() for one in outlying_images(after.frames, rms)],
+        "outlying_images": outlying_images(after.frames, rms),
         "observability": observability_summary(fit, support),
         "advice": advice,
         "plausibility": [one.to_mapping() for one in inspection.findings],
@@ -263,7 +263,7 @@ def calibration_mapping(
             "modulation_frequency_hz": data.first.modulation_frequency,
         },
         "held_out_error_mm": report["error_mm"]["after"]["test"],
-        "noise": None if fit.noise is None else fit.noise.to_mapping(),
+        "noise": None if fit.noise is None else fit.noise._asdict(),
     }
 
 

@@ -3,13 +3,13 @@
 import json
 import logging
 import signal
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from tofcorr.correction.corrector import DepthCorrector
@@ -152,14 +152,10 @@ class TrainingResult:
         if self.force or self.report["verdict"] != DO_NOT_USE:
             export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
         self.write_report(folder)
-        for name, text in (
-            ("config.yaml", dump_yaml(options.to_mapping(), last="model")),
-            (
-                "calibration.yaml",
-                dump_yaml(calibration_mapping(self.data, options, fit, self.report)),
-            ),
-        ):
-            (folder / name).write_text(text, encoding="utf-8")
+        text = dump_yaml(options.to_mapping(), last="model")
+        (folder / "config.yaml").write_text(text, encoding="utf-8")
+        text = dump_yaml(calibration_mapping(self.data, options, fit, self.report))
+        (folder / "calibration.yaml").write_text(text, encoding="utf-8")
 
     def write_report(self, folder: Path) -> None:
         """Write report.json, whole or not at all; an older one is replaced."""
@@ -223,15 +219,10 @@ def interruptible() -> Iterator[list[int]]:
         The signals received so far; empty until Ctrl-C is pressed.
     """
     received: list[int] = []
-
-    def note(number: int, _: FrameType | None) -> None:
-        received.append(number)
-
-    try:
-        before = signal.signal(signal.SIGINT, note)
-    except ValueError:
+    if threading.current_thread() is not threading.main_thread():
         yield received
         return
+    before = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
     try:
         yield received
     finally:
