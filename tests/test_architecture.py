@@ -2,11 +2,11 @@
 
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
+import grimp
 import pytest
-from import_graph import Graph, circles, import_graph, imported, reached_from
+from import_graph import imported
 
 from tofcorr.cli.main import COMMANDS
 from tofcorr.importing.registry import IMPORTERS
@@ -63,70 +63,16 @@ for words in {asked!r}:
     assert done.stdout.count("Usage: tofcorr") == len(asked)
 
 
-CONTRACTS = {
-    contract["name"]: contract
-    for contract in tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
-        "importlinter"
-    ]["contracts"]
-}
-
-
-@pytest.fixture(scope="module")
-def graph() -> Graph:
-    return import_graph()
-
-
-def test_no_files_import_each_other_in_a_circle(graph: Graph) -> None:
-    assert circles(graph) == []
-
-
-def test_no_import_runs_to_a_higher_layer(graph: Graph) -> None:
-    layers = [layer.split(" | ") for layer in CONTRACTS["Layers"]["layers"]]
-    rank = {name: number for number, names in enumerate(layers) for name in names}
-    upward = [
-        f"{module} imports {other}"
-        for module, others in graph.items()
-        for other in others
-        if "." in module and (other == "tofcorr" or not _may_import(module, other, rank))
-    ]
-    assert upward == []
-
-
-def _may_import(module: str, other: str, rank: dict[str, int]) -> bool:
-    """Return whether a room, the first name below the package, stands above the other."""
-    own, its = module.split(".")[1], other.split(".")[1]
-    return own == its or rank[own] < rank[its]
-
-
-@pytest.mark.parametrize("name", [n for n, c in CONTRACTS.items() if c["type"] == "forbidden"])
-def test_what_a_room_may_not_reach_it_does_not_reach(name: str, graph: Graph) -> None:
-    rooms = tuple(f"{room}." for room in CONTRACTS[name]["source_modules"])
-    forbidden = tuple(f"{room}." for room in CONTRACTS[name]["forbidden_modules"])
-    reached = {
-        f"{module} reaches {other}"
-        for module in graph
-        if f"{module}.".startswith(rooms)
-        for other in reached_from(module, graph)
-        if f"{other}.".startswith(forbidden)
+def test_no_files_import_each_other_in_a_circle() -> None:
+    """Imports inside functions count; those under `if TYPE_CHECKING` do not run."""
+    graph = grimp.build_graph("tofcorr", exclude_type_checking_imports=True, cache_dir=None)
+    circles = {
+        (module, other)
+        for module in graph.modules
+        for other in graph.find_modules_directly_imported_by(module)
+        if module in graph.find_upstream_modules(other)
     }
-    assert reached == set()
-
-
-def test_late_imports_and_imports_by_name_are_seen(tmp_path: Path) -> None:
-    files = {
-        "__init__.py": "",
-        "a.py": "def f():\n    from pkg import b",
-        "b.py": "from importlib import import_module\nimport_module(f'pkg.{\"c\" + str()}')\n'c'",
-        "c.py": "from pkg.a import f",
-        "d.py": "if TYPE_CHECKING:\n    from pkg.e import x",
-        "e.py": "import pkg.d",
-    }
-    (tmp_path / "pkg").mkdir()
-    for name, text in files.items():
-        (tmp_path / "pkg" / name).write_text(text, encoding="utf-8")
-    graph = import_graph(tmp_path / "pkg")
-    assert circles(graph) == [["pkg.a", "pkg.b", "pkg.c"]]
-    assert graph["pkg.e"] == {"pkg.d"}
+    assert circles == set()
 
 
 def test_no_source_file_is_long_without_a_reason() -> None:

@@ -1,6 +1,5 @@
 """The report names what a recording does not determine."""
 
-import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -23,7 +22,6 @@ from tofcorr.estimation.uncertainty import (
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.judgement import judge
-from tofcorr.training.report import observability_summary
 from tofcorr.training.support import recording_support, shortcomings
 
 FitOf = Callable[[str], Fit]
@@ -198,11 +196,3 @@ def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
     expected = torch.linalg.eigvalsh(spread).flip(0).sqrt()
     got = torch.tensor([direction.sigma for direction in found.directions], dtype=torch.float64)
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=0)
-
-
-def test_the_summary_is_plain_json(walls: dict[str, Dataset], fits: FitOf) -> None:
-    dataset, result = walls["no tilt"], fits("no tilt")
-    best = result.solution.parameters.tool_from_camera
-    support = recording_support(dataset, np.arange(dataset.num_frames), best)
-    text = json.dumps(observability_summary(result, support), allow_nan=False)
-    assert len(json.loads(text)["prior"]) == 4

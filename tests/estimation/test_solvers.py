@@ -106,18 +106,6 @@ def test_a_watcher_sees_every_iteration_and_can_interrupt(generator: torch.Gener
     assert torch.equal(seen[-1].parameters.tool_from_camera, solution.parameters.tool_from_camera)
 
 
-def test_going_on_from_an_interruption_ends_at_the_same_optimum(generator: torch.Generator) -> None:
-    scene = make_scene(generator, EA)
-    objective = MomentObjective(scene.moments())
-    start = nearby(scene.truth, generator, 0.05)
-    half_way = minimise(objective, start, watcher=lambda iteration: iteration.iterations < 2)
-    resumed = minimise(objective, half_way.parameters)
-    in_one_go = minimise(objective, start)
-    assert resumed.converged
-    assert resumed.loss == pytest.approx(in_one_go.loss, rel=1e-12)
-    assert apart(resumed.parameters, in_one_go.parameters)[0] < 1e-4
-
-
 def test_a_fixed_hand_eye_stays_exactly_where_it_is(generator: torch.Generator) -> None:
     scene = make_scene(generator, EA)
     objective = MomentObjective(scene.moments())
