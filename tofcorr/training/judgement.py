@@ -180,8 +180,6 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
         yield DO_NOT_USE, f"{measured}: the depth correction makes them worse."
     elif held_out > _NO_GAIN * bare and held_out > 3 * noise:
         yield DO_NOT_USE, f"{measured}: the correction gains nothing, so poses or planes are wrong."
-    elif held_out > bare:
-        yield "good", f"{measured}: the hand-eye transform is enough for this camera."
     # No application bears 30 mm, the raw error of most cameras, or eight times the noise.
     if error > max(30, 8 * noise):
         off = f"Frames are off by {error:.0f} mm RMS after the fit"
@@ -191,6 +189,8 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
     if held_out > _OVERFITTED * fitted:
         own = f"much more than the {fitted:.1f} mm of the fit itself"
         yield "usable", f"{measured}, {own}: record more views, or choose a smaller model."
+    elif bare < held_out <= _WORSE * bare:
+        yield "good", f"{measured}: the hand-eye transform is enough for this camera."
 
 
 def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
