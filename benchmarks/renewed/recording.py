@@ -32,6 +32,7 @@ class Recorded:
     depth: Array  # (N, H, W) of the kind that the camera gives, NaN where nothing returned
     amplitude: Array  # counts
     mask: np.ndarray
+    stated_target: Array | None = None  # world_from_target of each frame; None: that of the world
 
 
 @dataclass(frozen=True)
@@ -138,13 +139,14 @@ def write_recording(
 
 def _frames(recorded: Recorded, without: Collection[str]) -> str:
     world, poses, n = recorded.world, recorded.stated_poses, recorded.world.frames
-    normal = world.world_from_target[:3, 2]
+    target = world.world_from_target if recorded.stated_target is None else recorded.stated_target
+    target = np.broadcast_to(target, (n, 4, 4))
     columns: dict[str, Any] = {"frame": np.arange(n), "timestamp_s": world.way.seconds}
     columns |= dict(zip(("tx", "ty", "tz"), poses[:, :3, 3].T, strict=True))
     quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
     columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
-    columns |= {k: np.full(n, v) for k, v in zip(("nx", "ny", "nz"), normal, strict=True)}
-    columns["d"] = np.full(n, -normal @ world.world_from_target[:3, 3])
+    columns |= dict(zip(("nx", "ny", "nz"), target[:, :3, 2].T, strict=True))
+    columns["d"] = -(target[:, :3, 2] * target[:, :3, 3]).sum(-1)
     columns["target"] = list(world.surface.kind)
     if not world.design.moving:
         columns["pose_id"] = world.way.pose_id

@@ -107,7 +107,7 @@ class Check:
         counts = counts_by_name(kinds, cases, list(self._kinds), self._what)
         for name in counts:
             if (needed := self._kinds[name]) and needed not in os.environ:
-                raise click.UsageError(f"{name} needs the folder of real recordings in ${needed}")
+                raise click.UsageError(f"{name} needs the environment variable {needed}")
         for _ in tqdm(
             write_cases(seed, self._write(seed, counts, out), out), "recordings", unit=""
         ):

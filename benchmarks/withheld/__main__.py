@@ -1,5 +1,6 @@
 """`python -m benchmarks.withheld`: the regression set, and pairs of a camera and a simulator."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -24,11 +25,12 @@ from benchmarks.sealed.scores import (
     scores_table,
     set_sizes,
     share_score,
+    table,
     unknown,
     wrong,
 )
 from benchmarks.withheld.pairs import pairs
-from benchmarks.withheld.tiers import TIERS, write_case
+from benchmarks.withheld.tiers import AUDIT, TIERS, write_case
 
 REAL_FORMS = ("odd_harmonics", "clear_layer", "soft_knee", "free_columns", "every_pixel")
 REAL_MM = (3.0, 6.0)
@@ -72,7 +74,9 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
         *_real([one for one in outcomes if one.tier == "K"]),
         share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
     ]
-    return [one for one in scores if one.count], scores_table(scores)
+    audited = [one for one in outcomes if one.tier == "L"]
+    text = "\n\n".join([scores_table(scores), *([audit_table(audited)] if audited else [])])
+    return [one for one in scores if one.count], text
 
 
 def _single(cases: Sequence[Outcome], fresh: Mapping[str, Outcome]) -> list[Score]:
@@ -225,10 +229,42 @@ def _real(cases: Sequence[Outcome]) -> list[Score]:
     return [*scores, share_score("K", NEW_NAME, some, names_something_new(cases))]
 
 
+RIGHT, SET, WARNING, WRONG = ANSWERS = ("right", "set holds it", "warning says why", "WRONG")
+
+
+def judged(one: Outcome) -> str:
+    """The judgement of a case of tier L.
+
+    A set without a true effect is wrong, whatever else is said; so is silence about an effect, and
+    a missing warning where one is needed. "Unknown" is a warning where an effect is missing, and so
+    is a refusal.
+    """
+    if "CalibrationDataError" in one.said.failure:
+        return WARNING
+    sets, needed, left = one.said.sets, one.case["says"], one.truths - set().union(*one.said.sets)
+    warned = not needed or any(needed in text for text in one.said.report.get("warnings", []))
+    if one.said.failure or not warned or any(not members & one.truths for members in sets):
+        return WRONG
+    if not one.truths:
+        return WRONG if sets or unknown(one) else WARNING if needed else RIGHT
+    if not left:
+        return RIGHT if all(len(members) == 1 for members in sets) else SET
+    return WARNING if unknown(one) else WRONG
+
+
+def audit_table(cases: Sequence[Outcome]) -> str:
+    """How often each case of an audit is answered how."""
+    rows = []
+    for row in AUDIT:
+        found = Counter(judged(one) for one in cases if one.case["row"] == row)
+        rows.append((row, found.total(), *(found[answer] or "" for answer in ANSWERS)))
+    return table(("case", "n", *ANSWERS), rows)
+
+
 main = Check(
     "Check `tofcorr diagnose` on recordings whose effect is withheld from it.",
     "tier",
-    dict.fromkeys(TIERS, "") | {"K": "TOFCORR_REAL_DATA"},
+    dict.fromkeys(TIERS, "") | {"K": "TOFCORR_REAL_DATA", "L": "DRJIT_LIBLLVM_PATH"},
     generate,
     score_all,
     cases=40,

@@ -1,7 +1,7 @@
 """Which cases each tier asks for: designs of the generator of `benchmarks.renewed`."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,12 @@ import numpy as np
 from benchmarks.renewed import ranges
 from benchmarks.renewed.cases import Case, agree, in_world, make_case, seeded, turn, write_sealed
 from benchmarks.renewed.forms import EFFECTS, FORM, INSIDE, OUTSIDE
-from benchmarks.renewed.geometry import Array
+from benchmarks.renewed.forms.further import inverse_amplitude, knee, trefoil
+from benchmarks.renewed.geometry import inverse, small_motions
 from benchmarks.renewed.ranges import Range
-from benchmarks.renewed.recording import record
-from benchmarks.renewed.signal_chain import Change, Form, View, form
-from benchmarks.renewed.world import World, session_again
+from benchmarks.renewed.recording import Recorded, depth_over_range, record
+from benchmarks.renewed.signal_chain import Form
+from benchmarks.renewed.world import session_again
 from benchmarks.sealed.answers import Entry
 
 # Effects of the program's catalogue that hold another one as a special case: a catalogue without
@@ -30,31 +31,6 @@ TEXTBOOK = {one.effect: one for one in reversed(FORMS) if one.textbook}
 USUAL, LARGE = Range(0.5, 16.0, log=True), Range(2.0, 16.0, log=True)
 
 
-@form("distance", "path", 0.005)
-def knee(rng: np.random.Generator, world: World) -> Change:
-    """The error has a knee in distance."""
-    at = rng.uniform(0.3, 0.7) * (world.design.near + world.design.far)
-    return lambda strength, view, path: path + strength * np.abs(view.distance - at)
-
-
-@form("pixel", "path", 0.005)
-def trefoil(rng: np.random.Generator, world: World) -> Change:
-    """The error over the image is a trefoil."""
-    column, row = world.pixel_position
-    wave = np.hypot(column, row) ** 3 * np.cos(3 * np.arctan2(row, column) + rng.uniform(0, 6))
-    return lambda strength, view, path: path + strength * wave
-
-
-@form("amplitude", "path", 0.0005)
-def inverse_amplitude(rng: np.random.Generator, world: World) -> Change:
-    """The error goes with one over the amplitude."""
-
-    def change(strength: float, view: View, path: Array) -> Array:
-        return path + strength * np.minimum(view.bright / view.amplitude, 50.0)
-
-    return change
-
-
 @dataclass(frozen=True)
 class Draw:
     """What one case is made of.
@@ -67,6 +43,7 @@ class Draw:
         without: Columns and files that are not written.
         judged: Whether the effect can be judged without these.
         exclude: What the catalogue must do without.
+        fault: What is done to the recording after the camera.
         partner: The design of another session of the same camera; None: there is none.
         role: Of that session: `fresh`, or `cured`.
         about: What the answer says besides.
@@ -79,6 +56,7 @@ class Draw:
     without: tuple[str, ...] = ()
     judged: bool = True
     exclude: tuple[str, ...] = ()
+    fault: Callable[[np.random.Generator, Recorded], Recorded] | None = None
     partner: Mapping[str, Any] | None = None
     role: str = ""
     about: Mapping[str, Any] = field(default_factory=dict)
@@ -153,6 +131,86 @@ def _base(index: int, rng: np.random.Generator) -> Draw:
     return Draw(forms, Range(3.0, 6.0), about={"base": own.effect})
 
 
+# The cases of an audit.
+
+BOARD = (1e-3, 2e-3)  # metres and radians, each axis: errors of a board's pose
+OFF_SHARE, OFF_BY = 0.03, 0.7  # of the pixels; metres
+
+
+def far_pixels(rng: np.random.Generator, recorded: Recorded) -> Recorded:
+    """Single pixels are far off, and the mask has them."""
+    off = rng.uniform(size=recorded.depth.shape) < OFF_SHARE
+    depth = recorded.depth + off * OFF_BY * depth_over_range(recorded.world)
+    return replace(recorded, depth=depth)
+
+
+def board_planes(rng: np.random.Generator, recorded: Recorded) -> Recorded:
+    """No robot: each pose's plane comes from the picture of a board, with its errors."""
+    world = recorded.world
+    draws = (size * rng.standard_normal((world.way.poses, 3)) for size in BOARD)
+    true = inverse(world.world_from_tool() @ world.tool_from_camera) @ world.world_from_target
+    still = np.broadcast_to(np.eye(4), true.shape)
+    board = small_motions(*draws)[world.way.pose_id] @ true
+    guess = replace(world, guess=np.eye(4))
+    return replace(recorded, world=guess, stated_poses=still, stated_target=board)
+
+
+NO_AMPLITUDE: dict[str, Any] = {"without": ("amplitude.npy",)}
+OUTLIERS = {"says": "outliers"}  # a warning that must be there
+WIDE_IMAGE = {"ranges": {"images": {(224, 172): 1.0}, "frames": {40: 1.0}}}
+AUDIT: dict[str, tuple[str, dict[str, Any]]] = {
+    "multipath, weight falls with height": ("above_floor", {"sizes": Range(6.0, 20.0, log=True)}),
+    "stray light, 172x224": ("spread veil ghost", WIDE_IMAGE),
+    "noise of a filter, nothing missing": ("", {"ranges": NOISES["a filter"]}),
+    "robot 2 mm, nothing missing": ("", {"ranges": NOISES["a worse robot"]}),
+    "board poses 1 mm / 2 mrad, no robot, nothing missing": (
+        "",
+        {"ranges": {"robot_mm": Range(0.0, 0.0)}, "fault": board_planes},
+    ),
+    "3 % of the pixels 0.7 m off": ("", {"fault": far_pixels, "about": OUTLIERS}),
+    "wiggling, no amplitude, varied exposure": ("odd_harmonics", NO_AMPLITUDE),
+    "the same before a white wall": (
+        "odd_harmonics",
+        NO_AMPLITUDE | {"ranges": {"targets": {"white": 1.0}}},
+    ),
+    "wiggling times amplitude": ("wiggle_of_dark", {}),
+    "30 frames": (
+        "odd_harmonics driver_droop halves_and_pairs two_exponentials veil",
+        {"ranges": {"frames": {30: 1.0}}},
+    ),
+    "200 frames of warm-up": (
+        "two_exponentials line_with_pauses",
+        {"ranges": {"frames": {200: 1.0}}},
+    ),
+    "0.5 to 6 m": (
+        "odd_harmonics duty_cycle",
+        {"ranges": {"farthest_times": Range(12.0, 12.0)}},
+    ),
+    "two effects": (
+        "odd_harmonics+logarithm halves_and_pairs+two_exponentials clear_layer+driver_droop",
+        {},
+    ),
+    "172x224, nothing missing": ("", WIDE_IMAGE),
+    "a bracket that sags with the roll": ("sagging_bracket", {}),
+    "board edges, true footprints": (
+        "aperture",
+        {"wanted": {"mask": "all that is seen"}, "about": OUTLIERS},
+    ),
+    "rendered wall, floor, side wall": ("rendered_corner", {}),
+    "rendered bright room": ("bright_room", {}),
+}
+"""Forms of each draw in turn, those of one draw joined by +; and what else differs."""
+
+
+def _audit(index: int, rng: np.random.Generator) -> Draw:
+    row, (names, changes) = list(AUDIT.items())[index % len(AUDIT)]
+    turns = names.split() or [""]
+    joined = turns[index // len(AUDIT) % len(turns)]
+    forms = tuple(FORM[name] for name in joined.split("+") if name)
+    usual: dict[str, Any] = {"sizes": Range(4.0, 10.0, log=True)} | changes
+    return Draw(forms, **usual | {"about": {"row": row, "says": "", **changes.get("about", {})}})
+
+
 TIERS: dict[str, Callable[[int, np.random.Generator], Draw]] = {
     "A": lambda index, rng: Draw(
         _one(index), partner={"frames": 120} if index % 2 else None, role="fresh"
@@ -166,6 +224,7 @@ TIERS: dict[str, Callable[[int, np.random.Generator], Draw]] = {
     "H": lambda index, rng: Draw(_one(index // 3), wanted={"frames": (15, 30, 60)[index % 3]}),
     "I": _noise,
     "J": _base,
+    "L": _audit,
 }
 
 
@@ -180,6 +239,8 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> Iterator[Entry]:
     with ranges.drawn_from(**{**ranges.PLAIN, **draw.ranges}):
         forms = seeded(draw.forms, int(rng.integers(2**32)))
         case = make_case(rng, forms, draw.sizes, draw.wanted)
+        if draw.fault is not None:
+            case = replace(case, recorded=draw.fault(rng, case.recorded))
         entry = write_sealed(rng, case, out, about, {"role": "main", "index": index}, draw.without)
         yield entry | {"exclude": [*draw.exclude]}
         if draw.partner is not None:

@@ -1,4 +1,4 @@
-"""Laws of the small recordings of `levels` and of the rows of `audit`, and of their tables."""
+"""Laws of the small recordings of `levels` and of the cases of an audit, and of their tables."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,12 +8,15 @@ from typing import cast
 import numpy as np
 import pytest
 
-from benchmarks import audit, levels
-from benchmarks.audit import OFF_BY, OFF_SHARE, RIGHT, ROWS, SET, WARNING, WRONG, judged, write_draw
+from benchmarks import levels
 from benchmarks.renewed import ranges
 from benchmarks.renewed.cases import wanted_by
-from benchmarks.renewed.recording import read
+from benchmarks.renewed.recording import Data, read
+from benchmarks.sealed.answers import Outcome, Said, load
+from benchmarks.sealed.oracle import Oracle
 from benchmarks.sealed.remains import true_gaps_mm
+from benchmarks.withheld.__main__ import RIGHT, SET, WARNING, WRONG, audit_table, judged
+from benchmarks.withheld.tiers import AUDIT, OFF_BY, OFF_SHARE, write_case
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -43,14 +46,6 @@ def test_a_case_depends_on_seed_kind_and_number_alone(tmp_path: Path) -> None:
     assert first.described() == again.described()
     np.testing.assert_array_equal(first.truth.expected, again.truth.expected)
     assert 3.0 * 0.9 < max(first.sizes_mm.values()) < 6.0 * 1.1
-    one = write_draw(7, "height", 1, tmp_path / "d")
-    write_draw(7, "no_amplitude", 0, tmp_path / "e")
-    np.testing.assert_array_equal(
-        one.truth.expected, write_draw(7, "height", 1, tmp_path / "f").truth.expected
-    )
-    assert not (tmp_path / "e" / "amplitude.npy").exists()
-    low, high = ROWS["height"].size_mm.low, ROWS["height"].size_mm.high
-    assert 0.8 * low < one.sizes_mm["multipath"] < 1.2 * high
 
 
 def test_the_true_gap_of_distances_without_noise_is_all_that_a_model_leaves(tmp_path: Path) -> None:
@@ -110,27 +105,32 @@ def test_tables_count_what_is_said_and_what_intervals_hold() -> None:
     assert "| size of a set | 1.25 |" in text
 
 
+def audited(name: str, folder: Path) -> tuple[Data, np.ndarray]:
+    """A recording of a case of the audit, and its distances without noise."""
+    (entry,) = write_case(8, "L", [*AUDIT].index(name), folder)
+    return read(folder / "recordings" / entry["id"]), load(folder, entry["id"], "expected")
+
+
 def test_the_share_of_pixels_that_is_asked_for_is_far_off(tmp_path: Path) -> None:
-    made = write_draw(7, "far_pixels", 0, tmp_path / "one")
-    data = read(tmp_path / "one")
-    error = (data.depth - made.truth.expected)[data.valid]
+    data, expected = audited("3 % of the pixels 0.7 m off", tmp_path)
+    error = (data.depth - expected)[data.valid]
     far = np.abs(error - OFF_BY) < 0.1
     assert far.mean() == pytest.approx(OFF_SHARE, abs=4 * np.sqrt(OFF_SHARE / far.size))
     assert np.abs(error[~far]).max() < 0.1
 
 
 def test_planes_by_a_board_hold_the_distances_up_to_its_errors(tmp_path: Path) -> None:
-    made = write_draw(7, "board_poses", 0, tmp_path / "one")
-    data = read(tmp_path / "one")
+    data, expected = audited("board poses 1 mm / 2 mrad, no robot, nothing missing", tmp_path)
     assert not data.moves
     slope = np.einsum("nj,hwj->nhw", data.normal, data.rays)
-    off = made.truth.expected + data.offset[:, None, None] / slope
+    off = expected + data.offset[:, None, None] / slope
     left = np.abs(off - np.median(off[data.valid]))[data.valid]
     assert 0 < np.median(left) < 0.05
 
 
-def said(*sets: Sequence[str], unknown: bool = False, warning: str = "") -> dict[str, object]:
-    return {"sets": sets, "unknown": unknown, "warnings": [warning]}
+def said(*sets: Sequence[str], unknown: bool = False, warning: str = "") -> Said:
+    report = {"warnings": [warning]}
+    return Said(sets=tuple(map(frozenset, sets)), unknown=unknown, report=report)
 
 
 @pytest.mark.parametrize(
@@ -150,12 +150,11 @@ def said(*sets: Sequence[str], unknown: bool = False, warning: str = "") -> dict
     ],
 )
 def test_answers_are_judged_by_what_is_true(
-    truth: Sequence[str], answer: dict[str, object], needed: str, right: str
+    truth: Sequence[str], answer: Said, needed: str, right: str
 ) -> None:
-    assert judged(truth, answer, needed) == right
-
-
-def test_the_table_of_the_audit_counts_answers() -> None:
-    draw = {"kind": "robot", "number": 0, "judged": RIGHT}
-    text = audit.answers([draw, draw | {"judged": WRONG}])
-    assert "| robot 2 mm, nothing missing | 2 | 1 |  |  | 1 |" in text
+    case = {"tier": "L", "row": "two effects", "says": needed}
+    sizes = dict.fromkeys(truth, 5.0)
+    one = Outcome("r", {"case": case, "sizes_mm": sizes}, Oracle(5.0, 1.0, {}), answer)
+    assert judged(one) == right
+    found = [int(right == each) or "" for each in (RIGHT, SET, WARNING, WRONG)]
+    assert "| two effects | 1 | {} | {} | {} | {} |".format(*found) in audit_table([one])

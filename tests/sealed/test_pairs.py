@@ -180,7 +180,14 @@ def test_a_report_without_stages_and_blocks_is_not_measured() -> None:
 
 
 # Gaps, an error of a square, noise and missing pixels of degraded frames, see `read_degraded`.
-FIGURES = ("gap_mm", "error_of_square", "own_mm", "oracle_mm", "noise_mm", "true_noise_mm")
+FIGURES: tuple[str, ...] = (
+    "gap_mm",
+    "error_of_square",
+    "own_mm",
+    "oracle_mm",
+    "noise_mm",
+    "true_noise_mm",
+)
 NEAR = dict(zip(FIGURES, (1.05, 0.1, 1.0, 0.9, 4.2, 4.0), strict=True))
 NEAR |= {"missing": 0.01, "true_missing": 0.011}
 

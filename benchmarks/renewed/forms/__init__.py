@@ -4,6 +4,7 @@ from types import ModuleType
 
 from benchmarks.renewed.forms import (
     electronics,
+    further,
     geometry,
     heat,
     light,
@@ -24,4 +25,4 @@ def _of(*modules: ModuleType) -> tuple[Form, ...]:
 INSIDE = _of(electronics, heat, patterns, geometry, motion, light, surface)
 OUTSIDE = _of(outside)
 EFFECTS = tuple(dict.fromkeys(form.effect for form in INSIDE))
-FORM = {form.name: form for form in (*INSIDE, *OUTSIDE)}
+FORM = {form.name: form for form in (*INSIDE, *OUTSIDE, *_of(further))}
