@@ -9,8 +9,9 @@ true gaps are those of `benchmarks.sealed.remains`; the oracle's gap before, wit
 stands beside them.
 """
 
+import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from benchmarks.renewed.recording import read, write_recording
 from benchmarks.renewed.signal_chain import Form
 from benchmarks.sealed.command import OUT, SEED, counts_by_name, kept_rows
 from benchmarks.sealed.oracle import ask
-from benchmarks.sealed.scores import LEAST_MM, Share, known, share, table
+from benchmarks.sealed.scores import LEAST_MM, by_design, known, share, table
 
 Row = Mapping[str, Any]
 KINDS = ("nothing", "effect", "outside", "pair")
@@ -117,18 +118,6 @@ SAID: dict[str, Callable[[Row], bool]] = {
     "unknown": lambda row: row["unknown"],
     "detected": lambda row: row["tested"] and (bool(row["names"]) or row["unknown"]),
 }
-STRATA: dict[str, Callable[[Row], str]] = {
-    "poses": lambda row: _bin(row["design"]["poses"], (8, 16, 32, 48)),
-    "image": lambda row: f"{row['sensor']['width']}×{row['sensor']['height']}",
-    "robot, mm": lambda row: _bin(1e3 * row["design"]["robot"], (0.3, 0.6, 1.2)),
-    "spatial filter": lambda row: row["sensor"]["spatial_filter"],
-    "temporal filter": lambda row: str(row["sensor"]["temporal_filter"]),
-    "rounding, mm": lambda row: f"{row['sensor']['rounding_mm']:g}",
-    "sun": lambda row: "yes" if row["sensor"]["sun"] else "no",
-    "frequencies": lambda row: str(len(row["sensor"]["frequencies"])),
-    "mask": lambda row: row["design"]["mask"],
-    "repeats": lambda row: "yes" if row["design"]["repeated"] else "no",
-}
 QUANTILES = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 0.75)
 
 
@@ -145,10 +134,7 @@ def _levels(rows: Sequence[Row]) -> str:
     lines: list[tuple[object, ...]] = []
     for what, some in (("all", rows), ("tested", [row for row in rows if row["tested"]])):
         lines.append((what, "", len(some), *(share(map(of, some)) for of in SAID.values())))
-    for what, of in STRATA.items():
-        for value in sorted(set(map(of, rows))):
-            some = [row for row in rows if of(row) == value]
-            lines.append((what, value, len(some), *(sum(map(s, some)) for s in SAID.values())))
+    lines += by_design([(row, [of(row) for of in SAID.values()]) for row in rows])
     return table(("nothing missing", "", "n", *SAID), lines)
 
 
@@ -195,23 +181,18 @@ def _pairs(rows: Sequence[Row]) -> str:
     figures = [
         ("effects named: right, wrong, missed", f"{right}, {wrong}, {missed}"),
         ("F1 of the names", f"{2 * right / max(2 * right + wrong + missed, 1):.3f}"),
-        ("effects to be found that are in a set", _counted(held)),
-        ("a single wrong name", _counted(single)),
+        ("effects to be found that are in a set", f"{share(held)}, n = {len(held)}"),
+        ("a single wrong name", f"{share(single)}, n = {len(single)}"),
         ("size of a set", f"{sum(sizes) / max(len(sizes), 1):.2f}"),
     ]
     return table((f"{len(rows)} pairs of effects", ""), figures)
 
 
-def _counted(judged: Iterable[bool]) -> str:
-    counted: Share = share(judged)
-    return f"{counted}, n = {counted.total}"
-
-
 def _coverage(rows: Sequence[Row]) -> str:
-    poses = [_bin(row["design"]["poses"], (16, 32)) for row in rows]
     groups = {"all": rows} | {k: [row for row in rows if row["kind"] == k] for k in KINDS}
-    for name in sorted(set(poses)):
-        groups[f"{name} poses"] = [r for r, own in zip(rows, poses, strict=True) if own == name]
+    for low, high in ((0, 16), (16, 32), (32, math.inf)):
+        some = [row for row in rows if low <= row["design"]["poses"] < high]
+        groups[f"{low} poses or more"] = some
     lines = []
     for name, some in groups.items():
         held = [share(row["held"][gap] for row in some) for gap in GAPS]
@@ -220,14 +201,6 @@ def _coverage(rows: Sequence[Row]) -> str:
         lines += [(name, len(some), *held, alike)] if some else []
     head = ("95 % intervals hold the truth", "n", *GAPS, "before, all pixels alike")
     return table(head, lines)
-
-
-def _bin(value: float, edges: Sequence[float]) -> str:
-    low = [edge for edge in edges if edge <= value]
-    high = [edge for edge in edges if edge > value]
-    if not high:
-        return f"{low[-1]:g} or more"
-    return f"below {high[0]:g}" if not low else f"{low[-1]:g} to {high[0]:g}"
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})

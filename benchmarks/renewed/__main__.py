@@ -1,6 +1,6 @@
 """`python -m benchmarks.renewed`: the check on forms, sensors and robots that nobody tuned on."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmarks.renewed.cases import TIERS, write_case
@@ -14,6 +14,7 @@ from benchmarks.sealed.scores import (
     Score,
     at_least,
     at_most,
+    by_design,
     detected,
     mean_score,
     named,
@@ -71,7 +72,9 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
         *_real([one for one in outcomes if one.tier == "K"]),
         share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
     ]
-    text = "\n\n".join([scores_table(scores), by_form(cases), by_design(nulls)])
+    judged = [(one.case, (named(one), unknown(one), detected(one))) for one in nulls]
+    head = ("nothing missing", "", "n", "named", "unknown", "detected")
+    text = "\n\n".join([scores_table(scores), by_form(cases), table(head, by_design(judged))])
     return [one for one in scores if one.count], text
 
 
@@ -137,40 +140,8 @@ def by_form(cases: Sequence[Outcome]) -> str:
     return table(("effect", "form", "n", *judges), lines)
 
 
-DESIGNS: dict[str, Callable[[dict], str]] = {
-    "frames": lambda case: _bin(case["design"]["frames"], (30, 60, 120)),
-    "pixels": lambda case: _bin(case["sensor"]["width"], (48, 80, 160)),
-    "robot, mm": lambda case: _bin(1e3 * case["design"]["robot"], (0.3, 0.6, 1.2)),
-    "farthest, m": lambda case: _bin(case["design"]["far"], (1, 2, 4)),
-    "mask": lambda case: case["design"]["mask"],
-    "scene": lambda case: case["design"]["scene"],
-    "spatial filter": lambda case: case["sensor"]["spatial_filter"],
-    "temporal filter": lambda case: str(case["sensor"]["temporal_filter"]),
-    "rounding, mm": lambda case: str(case["sensor"]["rounding_mm"]),
-    "sun": lambda case: str(case["sensor"]["sun"]),
-    "frequencies": lambda case: str(len(case["sensor"]["frequencies"])),
-}
-
-
-def by_design(nulls: Sequence[Outcome]) -> str:
-    """What is said where nothing is missing, by what was drawn."""
-    rows = []
-    for what, of in DESIGNS.items():
-        for value in sorted({of(one.case) for one in nulls}):
-            some = [one for one in nulls if of(one.case) == value]
-            counts = (sum(map(judge, some)) for judge in (named, unknown, detected))
-            rows.append((what, value, len(some), *counts))
-    return table(("nothing missing", "", "n", "named", "unknown", "detected"), rows)
-
-
 def _poses(one: Outcome) -> int:
     return one.case["design"]["poses"]
-
-
-def _bin(value: float, edges: Sequence[float]) -> str:
-    low = [edge for edge in edges if edge <= value]
-    high = [edge for edge in edges if edge > value]
-    return f"{len(low)}: {low[-1] if low else 0} to {high[0] if high else 'more'}"
 
 
 main = Check(

@@ -230,6 +230,42 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
+DESIGNS: dict[str, Callable[[Any], str]] = {
+    "frames": lambda case: _bin(case["design"]["frames"], (30, 60, 120)),
+    "poses": lambda case: _bin(case["design"]["poses"], (8, 16, 32, 48)),
+    "image": lambda case: f"{case['sensor']['width']}×{case['sensor']['height']}",
+    "robot, mm": lambda case: _bin(1e3 * case["design"]["robot"], (0.3, 0.6, 1.2)),
+    "farthest, m": lambda case: _bin(case["design"]["far"], (1, 2, 4)),
+    "mask": lambda case: case["design"]["mask"],
+    "scene": lambda case: case["design"]["scene"],
+    "repeats": lambda case: "yes" if case["design"]["repeated"] else "no",
+    "spatial filter": lambda case: case["sensor"]["spatial_filter"],
+    "temporal filter": lambda case: str(case["sensor"]["temporal_filter"]),
+    "rounding, mm": lambda case: f"{case['sensor']['rounding_mm']:g}",
+    "sun": lambda case: "yes" if case["sensor"]["sun"] else "no",
+    "frequencies": lambda case: str(len(case["sensor"]["frequencies"])),
+}
+"""What is drawn of a case, in words."""
+
+
+def by_design(cases: Sequence[tuple[Mapping[str, Any], Sequence[bool]]]) -> list[tuple[Any, ...]]:
+    """Rows that count what was judged of cases, for all that have the same in common."""
+    rows = []
+    for what, of in DESIGNS.items():
+        for value in sorted({of(case) for case, _ in cases}):
+            some = [judged for case, judged in cases if of(case) == value]
+            rows.append((what, value, len(some), *map(sum, zip(*some, strict=True))))
+    return rows
+
+
+def _bin(value: float, edges: Sequence[float]) -> str:
+    low = [edge for edge in edges if edge <= value]
+    high = [edge for edge in edges if edge > value]
+    if not high:
+        return f"{low[-1]:g} or more"
+    return f"below {high[0]:g}" if not low else f"{low[-1]:g} to {high[0]:g}"
+
+
 def scores_table(scores: Iterable[Score]) -> str:
     """All figures as one table."""
     rows = []

@@ -207,8 +207,8 @@ def _audit(index: int, rng: np.random.Generator) -> Draw:
     turns = names.split() or [""]
     joined = turns[index // len(AUDIT) % len(turns)]
     forms = tuple(FORM[name] for name in joined.split("+") if name)
-    usual: dict[str, Any] = {"sizes": Range(4.0, 10.0, log=True)} | changes
-    return Draw(forms, **usual | {"about": {"row": row, "says": "", **changes.get("about", {})}})
+    draw = Draw(forms, **{"sizes": Range(4.0, 10.0, log=True), **changes})  # type: ignore[arg-type]
+    return replace(draw, about={"row": row, "says": "", **draw.about})
 
 
 TIERS: dict[str, Callable[[int, np.random.Generator], Draw]] = {

@@ -75,7 +75,8 @@ def test_tables_count_what_is_said_and_what_intervals_hold() -> None:
         "kind": "nothing",
         "must_find": [],
         "unknown": True,
-        "design": {"poses": 20, "robot": 5e-4, "mask": "RANSAC", "repeated": 0.0},
+        "design": {"poses": 20, "frames": 20, "robot": 5e-4, "far": 2.0, "repeated": 0.0}
+        | {"mask": "RANSAC", "scene": "wall"},
         "sensor": sensor | {"rounding_mm": 0.0, "sun": False, "frequencies": [2e7]},
         "names": [],
         "sets": [],
