@@ -1,6 +1,6 @@
 """`python -m benchmarks.renewed`: the check on forms, sensors and robots that nobody tuned on."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from benchmarks.renewed.cases import TIERS, write_case
@@ -15,16 +15,13 @@ from benchmarks.sealed.scores import (
     at_least,
     at_most,
     by_design,
+    covers,
     detected,
-    mean_score,
+    figures,
     named,
     names_something_new,
-    right,
-    right_or_unknown,
     scores_table,
-    set_sizes,
     share_score,
-    shares_of,
     silent,
     table,
     unknown,
@@ -34,6 +31,11 @@ from benchmarks.sealed.scores import (
 MANY = 25  # poses: recordings with as many are also counted by themselves
 LEVEL = (0.03, 0.07)  # share of recordings with nothing missing that are named, or called unknown
 COVERAGE = (0.92, 0.98)  # of 95 % intervals
+TARGETS = {
+    "in the set": at_least(0.9),
+    "size of the set": at_most(1.8),
+    "a single wrong name": at_most(0.05),
+}
 
 
 def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
@@ -54,22 +56,27 @@ def findable(outcomes: Sequence[Outcome]) -> list[Outcome]:
 def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]:
     """All figures, and them as text with tables of forms and designs."""
     cases, nulls = findable(outcomes), [one for one in outcomes if one.tier == "N"]
-    parts = {flag: [one for one in cases if one.case["textbook"] is flag] for flag in (True, False)}
-    outside = [one for one in outcomes if one.tier == "O" and one.must_find]
-    many, wide = [one for one in cases if _poses(one) >= MANY], (right_or_unknown, at_least(0.9))
+    outside = [one for one in outcomes if one.tier == "O"]
+    real = [one for one in outcomes if one.tier == "K" and one.role == "added"]
+    other = {"in the set or unknown": at_least(0.9), "a single wrong name": at_most(0.08)}
+    level = {
+        "named though nothing is there": LEVEL,
+        "called unknown though nothing is there": LEVEL,
+        "detected though nothing is there": at_most(0.1),
+    }
     scores = [
-        *_one_effect("findable", cases),
-        *_one_effect("textbook form", parts[True]),
-        *shares_of("other form", parts[False], {"in the set or unknown": wide}),
-        *_said("other form", parts[False], 0.08),
-        *_one_effect("25 poses or more", many),
-        *_said("outside", outside, 0.08),
-        *_nothing("nothing", nulls),
-        *_nothing("nothing, 25 poses", [one for one in nulls if _poses(one) >= MANY]),
+        *figures("findable", cases, TARGETS),
+        *figures("textbook form", [one for one in cases if one.case["textbook"]], TARGETS),
+        *figures("other form", [one for one in cases if not one.case["textbook"]], other),
+        *figures("25 poses or more", _many(cases), TARGETS),
+        *figures("outside", outside, {"a single wrong name": at_most(0.08)}),
+        *figures("nothing", nulls, level),
+        *figures("nothing, 25 poses", _many(nulls), level),
         *_coverage("all", [one for one in outcomes if one.tier in TIERS], out),
         *_coverage("one effect", cases, out),
         *_coverage("nothing", nulls, out),
-        *_real([one for one in outcomes if one.tier == "K"]),
+        *figures("real, added", real),
+        share_score("real, added", NEW_NAME, real, names_something_new(outcomes)),
         share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
     ]
     judged = [(one.case, (named(one), unknown(one), detected(one))) for one in nulls]
@@ -78,56 +85,28 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
     return [one for one in scores if one.count], text
 
 
-def _one_effect(title: str, cases: Sequence[Outcome]) -> list[Score]:
-    return [
-        *shares_of(title, cases, {"in the set": (right, at_least(0.9))}),
-        mean_score(title, "size of the set", set_sizes(cases), at_most(1.8)),
-        *_said(title, cases, 0.05),
-    ]
-
-
-def _said(title: str, cases: Sequence[Outcome], most_wrong: float) -> list[Score]:
-    judges = {
-        "a single wrong name": (wrong, at_most(most_wrong)),
-        "something named": (named,),
-        "called unknown": (unknown,),
-        "neither": (silent,),
-    }
-    return shares_of(title, cases, judges)
-
-
-def _nothing(title: str, cases: Sequence[Outcome]) -> list[Score]:
-    judges = {
-        "named": (named, LEVEL),
-        "unknown": (unknown, LEVEL),
-        "detected": (detected, at_most(0.1)),
-    }
-    return shares_of(title, cases, judges)
+def _many(cases: Sequence[Outcome]) -> list[Outcome]:
+    return [one for one in cases if one.case["design"]["poses"] >= MANY]
 
 
 def _coverage(title: str, cases: Sequence[Outcome], out: Path) -> list[Score]:
     held = [covered(one, out) for one in cases]
-    judges = {
-        f"{name}_ci holds the truth": (lambda held, name=name: held.get(name), COVERAGE)
-        for name in ("before", "after", "closed")
-    }
-    return shares_of(title, held, judges)
-
-
-def _real(cases: Sequence[Outcome]) -> list[Score]:
-    """Real recordings: what is named of what was added, beside what they show as they are."""
-    judges = {
-        "added effect in the set": (right,),
-        "added effect in the set or unknown": (right_or_unknown,),
-        NEW_NAME: (names_something_new(cases),),
-    }
-    return shares_of("real", [one for one in cases if one.role == "added"], judges)
+    return [
+        share_score(
+            title, f"{gap}_ci holds the truth", held, lambda one, gap=gap: one.get(gap), COVERAGE
+        )
+        for gap in ("before", "after", "closed")
+    ]
 
 
 def by_form(cases: Sequence[Outcome]) -> str:
     """What is said of every effect under each of its forms."""
-    judges = {"in the set": right, "set or unknown": right_or_unknown, "wrong single": wrong}
-    judges["neither"] = silent
+    judges: dict[str, Callable[[Outcome], bool]] = {
+        "in the set": lambda one: covers(one, one.truth),
+        "set or unknown": lambda one: covers(one, one.truth) or unknown(one),
+        "wrong single": wrong,
+        "neither": silent,
+    }
     groups: dict[tuple[str, bool, str], list[Outcome]] = {}
     for one in cases:
         key = one.truth, not one.case["textbook"], one.case["form"]
@@ -138,10 +117,6 @@ def by_form(cases: Sequence[Outcome]) -> str:
         for effect, form, some in [*rows, ("all", "", list(cases))]
     ]
     return table(("effect", "form", "n", *judges), lines)
-
-
-def _poses(one: Outcome) -> int:
-    return one.case["design"]["poses"]
 
 
 main = Check(

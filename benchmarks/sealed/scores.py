@@ -89,11 +89,6 @@ def share_score(
     return Score(tier, what, counted.value, counted.interval, counted.total, target)
 
 
-def shares_of(tier: str, cases: Sequence[Case], judges: Mapping[str, Sequence[Any]]) -> list[Score]:
-    """The shares of the same cases by several judgements, each with its target if it has one."""
-    return [share_score(tier, what, cases, *judge) for what, judge in judges.items()]
-
-
 def at_least(limit: float) -> Limits:
     """A lower target."""
     return limit, math.inf
@@ -168,9 +163,9 @@ def known(names: Iterable[str]) -> frozenset[str]:
     return frozenset(PART_OF.get(name, name) for name in names)
 
 
-def right(one: Outcome) -> bool:
-    """Whether the true effect is in a set."""
-    return any(one.truth in members for members in map(known, one.said.sets))
+def covers(one: Outcome, name: str) -> bool:
+    """Whether an effect is in a set."""
+    return any(name in members for members in map(known, one.said.sets))
 
 
 def wrong(one: Outcome) -> bool:
@@ -186,18 +181,13 @@ def named(one: Outcome) -> bool:
 
 
 def named_first(one: Outcome) -> bool:
-    """Whether the true effect is the first one named."""
-    return known(one.said.effects[:1]) == {one.truth}
+    """Whether a true effect is the first one named."""
+    return bool(known(one.said.effects[:1]) & one.truths)
 
 
 def unknown(one: Outcome) -> bool:
     """Whether the cause is called unknown."""
     return one.said.unknown
-
-
-def right_or_unknown(one: Outcome) -> bool:
-    """Whether the true effect is in a set, or the cause is called unknown."""
-    return right(one) or unknown(one)
 
 
 def silent(one: Outcome) -> bool:
@@ -219,9 +209,35 @@ def names_something_new(cases: Iterable[Outcome]) -> Callable[[Outcome], bool]:
     return lambda one: bool(set(one.said.effects) - one.truths - own)
 
 
-def set_sizes(cases: Iterable[Outcome]) -> list[float]:
-    """Members of the first set of each case that has one."""
-    return [float(len(one.said.sets[0])) for one in cases if one.said.sets]
+def figures(
+    title: str, cases: Sequence[Outcome], targets: Mapping[str, Limits] | None = None
+) -> list[Score]:
+    """What is said of cases: of effects that an oracle finds, and where nothing is missing."""
+    find = [one for one in cases if one.must_find]
+    nulls = [one for one in cases if not one.truths]
+    effects = [(one, name) for one in find for name in sorted(one.must_find)]
+    held = [covers(one, name) for one, name in effects]
+    judged: dict[str, Iterable[bool]] = {
+        "in the set": held,
+        "in the set or unknown": [
+            a or unknown(one) for a, (one, _) in zip(held, effects, strict=True)
+        ],
+        "named first": map(named_first, find),
+        "something named": map(named, find),
+        "called unknown": map(unknown, find),
+        "neither": map(silent, find),
+        "a single wrong name": map(wrong, cases),
+        "named though nothing is there": map(named, nulls),
+        "called unknown though nothing is there": map(unknown, nulls),
+        "detected though nothing is there": map(detected, nulls),
+    }
+    wanted = targets or {}
+    sizes = [float(len(one.said.sets[0])) for one in find if one.said.sets]
+    scores = [
+        share_score(title, what, some, bool, wanted.get(what, ANY)) for what, some in judged.items()
+    ]
+    size = "size of the set"
+    return [*scores, mean_score(title, size, sizes, wanted.get(size, ANY))]
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

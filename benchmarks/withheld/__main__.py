@@ -9,25 +9,21 @@ from benchmarks.sealed.answers import Entry, Outcome
 from benchmarks.sealed.command import Check
 from benchmarks.sealed.scores import (
     NEW_NAME,
+    Limits,
     Score,
     area_score,
     at_least,
     at_most,
     bootstrap,
-    detected,
+    figures,
     macro_f1,
-    mean_score,
     named,
-    named_first,
     names_something_new,
     quantile_score,
-    right,
     scores_table,
-    set_sizes,
     share_score,
     table,
     unknown,
-    wrong,
 )
 from benchmarks.withheld.pairs import pairs
 from benchmarks.withheld.tiers import AUDIT, TIERS, write_case
@@ -55,48 +51,74 @@ def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
             yield from write_case(seed, tier, index, out)
 
 
+TARGETS: dict[str, dict[str, Limits]] = {
+    "A": {
+        "named first": at_least(0.85),
+        "in the set": at_least(0.95),
+        "size of the set": at_most(1.5),
+    },
+    "C": {"named though nothing is there": at_most(0.08)},
+    "F": {"in the set": at_least(0.9), "a single wrong name": at_most(0.05)},
+}
+
+
 def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]:
     """All figures of the tiers that are there, and them as text."""
     main = {
         tier: [one for one in outcomes if one.tier == tier and one.role == "main"] for tier in TIERS
     }
-    find = {tier: [one for one in cases if one.must_find] for tier, cases in main.items()}
     again = {one.answer["main"]: one for one in outcomes if one.role in ("fresh", "cured")}
-    scores = [
-        *_single(find["A"], again),
-        *_several(main["B"]),
-        *_nothing(main["C"]),
-        *_not_in_catalogue(find),
-        *_confounded(main["F"], find["F"], again),
-        *_missing(main["G"]),
-        *_few_and_noisy(find["H"], main["I"]),
-        *_other_base(main["J"]),
-        *_real([one for one in outcomes if one.tier == "K"]),
+    scores: list[Score] = []
+    for tier, cases in main.items():
+        scores += figures(tier, cases, TARGETS.get(tier))
+    scores += _closed(main["A"], again)
+    limits = bootstrap(main["B"], macro_f1)
+    scores.append(
+        Score("B", "macro-F1", macro_f1(main["B"]), limits, len(main["B"]), at_least(0.75))
+    )
+    abstains = {k: [one.said.abstains for one in main[k] if one.must_find] for k in "ADE"}
+    for tier, target in (("D", at_least(0.95)), ("E", at_least(0.85))):
+        what = "AUROC of abstention against tier A"
+        scores.append(area_score(tier, what, abstains[tier], abstains["A"], target))
+    scores += _confounded(main["F"], again)
+    blind = [one for one in main["G"] if not one.case["judged"]]
+    scores.append(
+        share_score("G", "says that the effect cannot be judged", blind, _says_unavailable)
+    )
+    for what, tier, of in (
+        ("frames", "H", lambda one: one.case["design"]["frames"]),
+        ("noise", "I", lambda one: one.case["noise"]),
+        ("base", "J", lambda one: one.case["base"]),
+        ("role", "K", lambda one: one.role),
+    ):
+        cases = [one for one in outcomes if one.tier == tier]
+        for value in sorted({of(one) for one in cases}):
+            some = [one for one in cases if of(one) == value]
+            scores += figures(f"{tier}, {what} {value}", some)
+    real = [one for one in outcomes if one.tier == "K"]
+    added = [one for one in real if one.role == "added"]
+    scores += [
+        share_score("K", NEW_NAME, added, names_something_new(real)),
         share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
     ]
-    audited = [one for one in outcomes if one.tier == "L"]
-    text = "\n\n".join([scores_table(scores), *([audit_table(audited)] if audited else [])])
-    return [one for one in scores if one.count], text
+    text = [scores_table(scores), *([audit_table(main["L"])] if main["L"] else [])]
+    return [one for one in scores if one.count], "\n\n".join(text)
 
 
-def _single(cases: Sequence[Outcome], fresh: Mapping[str, Outcome]) -> list[Score]:
-    """Tier A: one effect that can be found."""
-    said = [one for one in cases if named(one)]
-    closed = [_closed(one) / one.oracle.closed_fraction for one in said]
+def _closed(cases: Sequence[Outcome], fresh: Mapping[str, Outcome]) -> list[Score]:
+    """Of tier A: what share of the gap is said to be closed."""
+    said = [one for one in cases if one.must_find and named(one)]
+    closed = [_share(one) / one.oracle.closed_fraction for one in said]
     both = [(one, fresh[one.name]) for one in said if one.name in fresh]
     seen_again = "closed_ci holds what a fresh session shows"
     return [
-        share_score("A", "named first", cases, named_first, at_least(0.85)),
-        share_score("A", "in the set", cases, right, at_least(0.95)),
-        mean_score("A", "size of the set", set_sizes(cases), at_most(1.5)),
-        share_score("A", "something named", cases, named),
         quantile_score("A", "shrinkage against the oracle, median", closed, 0.5, at_least(0.9)),
         quantile_score("A", "the same, 10th percentile", closed, 0.1, at_least(0.6)),
         share_score("A", seen_again, both, lambda pair: _holds(*pair), at_least(0.9)),
     ]
 
 
-def _closed(one: Outcome) -> float:
+def _share(one: Outcome) -> float:
     return one.said.report["gap_mm"]["closed_fraction"]
 
 
@@ -105,56 +127,14 @@ def _holds(one: Outcome, again: Outcome) -> bool | None:
     if set(one.said.effects) != set(again.said.effects):
         return None
     low, high = one.said.report["gap_mm"]["closed_ci"]
-    return low <= _closed(again) <= high
+    return low <= _share(again) <= high
 
 
-def _several(cases: Sequence[Outcome]) -> list[Score]:
-    """Tier B: two or three effects."""
-    wanted = [(one, name) for one in cases for name in sorted(one.must_find)]
-    said = [name in one.truths for one in cases for name in one.said.effects]
-    limits = bootstrap(cases, macro_f1)
-    return [
-        Score("B", "macro-F1", macro_f1(cases), limits, len(cases), at_least(0.75)),
-        share_score("B", "in a set, of the effects findable", wanted, lambda pair: _covers(*pair)),
-        share_score("B", "precision", said, bool),
-    ]
-
-
-def _nothing(cases: Sequence[Outcome]) -> list[Score]:
-    """Tier C: no effect, or one of 0.2 mm."""
-    nulls = [one for one in cases if not one.truths]
-    nearly = [set(one.said.effects) - one.truths for one in cases if one.truths]
-    return [
-        share_score("C", "named though nothing is there", nulls, named, at_most(0.08)),
-        share_score("C", "called unknown", nulls, unknown),
-        share_score("C", "detected", nulls, detected),
-        share_score("C", "a false name beside 0.2 mm", nearly, bool),
-    ]
-
-
-def _not_in_catalogue(find: Mapping[str, Sequence[Outcome]]) -> list[Score]:
-    """Tiers D and E: effects that the catalogue does not have."""
-    scores = []
-    for tier, target in (("D", 0.95), ("E", 0.85)):
-        positives, negatives = ([one.said.abstains for one in find[name]] for name in (tier, "A"))
-        what = "AUROC of abstention against tier A"
-        scores += [
-            area_score(tier, what, positives, negatives, at_least(target)),
-            share_score(tier, "called unknown", find[tier], unknown),
-            share_score(tier, "a wrong single name", find[tier], wrong),
-        ]
-    return scores
-
-
-def _confounded(
-    cases: Sequence[Outcome], must: Sequence[Outcome], cured: Mapping[str, Outcome]
-) -> list[Score]:
-    """Tier F: designs that confound effects, each with a sound session."""
-    open_ = [one for one in must if one.said.sets and len(one.said.sets[0]) > 1]
+def _confounded(cases: Sequence[Outcome], cured: Mapping[str, Outcome]) -> list[Score]:
+    """Of tier F: designs that confound effects, each with a sound session."""
+    open_ = [one for one in cases if one.must_find and [*map(len, one.said.sets)][:1] > [1]]
     resolved = [one.name in cured and cured[one.name].said.sets == (one.truths,) for one in open_]
     return [
-        share_score("F", "truth in the set", must, right, at_least(0.9)),
-        share_score("F", "a wrong single name", cases, wrong, at_most(0.05)),
         share_score("F", "sets that a sound session resolves", resolved, bool),
         share_score("F", "advice that names the remedy", open_, _advises),
     ]
@@ -165,68 +145,9 @@ def _advises(one: Outcome) -> bool:
     return any(word in advice for lack in one.case["lacks"] for word in REMEDIES[lack])
 
 
-def _missing(cases: Sequence[Outcome]) -> list[Score]:
-    """Tier G: columns or files missing."""
-    blind = [one for one in cases if not one.case["judged"]]
-    seen = [one for one in cases if one.case["judged"] and one.must_find]
-    return [
-        share_score("G", "says that the effect cannot be judged", blind, _says_unavailable),
-        share_score("G", "a wrong single name", blind, wrong),
-        share_score("G", "in the set where it can be judged still", seen, right),
-    ]
-
-
 def _says_unavailable(one: Outcome) -> bool:
     ranking = one.said.report.get("ranking", [])
     return any(row["effect"] == one.truth and not row["available"] for row in ranking)
-
-
-def _few_and_noisy(few: Sequence[Outcome], noisy: Sequence[Outcome]) -> list[Score]:
-    """Tiers H and I: few frames, other noise."""
-    scores = []
-    for what, judge in (("named", named), ("in the set", right)):
-        for n in (15, 30, 60):
-            some = [one for one in few if one.case["design"]["frames"] == n]
-            scores.append(share_score("H", f"{n} frames: {what}", some, judge))
-    nulls = [one for one in noisy if not one.truths]
-    found = [one for one in noisy if one.truths and one.must_find]
-    scores.append(share_score("I", "named though nothing is there", nulls, named))
-    for kind in sorted({one.case["noise"] for one in nulls}):
-        some = [one for one in nulls if one.case["noise"] == kind]
-        scores.append(share_score("I", f"the same, {kind}", some, named))
-    return [*scores, share_score("I", "in the set", found, right)]
-
-
-def _other_base(cases: Sequence[Outcome]) -> list[Score]:
-    """Tier J: a base of another form, alone or beside an effect."""
-    own = [_covers(one, one.case["base"]) for one in cases]
-    beside = [one for one in cases if one.must_find and len(one.truths) > 1]
-    found = [_covers(one, *(one.truths - {one.case["base"]})) for one in beside]
-    return [
-        share_score("J", "named though not there", cases, _falsely_named),
-        share_score("J", "the base's own term in a set", own, bool),
-        share_score("J", "the effect in a set", found, bool),
-    ]
-
-
-def _covers(one: Outcome, name: str) -> bool:
-    return any(name in members for members in one.said.sets)
-
-
-def _falsely_named(one: Outcome) -> bool:
-    """Whether a name is neither true nor what a base of the wrong form is rightly called."""
-    also = {"distance": "wiggling", "pixel": "fixed_pattern"}.get(one.case["base"], "")
-    return bool(set(one.said.effects) - one.truths - {also})
-
-
-def _real(cases: Sequence[Outcome]) -> list[Score]:
-    """Tier K: what is named of what was done to real images."""
-    scores = []
-    for role in ("term", "added"):
-        some = [one for one in cases if one.role == role]
-        scores.append(share_score("K", f"{role}: in a set", some, right))
-        scores.append(share_score("K", f"{role}: named first", some, named_first))
-    return [*scores, share_score("K", NEW_NAME, some, names_something_new(cases))]
 
 
 RIGHT, SET, WARNING, WRONG = ANSWERS = ("right", "set holds it", "warning says why", "WRONG")

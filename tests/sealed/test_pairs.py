@@ -188,7 +188,7 @@ FIGURES: tuple[str, ...] = (
     "noise_mm",
     "true_noise_mm",
 )
-NEAR = dict(zip(FIGURES, (1.05, 0.1, 1.0, 0.9, 4.2, 4.0), strict=True))
+NEAR: dict[str, float] = dict(zip(FIGURES, (1.05, 0.1, 1.0, 0.9, 4.2, 4.0), strict=True))
 NEAR |= {"missing": 0.01, "true_missing": 0.011}
 
 

@@ -31,9 +31,9 @@ from benchmarks.sealed.scores import (
     ANY,
     Share,
     area_score,
+    covers,
     macro_f1,
     quantile_score,
-    right,
     share_score,
     wrong,
 )
@@ -150,7 +150,7 @@ def test_figures_of_the_regression_set_by_hand(tmp_path: Path) -> None:
     assert found["C", "named though nothing is there"] == 1.0
     assert found["D", "AUROC of abstention against tier A"] == 1.0
     assert found["G", "says that the effect cannot be judged"] == 1.0
-    assert found["K", "added: named first"] == 1.0
+    assert found["K, role added", "named first"] == 1.0
 
 
 def test_abstention_orders_unknown_above_unclosed_above_closed_above_silent() -> None:
@@ -166,7 +166,7 @@ def test_abstention_orders_unknown_above_unclosed_above_closed_above_silent() ->
 
 def test_a_wrong_single_name_is_one_whose_set_lacks_the_truth() -> None:
     one = outcome("E", {"robot_kinematics": 4.0}, report(["backlash"], [["backlash"]]))
-    assert right(one)
+    assert covers(one, "robot_kinematics")
     assert not wrong(one)
     assert wrong(outcome("E", {"lens": 4.0}, report(["warm_up"], [["warm_up"]])))
     assert not wrong(outcome("E", {"lens": 4.0}, report(["warm_up"], [["warm_up", "fan"]])))
