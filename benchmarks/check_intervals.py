@@ -26,7 +26,6 @@ from tqdm import tqdm
 from benchmarks.sealed.scores import share, table
 from benchmarks.timing import write
 from benchmarks.wrong_recordings.clean import drawn_simulator
-from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift
 from tofcorr.drift.offset import OffsetSums, Wall
@@ -50,21 +49,13 @@ DRIFT_MM, REACH = 5.0, 0.2
 def drawn_camera(generator: np.random.Generator) -> dict[str, Any]:
     """Return the simulator's options of a training recording."""
     values = drawn_simulator(generator)
-    values["camera"] |= {
-        "width": 32,
-        "height": 25,
-        "K": [[45.0, 0.0, 16.0], [0.0, 45.0, 12.5], [0.0, 0.0, 1.0]],
-    }
-    values["shots"] = [
-        {"target": target, "poses": int(generator.integers(8, 21))}
-        for target in ("white", "checkerboard")
-    ]
+    matrix = [[45.0, 0.0, 16.0], [0.0, 45.0, 12.5], [0.0, 0.0, 1.0]]
+    values["camera"] |= {"width": 32, "height": 25, "K": matrix}
+    targets = ("white", "checkerboard")
+    values["shots"] = [{"target": one, "poses": int(generator.integers(8, 21))} for one in targets]
     if generator.random() < 0.5:
-        values["sensor"]["delays"]["amplitude"] = {
-            "law": "log",
-            "scale_mm": float(generator.uniform(5, 25)),
-            "electrons": 1.2e6,
-        }
+        law = {"law": "log", "scale_mm": float(generator.uniform(5, 25)), "electrons": 1.2e6}
+        values["sensor"]["delays"]["amplitude"] = law
     values["scene"] = {"subsamples": 2}
     return values
 
@@ -99,7 +90,18 @@ def one_draw(number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
     later = check_options(camera, max(FRAMES), generator)
     same = recorded(later, folder / "unchanged", frames, 0.0)
     moved = recorded(later, folder / "drifted", max(FRAMES), DRIFT_MM)
-    lines = [*unchanged(state, reference, same), *drifted(state, reference, moved)]
+    lines = []
+    for wall in WALLS:
+        found = check_drift(state, same, wall, reference=reference)
+        said = {"verdict": found.verdict, "headline": found.headline}
+        lines.append(_line(wall, frames, 0.0, found.offset, *found.interval) | said)
+        own = reference or unknown_reference(state, wall_is_known=False)
+        sums = OffsetSums(state, moved, wall, own)
+        for count, _ in enumerate(sums.read(), 1):
+            if count in FRAMES:
+                drift = sums.estimate()
+                ends = drift.value - drift.half_width, drift.value + drift.half_width
+                lines.append(_line(wall, count, DRIFT_MM, drift.value, *ends))
     return [{"draw": number, "model": model, **line} for line in lines]
 
 
@@ -112,47 +114,17 @@ def recorded(later: dict[str, Any], folder: Path, frames: int, drift: float) -> 
     return Dataset((Recording.open(folder),))
 
 
-def unchanged(
-    state: CalibrationState, reference: Reference | None, dataset: Dataset
-) -> list[dict[str, Any]]:
-    """Check an unchanged camera; return a line for each wall."""
-    lines = []
-    for wall in WALLS:
-        found = check_drift(state, dataset, wall, reference=reference)
-        low, high = (1e3 * end for end in found.interval)
-        lines.append(
-            _line(wall, dataset.num_frames, 0.0, 1e3 * found.offset, low, high)
-            | {"verdict": found.verdict, "headline": found.headline}
-        )
-    return lines
-
-
-def drifted(
-    state: CalibrationState, reference: Reference | None, dataset: Dataset
-) -> list[dict[str, Any]]:
-    """Check a drifted camera with more and more frames; return a line for each wall and number."""
-    lines = []
-    for wall in WALLS:
-        own = reference or unknown_reference(state, wall_is_known=False)
-        sums = OffsetSums(state, dataset, wall, own)
-        for frames, _ in enumerate(sums.read(), 1):
-            if frames in FRAMES:
-                found = sums.estimate()
-                middle, half = 1e3 * found.value, 1e3 * found.half_width
-                lines.append(_line(wall, frames, DRIFT_MM, middle, middle - half, middle + half))
-    return lines
-
-
 def _line(
-    wall: Wall, frames: int, drift: float, offset: float, low: float, high: float
+    wall: Wall, frames: int, drift_mm: float, offset: float, low: float, high: float
 ) -> dict[str, Any]:
+    """Return what was found with a wall and a number of frames; offset and interval in metres."""
     return {
         "frames": frames,
         "wall": wall,
-        "drift_mm": drift,
-        "offset_mm": offset,
-        "interval_mm": [low, high],
-        "covered": low <= drift <= high,
+        "drift_mm": drift_mm,
+        "offset_mm": 1e3 * offset,
+        "interval_mm": [1e3 * low, 1e3 * high],
+        "covered": 1e3 * low <= drift_mm <= 1e3 * high,
         "differs_from_0": low > 0 or high < 0,
     }
 
@@ -175,15 +147,12 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
         headlines = sum(one["headline"] is not None for one in same)
         held = share(one["covered"] for one in same)
         cells = (len(same), held, f"{half:.2f}", f"{error:.2f}", drifts, headlines)
-        # All numbers of frames together are not independent.
-        of_drifted = ["", "", ""] if frames is None else _of_drifted(moved)
-        rows.append((wall, "all" if frames is None else frames, *cells, *of_drifted))
+        of_drifted: list[object] = ["", "", ""]
+        if frames is not None:  # All numbers of frames together are not independent.
+            shares = (share(one[key] for one in moved) for key in ("covered", "differs_from_0"))
+            of_drifted = [len(moved), *shares]
+        rows.append((wall, frames or "all", *cells, *of_drifted))
     return table(head, rows)
-
-
-def _of_drifted(moved: Sequence[dict[str, Any]]) -> list[str]:
-    keys = ("covered", "differs_from_0")
-    return [str(len(moved)), *(str(share(one[key] for one in moved)) for key in keys)]
 
 
 @click.command()

@@ -98,10 +98,10 @@ _IMPORTS = {
 
 def _inputs() -> dict[str, tuple[str, ...]]:
     """Return every input whose data are there, and its commands; `{...}` are folders."""
-    found: dict[str, tuple[str, ...]] = {}
-    for name in SIMULATED:
-        own = f"simulate --config {name} --out {{out}}/simulated"
-        found[name] = (own, *_COMMON, *_MORE.get(name, ()))
+    found: dict[str, tuple[str, ...]] = {
+        name: (f"simulate --config {name} --out {{out}}/simulated", *_COMMON, *_MORE.get(name, ()))
+        for name in SIMULATED
+    }
     found |= {f"generated_{tier}{index}": _COMMON for tier, index in GENERATED}
     many = "diagnose --config many --recording {recording} --out {out}/diagnosis"
     for name, command in _IMPORTS.items():
@@ -300,18 +300,16 @@ def _values(folder: Path) -> dict[str, Any]:
         if path.name == "said.txt":
             for said in path.read_text().split("$ ")[1:]:
                 command, _, text = said.partition("\n")
-                _flatten_text(f"said by {command}:", text, found)
-        elif path.suffix == ".json":
-            _flatten(key, json.loads(path.read_text()), found)
-        elif path.suffix in {".yaml", ".yml"}:
+                _flatten(f"said by {command}:", text, found)
+        elif path.suffix in {".json", ".yaml", ".yml"}:  # JSON is YAML, but for its speed
             text = re.sub(r"^%YAML.*|!!opencv-matrix", "", path.read_text(), flags=re.MULTILINE)
-            _flatten(key, yaml.safe_load(text), found)
+            _flatten(key, (json.loads if path.suffix == ".json" else yaml.safe_load)(text), found)
         elif path.suffix in {".txt", ".md", ".csv", ".xacro"}:
-            _flatten_text(key, path.read_text(), found)
-        elif path.suffix in {".npy", ".npz"}:
-            loaded = np.load(path)
-            arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
-            for name, values in arrays.items():
+            _flatten(key, path.read_text(), found)
+        elif path.suffix == ".npy":
+            _flatten_array(key, np.load(path), found)
+        elif path.suffix == ".npz":
+            for name, values in np.load(path).items():
                 _flatten_array(f"{key}{name}", values, found)
     return found
 

@@ -6,7 +6,6 @@ and amplitude that the camera gave. A term is withheld by a configuration whose 
 The diagnosis refuses images of one pixel, so the real arm's trials take no part yet.
 """
 
-import json
 import os
 import subprocess
 import sys
@@ -42,12 +41,6 @@ FORMS = (  # those that need no more than a pixel's own depth, amplitude and pla
 )
 STRIDE = 3
 MODULATION = 80e6  # Hz, the middle one of the camera's three
-KINECT = {
-    "width": 512,
-    "height": 424,
-    "K": [[365.5, 0.0, 255.5], [0.0, 365.5, 205.0], [0.0, 0.0, 1.0]],
-    "distortion": [0.0905, -0.268, 0.0, 0.0, 0.095],
-}
 
 
 def write_real(
@@ -84,17 +77,15 @@ def write_real(
 
 def import_kinect(folder: Path, out: Path) -> Path:
     """Import the images with the installed program; return the recording."""
-    recording, intrinsics = out / "kinect_full", out / "kinect.json"
-    if recording.exists():
-        return recording
-    out.mkdir(parents=True, exist_ok=True)
-    intrinsics.write_text(json.dumps(KINECT))
-    command = [str(Path(sys.executable).with_name("tofcorr")), "import", "checkerboard"]
-    command += [str(folder / "kinect2_checkerboard"), "--out", str(recording)]
-    command += ["--depth", "{view}_sync_depth.png", "--infrared", "{view}_sync_ir.png"]
-    command += ["--board", "5x7", "--square-mm", "30", "--intrinsics", str(intrinsics)]
-    command += ["--modulation-frequency-hz", str(MODULATION)]
-    subprocess.run(command, check=True, capture_output=True)
+    recording = out / "kinect_full"
+    if not recording.exists():
+        out.mkdir(parents=True, exist_ok=True)
+        program = str(Path(sys.executable).with_name("tofcorr"))
+        words = [program, "import", "checkerboard", str(folder / "kinect2_checkerboard")]
+        words += ["--depth", "{view}_sync_depth.png", "--infrared", "{view}_sync_ir.png"]
+        words += ["--board", "5x7", "--square-mm", "30", "--intrinsics", "kinect2"]
+        words += ["--modulation-frequency-hz", str(MODULATION), "--out", str(recording)]
+        subprocess.run(words, check=True, capture_output=True)
     return recording
 
 
