@@ -124,22 +124,6 @@ def _stream(job: Callable[..., object], frames: Iterable[tuple]) -> Callable[[],
     return lambda: job(*next(coming))
 
 
-def on_gpu(batch: int, repeats: int) -> dict[str, float]:
-    """Return frames a second and bytes a second of the compiled-free corrector on CUDA."""
-    corrector = DepthCorrector.from_state(calibration(480, 640)).cuda()
-    depth = 0.6 + 1.3 * torch.rand(batch, 480, 640, device="cuda")
-    amplitude = 20 + 800 * torch.rand(batch, 480, 640, device="cuda")
-
-    def job() -> None:
-        for _ in range(repeats):
-            corrector(depth, amplitude)
-        torch.cuda.synchronize()
-
-    spent = timed({"cuda": job}, 1)["cuda"][0] / repeats
-    useful_bytes = depth.numel() * (4 + 4 + 4 + 1)
-    return {"frames_a_second": batch / spent, "useful_bytes_a_second": useful_bytes / spent}
-
-
 @click.command()
 @click.option("--repeats", default=30, show_default=True)
 @JSON
@@ -160,8 +144,6 @@ def main(repeats: int, out: Path | None) -> None:
         result[f"{height}x{width}, {what}"] = {
             name: [1e3 * time for time in spread(times)] for name, times in seconds.items()
         }
-    result["gpu"] = on_gpu(64, 20) if torch.cuda.is_available() else "not measured: no CUDA here"
-    click.echo(f"GPU: {result['gpu']}")
     write(result, out)
 
 

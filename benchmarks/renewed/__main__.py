@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from benchmarks.renewed.cases import TIERS, write_case
-from benchmarks.renewed.real import FORMS, write_real
+from benchmarks.renewed.real import write_real
 from benchmarks.sealed.answers import Entry, Outcome
 from benchmarks.sealed.command import Check
 from benchmarks.sealed.remains import covered
@@ -42,7 +42,7 @@ def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
     """Write cases, real ones too where they are asked for."""
     for tier, count in counts.items():
         if tier == "K":
-            yield from write_real(seed, out, FORMS)
+            yield from write_real(seed, out)
         else:
             yield from (write_case(seed, tier, index, out) for index in range(count))
 
@@ -57,7 +57,7 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
     """All figures, and them as text with tables of forms and designs."""
     cases, nulls = findable(outcomes), [one for one in outcomes if one.tier == "N"]
     outside = [one for one in outcomes if one.tier == "O"]
-    real = [one for one in outcomes if one.tier == "K" and one.role == "added"]
+    real = {role: [x for x in outcomes if x.role == role] for role in ("added", "term")}
     other = {"in the set or unknown": at_least(0.9), "a single wrong name": at_most(0.08)}
     level = {
         "named though nothing is there": LEVEL,
@@ -75,8 +75,9 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
         *_coverage("all", [one for one in outcomes if one.tier in TIERS], out),
         *_coverage("one effect", cases, out),
         *_coverage("nothing", nulls, out),
-        *figures("real, added", real),
-        share_score("real, added", NEW_NAME, real, names_something_new(outcomes)),
+        *figures("real, effect added", real["added"]),
+        share_score("real", NEW_NAME, real["added"], names_something_new(outcomes)),
+        *figures("real, term withheld", real["term"]),
         share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
     ]
     judged = [(one.case, (named(one), unknown(one), detected(one))) for one in nulls]

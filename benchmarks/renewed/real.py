@@ -9,7 +9,7 @@ The diagnosis refuses images of one pixel, so the real arm's trials take no part
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,25 +39,17 @@ FORMS = (  # those that need no more than a pixel's own depth, amplitude and pla
     *("every_pixel", "hot_pixels", "blocks", "free_columns", "halves_and_pairs", "clock_beat"),
     *("ghost", "veil", "clear_layer", "rendered_slab", "grazing"),
 )
+BASE = {  # terms of the base model, of which one is withheld at a time
+    "distance": {"kind": "distance_polynomial", "degree": 3},
+    "pixel": {"kind": "pixel_polynomial", "degree": 2},
+    "amplitude": {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
+}
 STRIDE = 3
 MODULATION = 80e6  # Hz, the middle one of the camera's three
 
 
-def write_real(
-    seed: int,
-    out: Path,
-    forms: Sequence[str],
-    sizes_mm: Sequence[float] = (),
-    terms: Mapping[str, Mapping[str, Any]] | None = None,
-) -> Iterator[Entry]:
-    """Write the images as they are, without each of some base terms, and with each form.
-
-    Args:
-        seed: Draws the forms.
-        out: Folder of the check.
-        forms: Names of those added.
-        sizes_mm: Each form comes at each; without any at one drawn.
-        terms: The base model's.
+def write_real(seed: int, out: Path, forms: Sequence[str] = FORMS) -> Iterator[Entry]:
+    """Write the images as they are, with each form at a size that is drawn, without each term.
 
     Raises:
         KeyError: when `$TOFCORR_REAL_DATA` is not set.
@@ -66,13 +58,12 @@ def write_real(
     rng, data = np.random.default_rng([seed, 10]), read(thin)
     view = real_view(data)
     yield _write(rng, out, thin, data)
-    for term in terms or {}:
-        kept = [one for name, one in (terms or {}).items() if name != term]
+    for name in forms:
+        yield _write(rng, out, thin, data, added=_added(rng, view, FORM[name]))
+    for term in BASE:
+        kept = [one for name, one in BASE.items() if name != term]
         entry = _write(rng, out, thin, data, term=term)
         yield entry | {"config": yaml.safe_dump({"base": {"terms": kept}})}
-    for name in forms:
-        for size in sizes_mm or (None,):
-            yield _write(rng, out, thin, data, added=_added(rng, view, FORM[name], size))
 
 
 def import_kinect(folder: Path, out: Path) -> Path:
@@ -133,9 +124,7 @@ def real_view(data: Data) -> View:
     )
 
 
-def _added(
-    rng: np.random.Generator, view: View, form: Form, size_mm: float | None
-) -> tuple[Form, Array, Array]:
+def _added(rng: np.random.Generator, view: View, form: Form) -> tuple[Form, Array, Array]:
     """A form with its change of depth (N, H, W), metres, and its factor of the amplitude."""
     change = form.draw(rng, view.world)
     before = _measured(view, [])
@@ -148,7 +137,7 @@ def _added(
     def size_at(strength: float) -> float:
         return float(np.sqrt(np.mean(field(strength)[view.on_target] ** 2)))
 
-    size = 1e-3 * (size_mm or ranges.draw("sizes_mm", rng))
+    size = 1e-3 * ranges.draw("sizes_mm", rng)
     hook = Hook(form, change, strength_for(size_at, form.guess, size))
     factor = _measured(view, [hook])[1] / np.maximum(before[1], 1e-12)
     return form, field(hook.strength), np.where(view.on_target, factor, 1.0)

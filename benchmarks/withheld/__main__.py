@@ -4,11 +4,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.renewed.real import write_real
 from benchmarks.sealed.answers import Entry, Outcome
 from benchmarks.sealed.command import Check
 from benchmarks.sealed.scores import (
-    NEW_NAME,
     Limits,
     Score,
     area_score,
@@ -18,7 +16,6 @@ from benchmarks.sealed.scores import (
     figures,
     macro_f1,
     named,
-    names_something_new,
     quantile_score,
     scores_table,
     share_score,
@@ -28,13 +25,6 @@ from benchmarks.sealed.scores import (
 from benchmarks.withheld.pairs import pairs
 from benchmarks.withheld.tiers import AUDIT, TIERS, write_case
 
-REAL_FORMS = ("odd_harmonics", "clear_layer", "soft_knee", "free_columns", "every_pixel")
-REAL_MM = (3.0, 6.0)
-BASE = {
-    "distance": {"kind": "distance_polynomial", "degree": 3},
-    "pixel": {"kind": "pixel_polynomial", "degree": 2},
-    "amplitude": {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
-}
 REMEDIES = {  # words of an advice that names what a confounded design lacks
     "exposure": ("integration", "exposure"),
     "tilt": ("tilt", "oblique", "incidence"),
@@ -43,11 +33,9 @@ REMEDIES = {  # words of an advice that names what a confounded design lacks
 
 
 def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
-    """Write cases, real ones too where they are asked for."""
+    """Write cases."""
     for tier, count in counts.items():
-        if tier == "K":
-            yield from write_real(seed, out, REAL_FORMS, REAL_MM, BASE)
-        for index in range(count if tier != "K" else 0):
+        for index in range(count):
             yield from write_case(seed, tier, index, out)
 
 
@@ -89,18 +77,12 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
         ("frames", "H", lambda one: one.case["design"]["frames"]),
         ("noise", "I", lambda one: one.case["noise"]),
         ("base", "J", lambda one: one.case["base"]),
-        ("role", "K", lambda one: one.role),
     ):
-        cases = [one for one in outcomes if one.tier == tier]
-        for value in sorted({of(one) for one in cases}):
-            some = [one for one in cases if of(one) == value]
+        for value in sorted({of(one) for one in main[tier]}):
+            some = [one for one in main[tier] if of(one) == value]
             scores += figures(f"{tier}, {what} {value}", some)
-    real = [one for one in outcomes if one.tier == "K"]
-    added = [one for one in real if one.role == "added"]
-    scores += [
-        share_score("K", NEW_NAME, added, names_something_new(real)),
-        share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
-    ]
+    failed = [bool(one.said.failure) for one in outcomes]
+    scores.append(share_score("all", "runs that failed", failed, bool))
     text = [scores_table(scores), *([audit_table(main["L"])] if main["L"] else [])]
     return [one for one in scores if one.count], "\n\n".join(text)
 
@@ -185,7 +167,7 @@ def audit_table(cases: Sequence[Outcome]) -> str:
 main = Check(
     "Check `tofcorr diagnose` on recordings whose effect is withheld from it.",
     "tier",
-    dict.fromkeys(TIERS, "") | {"K": "TOFCORR_REAL_DATA", "L": "DRJIT_LIBLLVM_PATH"},
+    dict.fromkeys(TIERS, "") | {"L": "DRJIT_LIBLLVM_PATH"},
     generate,
     score_all,
     cases=40,

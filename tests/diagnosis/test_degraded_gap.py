@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from diagnosed_recordings import PLAIN
 
-from benchmarks.degraded_gap import degraded_gap
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
@@ -15,8 +14,6 @@ from tofcorr.simulation.simulator import simulate
 
 FAST = {"most_pixels": 40_000, "bootstraps": 19, "tests": {"flips": 99}}
 WIGGLING = {"name": "wiggling", "sin_4": 0.012, "cos_4": 0.006}
-# The converter never saturates; pixels darker than this have no distance.
-READOUT = {"converter_bits": 24, "least_amplitude_counts": 2500.0}
 
 
 def test_a_diagnosis_degrades_ideal_frames_of_poses_held_out(
@@ -33,25 +30,6 @@ def test_a_diagnosis_degrades_ideal_frames_of_poses_held_out(
     block = json.loads(json.dumps(time_diagnosis.to_mapping()["degraded"]))
     assert block["gap_mm"] == pytest.approx(1e3 * found.gap, abs=1e-3)
     assert "Ideal frames, degraded" in render(time_diagnosis)
-
-
-@pytest.mark.slow
-def test_degraded_ideal_frames_are_like_real_ones_of_poses_held_out(tmp_path: Path) -> None:
-    options = PLAIN | {
-        "seed": 41,
-        "shots": [{"target": "white", "poses": 30}, {"target": "checkerboard", "poses": 30}],
-        "sensor": PLAIN["sensor"] | {"readout": READOUT},
-        "effects": [WIGGLING],
-    }
-    real = simulate(options, tmp_path / "real")
-    found = degraded_gap(real, FAST, seed=5)
-    assert found.poses == 30
-    assert found.diagnosis.effects == ("wiggling",)
-    assert found.ideal > 0.015
-    assert found.within(1.1) is not False
-    assert found.degraded < 0.05 * found.ideal
-    assert found.noise[1] == pytest.approx(found.noise[0], rel=0.1)
-    assert found.dropouts[1] == pytest.approx(found.dropouts[0], rel=0.1)
 
 
 @pytest.mark.slow
