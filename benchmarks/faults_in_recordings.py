@@ -1,7 +1,7 @@
 """What comes of wrong recordings, and whether clean ones are let through.
 
     python -m benchmarks.faults_in_recordings --draws 5 --clean 200 --seed 1000 --out faults.json
-    python -m benchmarks.faults_in_recordings --table --commands all --draws 1 --clean 0
+    python -m benchmarks.faults_in_recordings --commands all --draws 1 --clean 0
 
 Each fault is made `--draws` times, each time in a newly simulated recording of the shipped `demo`
 camera, and given to `train`, or to each of `--commands`. `benchmarks.wrong_recordings.outcomes`
@@ -90,7 +90,6 @@ def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
 @click.option("--shipped", default=0, help="Clean recordings of each shipped simulator.")
 @click.option("--seed", default=1000, show_default=True)
 @click.option("--only", help="Only faults whose name contains this.")
-@click.option("--table", "only_table", is_flag=True, help="Only the rows of the table of issue 16.")
 @click.option("--commands", default="train", show_default=True, help="Comma-separated, or `all`.")
 @click.option("--out", type=click.Path(path_type=Path), help="JSON file for every outcome.")
 def main(
@@ -99,13 +98,12 @@ def main(
     shipped: int,
     seed: int,
     only: str | None,
-    only_table: bool,
     commands: str,
     out: Path | None,
 ) -> None:
     """Make every fault, give it to the commands, and print the table."""
-    every = TABLE if only_table else TABLE | FURTHER | UNLISTED
-    chosen = {name: f for name, f in every.items() if not only or only in name}
+    every = TABLE | FURTHER | UNLISTED
+    chosen = {name: fault for name, fault in every.items() if not only or only in name}
     asked = tuple(COMMANDS) if commands == "all" else tuple(commands.split(","))
     faults: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:

@@ -10,28 +10,22 @@ machine slow down.
 
 import time
 import warnings
-from typing import Any
 
 import click
 import torch
 from torch import Tensor
 
+from benchmarks.scene import camera_of
+from benchmarks.sealed.scores import table
 from benchmarks.timing import timed
 from tofcorr.sensor.effects import ImageEffects
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 from tofcorr.simulation.effects import CATALOGUE
 
-HEIGHT, WIDTH, FOCAL = 480, 640, 525.0
-VGA: dict[str, Any] = {  # what differs from the shipped Kinect
-    "modulation_frequency_hz": 2e7,
-    "camera": {
-        "width": WIDTH,
-        "height": HEIGHT,
-        "K": [[FOCAL, 0.0, 319.5], [0.0, FOCAL, 239.5], [0.0, 0.0, 1.0]],
-        "distortion": [0.05, -0.1, 0.0, 0.0, 0.0],
-    },
-}
+HEIGHT, WIDTH, FOCAL = 480, 640, 900.0
+# What differs from the shipped Kinect.
+VGA = {"modulation_frequency_hz": 2e7, "camera": camera_of(HEIGHT, WIDTH)}
 CONDITIONS = {
     "timestamp_s": 90.0,
     "integration_time_us": 800.0,
@@ -95,14 +89,17 @@ def main(effects: tuple[str, ...], threads: int, repeats: int) -> None:
     """Print how long a sensor takes for a VGA frame: one row for every effect."""
     torch.set_num_threads(threads)
     warnings.simplefilter("ignore")
-    click.echo(f"{'effect':>20}  processor, ms  clock, ms  frames/s   ({threads} threads)")
+    rows: list[tuple[object, ...]] = []
     for name in effects or [None, *CATALOGUE]:
         sensor = sensor_with(name)
-        if sensor is None:
-            click.echo(f"{name:>20}  no depth image shows it")
-            continue
-        processor, clock = milliseconds(sensor, repeats)
-        click.echo(f"{name or 'none':>20}  {processor:13.1f}  {clock:9.1f}  {1e3 / clock:8.1f}")
+        times = ("no depth image shows it", "", "")
+        if sensor is not None:
+            processor, clock = milliseconds(sensor, repeats)
+            times = (f"{processor:.1f}", f"{clock:.1f}", f"{1e3 / clock:.1f}")
+        rows.append((name or "none", *times))
+    click.echo(
+        table((f"effect, {threads} threads", "processor, ms", "clock, ms", "frames/s"), rows)
+    )
 
 
 if __name__ == "__main__":

@@ -165,18 +165,10 @@ BINS = 1200  # paths up to 24 m
 DIRECT_WITHIN = 1e-3  # metres of path by which direct light may differ, in single precision
 
 
-@dataclass(frozen=True)
-class Transient:
-    """Light at some points of the target: indirect over direct, by additional path."""
-
-    histogram: np.ndarray  # (K, BINS) share of the direct light
-    noise: np.ndarray  # (K,) Monte Carlo standard error of the share of all bins together
-
-    def phasor(self, frequency: float) -> np.ndarray:
-        """Sum over the histogram (K,), relative to the direct light, at a modulation frequency."""
-        extra = (np.arange(BINS) + 0.5) * BIN
-        turn = np.exp(2j * np.pi * frequency / SPEED_OF_LIGHT * extra)
-        return self.histogram @ turn
+def phasors(histogram: np.ndarray, frequency: float) -> np.ndarray:
+    """Sum over a histogram (K, BINS), relative to the direct light, at a modulation frequency."""
+    extra = (np.arange(BINS) + 0.5) * BIN
+    return histogram @ np.exp(2j * np.pi * frequency / SPEED_OF_LIGHT * extra)
 
 
 class Renderer:
@@ -189,8 +181,12 @@ class Renderer:
         self._scene: Scene = mi.load_dict(scene_of(room, np.eye(4)))
         self._parameters: Any = mi.traverse(self._scene)
 
-    def at(self, camera: np.ndarray, points: np.ndarray, samples: int, seed: int) -> Transient:
-        """Render the light at points (K, 3) of the target with light and eye at a camera (4, 4)."""
+    def at(self, camera: np.ndarray, points: np.ndarray, samples: int, seed: int) -> np.ndarray:
+        """Render the light at points (K, 3) of the target with light and eye at a camera (4, 4).
+
+        Returns:
+            Indirect light as a share of the direct light, by additional path, (K, BINS).
+        """
         import drjit as dr
         import mitsuba as mi
 
@@ -212,7 +208,6 @@ class Renderer:
         there_and_back = dr.gather(mi.Float, mi.Float(2 * length), index)
         direct = dr.zeros(mi.Float, count)
         bins = dr.zeros(mi.Float, count * BINS)
-        squares = dr.zeros(mi.Float, count)
 
         def add(spec: Light, distance: Light, _wavelengths: object, active: Light) -> None:
             extra = distance - there_and_back
@@ -222,16 +217,13 @@ class Renderer:
             dr.scatter_reduce(dr.ReduceOp.Add, direct, light, index, first)
             where = index * BINS + mi.UInt32(dr.select(later, extra / BIN, 0.0))
             dr.scatter_reduce(dr.ReduceOp.Add, bins, light, where, later)
-            dr.scatter_reduce(dr.ReduceOp.Add, squares, dr.square(light), index, later)
 
         radiance = traced(self._scene, rays, seed, add)
-        dr.eval(radiance, direct, bins, squares)
+        dr.eval(radiance, direct, bins)
         base = np.array(direct)
         if not (base > 0).all():
             raise RuntimeError("the renderer returned no direct light at some points of the target")
-        return Transient(
-            np.array(bins).reshape(count, BINS) / base[:, None], np.sqrt(np.array(squares)) / base
-        )
+        return np.array(bins).reshape(count, BINS) / base[:, None]
 
 
 PATHS = 2048  # paths a point: leaves 3 % of the indirect light as noise, before `smooth`
@@ -261,7 +253,7 @@ def _rendered(
     renderer, result = Renderer(room), []
     for number, (camera, at) in enumerate(zip(cameras, points, strict=True)):
         light = renderer.at(camera, at.reshape(-1, 3), PATHS, seed + number)
-        result.append([light.phasor(frequency) for frequency in frequencies])
+        result.append([phasors(light, frequency) for frequency in frequencies])
     return np.stack(result, axis=1).reshape(len(frequencies), *points.shape[:3])
 
 
