@@ -96,6 +96,7 @@ class OffsetSums:
         self, state: CalibrationState, dataset: Dataset, wall: Wall, reference: Reference
     ) -> None:
         self._state, self._dataset, self._wall, self._reference = state, dataset, wall, reference
+        self._shared_walls = 3 if wall == "one" else 0
         within = reference.covariance_within if wall == "per_image" else None
         # Standardises what the calibration left unknown.
         self._factor = Curvature(reference.covariance if within is None else within).root
@@ -193,10 +194,6 @@ class OffsetSums:
             disagreement=disagreement,
             disagrees=disagrees,
         )
-
-    @property
-    def _shared_walls(self) -> int:
-        return 3 if self._wall == "one" else 0
 
     def _solved(
         self, sums: GroupSums, noise: Tensor, pose_precision: Tensor

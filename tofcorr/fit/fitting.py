@@ -36,7 +36,6 @@ from tofcorr.estimation.moments import (
     ImageMoments,
     MomentObjective,
     Parameters,
-    Prior,
 )
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.planes import estimate_walls, joint_image_equations
@@ -47,7 +46,7 @@ from tofcorr.estimation.regularisation import (
     total_weight,
     with_strengths,
 )
-from tofcorr.estimation.solvers import Solution, Watcher, minimise
+from tofcorr.estimation.solvers import Watcher, minimise
 from tofcorr.estimation.uncertainty import (
     PRIOR_SIGMA,
     effective_variance,
@@ -130,7 +129,6 @@ def fit(
             optimum=optimum if model.error.residual is None else core.solution.parameters,
             hand_eye_only=hand_eye_only,
             covariance=covariance,
-            poses=poses,
             residual=outcome,
             weights=weights,
             walls=problem.walls,
@@ -146,20 +144,10 @@ def hand_eye_alone(problem: Problem, moments: ImageMoments) -> Parameters:
         CalibrationDataError: The frames do not determine it.
     """
     geometry = moments.columns([])
-    found = _minimum(problem, geometry, replace(problem, resumed=None).start(geometry)).parameters
+    start = replace(problem, resumed=None).start(geometry)
+    found = minimise(MomentObjective(geometry), start, problem.options.solver).parameters
     refuse_diverged(found)
     return found
-
-
-def _minimum(
-    problem: Problem,
-    moments: ImageMoments,
-    start: Parameters,
-    prior: Prior | None = None,
-    watcher: Watcher | None = None,
-) -> Solution:
-    """Minimise the point-to-plane loss of the moments with the solver that the options name."""
-    return minimise(MomentObjective(moments, prior), start, problem.options.solver, watcher)
 
 
 def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
@@ -219,9 +207,10 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
     Raises:
         CalibrationDataError: There is one, and the options ask to refuse it.
     """
-    options, conditions = problem.options.model, problem.dataset.conditions(problem.frames)
+    options, solver = problem.options.model, problem.options.solver
+    conditions = problem.dataset.conditions(problem.frames)
     if any(term.is_open("time_constants_s") for term in options.terms):
-        around = _minimum(problem, moments, problem.start(moments)).parameters
+        around = minimise(MomentObjective(moments), problem.start(moments), solver).parameters
         found = time_constant(moments, around, conditions[:, CONDITIONS.index("timestamp")])
         terms = [
             one.model_copy(update={"time_constants_s": (found,)})
@@ -253,7 +242,7 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
         moments=moments,
         start=start,
         smoothness=(prior := smoothness(penalties, total_weight(moments), start)),
-        solution=_minimum(problem, moments, start, prior, problem.watcher),
+        solution=minimise(MomentObjective(moments, prior), start, solver, problem.watcher),
     )
     return _hold(problem, core) if held else core
 
@@ -286,7 +275,8 @@ def _hold(problem: Problem, core: Core) -> Core:
             "axes and a wider range of distances, keep the recorded hand-eye transform "
             "(hand_eye.estimate: no), or set free_directions: prior."
         )
-    return replace(core, solution=_minimum(problem, moments, core.start, core.total_prior))
+    objective = MomentObjective(moments, core.total_prior)
+    return replace(core, solution=minimise(objective, core.start, problem.options.solver))
 
 
 def refuse_diverged(parameters: Parameters) -> None:

@@ -325,7 +325,6 @@ class Fit(Core):
             without the noise of the distances, unless `noise_shift` says otherwise.
         hand_eye_only: The best hand-eye transform without any depth correction.
         covariance: Uncertainty of the parameters, by leaving out one pose at a time.
-        poses: The pose of each image fitted, shape (N,), counted from zero.
         residual: How the residual network was decided on, one sentence; None if none was asked for.
         weights: The weight of each pixel; None if all have the same.
         walls: The estimated walls; None if the recorded ones were used.
@@ -344,7 +343,6 @@ class Fit(Core):
     optimum: Parameters
     hand_eye_only: Parameters
     covariance: Covariance
-    poses: Tensor
     residual: str | None
     weights: PixelWeights | None
     walls: FoundWalls | None
