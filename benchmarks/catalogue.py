@@ -20,9 +20,9 @@ from tqdm import tqdm
 
 from benchmarks.sealed.remains import diagnosed
 from benchmarks.sealed.scores import share, table
-from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.observations import effect_inputs, observe
+from tofcorr.diagnosis.sums.study import absorbed_share
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import load_options
 from tofcorr.simulation.effects import CATALOGUE, MapEffect

@@ -1,10 +1,11 @@
 """Small simulated recordings for the tests of effects and diagnosis."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from tofcorr.data.recording import Recording
@@ -81,6 +82,13 @@ def recorded(
     """Simulate a recording."""
     simulate(options(seed, effects, changes), folder, noise=noise)
     return Recording.open(folder)
+
+
+def altered(recording: Recording, change: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """Change the depth of a recording, (N, H, W), metres; open it again."""
+    path = recording.path / "depth.npy"
+    np.save(path, change(np.load(path)).astype(np.float32))
+    return Recording.open(recording.path)
 
 
 def true_inputs(recording: Recording, simulator: SimulatorOptions) -> EffectInputs:

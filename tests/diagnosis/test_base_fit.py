@@ -11,20 +11,23 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.base_fit import fit_base
-from tofcorr.diagnosis.sums.base_model import BaseModel
+from tofcorr.diagnosis.sums.base import BaseFit, BaseModel, fit_base
 from tofcorr.diagnosis.sums.noise import robust_weights
 from tofcorr.diagnosis.sums.observations import hand_eye_columns, observe, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 
 
+def fitted(recording: Recording) -> BaseFit:
+    """Fit the default base model with a free hand-eye transform."""
+    observations = observe(recording, 50_000)
+    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
+    return fit_base(model, observations)
+
+
 def test_the_hand_eye_transform_is_found_from_a_guess_far_off(nothing_missing: Recording) -> None:
     truth = diagnosed_recordings.options(31).hand_eye.tool_from_camera()
-    lost = replace(nothing_missing, tool_from_camera=np.eye(4))
-    observations = observe(lost, 50_000)
-    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
-    fit = fit_base(model, observations)
+    fit = fitted(replace(nothing_missing, tool_from_camera=np.eye(4)))
     # Robot noise of 0.3 mm and 0.3 mrad over 50 poses; the offset along the axis is the weak one.
     assert float((fit.tool_from_camera - truth)[:3, 3].norm()) < 2e-3
     assert float(se3.rotation_angle(fit.tool_from_camera[:3, :3].T @ truth[:3, :3])) < 2e-3
@@ -59,21 +62,15 @@ def test_the_noise_of_a_pixel_is_known_to_five_per_cent(
 
 def test_a_fixed_pattern_does_not_count_as_noise(folder: Path, nothing_study: Study) -> None:
     pattern = {"name": "fixed_pattern", "rms_m": 0.006, "height": 24, "width": 32}
-    recording = diagnosed_recordings.recorded(folder / "pattern_floor", 31, [pattern])
-    observations = observe(recording, 50_000)
-    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
-    fit = fit_base(model, observations)
+    fit = fitted(diagnosed_recordings.recorded(folder / "pattern_floor", 31, [pattern]))
     assert fit.floor == pytest.approx(nothing_study.fit.floor, rel=0.1)
 
 
 def test_repeats_measure_the_floor(folder: Path, nothing_study: Study) -> None:
     repeats = {"robot": {"repeat_poses": 2, "repeat_frames": 10}}
-    recording = diagnosed_recordings.recorded(folder / "repeats", 31, [], repeats)
-    observations = observe(recording, 50_000)
-    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
-    fit = fit_base(model, observations)
+    fit = fitted(diagnosed_recordings.recorded(folder / "repeats", 31, [], repeats))
     assert fit.noise.repeats == 20
-    assert observations.num_units == 50
+    assert fit.model.observations.num_units == 50
     assert fit.floor == pytest.approx(nothing_study.fit.floor, rel=0.15)
 
 
@@ -91,9 +88,7 @@ def test_undetermined_directions_of_the_hand_eye_transform_stay_near_the_guess(
     lean = {"name": "target_registration", "lean_x": 0.01, "lean_y": -0.01}
     upright = {"robot": {"tilt_axes": "none"}}
     recording = diagnosed_recordings.recorded(tmp_path / "upright", 44, [lean], upright)
-    observations = observe(recording, 50_000)
-    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
-    found = fit_base(model, observations).tool_from_camera
+    found = fitted(recording).tool_from_camera
     away = se3.log(se3.inverse(torch.from_numpy(recording.tool_from_camera)) @ found)
     assert float(away[:3].norm()) < 0.1
     assert float(away[3:].norm()) < 0.2
@@ -105,13 +100,11 @@ def test_depth_without_noise_or_coarsely_rounded_can_be_diagnosed(
 ) -> None:
     """Repeats of such frames are equal: their standard deviation is zero, or nearly."""
     repeats = {"robot": {"repeat_poses": 2, "repeat_frames": 5}}
-    path = tmp_path / "odd"
-    diagnosed_recordings.recorded(path, 31, [], repeats, noise=noise)
-    depth = np.load(path / "depth.npy")
+    recording = diagnosed_recordings.recorded(tmp_path / "odd", 31, [], repeats, noise=noise)
     if step:
-        np.save(path / "depth.npy", (np.round(depth / step) * step).astype(np.float32))
+        recording = diagnosed_recordings.altered(recording, lambda z: np.round(z / step) * step)
     few = DiagnosisOptions(catalogue=("wiggling", "saturation", "fixed_pattern"))
-    study = prepare(Recording.open(path), few, None).study
+    study = prepare(recording, few).study
     assert bool(study.fit.sigma.isfinite().all())
     assert bool(study.sums.ols.gram.isfinite().all())
     # Rounding to a step is an error of step / sqrt(12) at most on the average.

@@ -10,13 +10,14 @@ from typing import Any
 import diagnosed_recordings
 import numpy as np
 import pytest
+from diagnosis.comparisons import model_of
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.rerun.simulator import fitted_distance
+from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.errors import CalibrationDataError
@@ -108,10 +109,8 @@ def test_the_simulator_makes_the_error_of_the_base_model(
     kind: str, beside_pixels: Callable[[str], Study]
 ) -> None:
     study = beside_pixels(kind)
-    twin = fitted_distance(study, None, None)
-    fitted = study.observations.measured - study.fit.residual
-    if study.pattern is not None:
-        fitted = fitted + study.pattern.shift(study.inputs, study.pattern.coefficients)
+    twin = Evidence(study=study, named=model_of(study)).distance()
+    fitted = study.observations.measured - study.system.residual_of(())
     # Tables have knots, and a delay changes the amplitude that the next one depends on.
     assert float((twin - fitted).square().mean().sqrt()) < 3e-4
 

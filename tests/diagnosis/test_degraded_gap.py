@@ -7,8 +7,7 @@ import pytest
 from diagnosed_recordings import PLAIN
 
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.report.page import render
-from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.result import DiagnosisResult, render
 from tofcorr.sensor.model import SensorModel
 from tofcorr.simulation.simulator import simulate
 

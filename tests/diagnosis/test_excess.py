@@ -11,8 +11,9 @@ from tofcorr.diagnosis.sums.observations import Observations
 
 
 def test_poses_count_by_their_weights_and_unknown_pixels_not_at_all() -> None:
-    unit, frame = torch.tensor([0, 1, 1]), torch.tensor([0, 0, 1, 2, 2])
-    observations = cast("Observations", SimpleNamespace(unit=unit, frame=frame, num_units=2))
+    pose = torch.tensor([0, 0, 1, 1, 1])
+    known = SimpleNamespace(per_pose=lambda values: torch.bincount(pose, values))
+    observations = cast("Observations", known)
     left = torch.tensor([0.003, torch.nan, 0.005, 0.005, 0.001]).double()
     share = torch.tensor([1.0, 1.0, 0.5, 0.5, 2.0]).double()
     drawn = torch.tensor([[2.0, 0.0], [0.0, 2.0]]).double()

@@ -12,12 +12,15 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
-from tofcorr.diagnosis.given.checks import refuse_mistaken_geometry
-from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
-from tofcorr.diagnosis.given.source import BuiltInSimulator, open_simulator
+from tofcorr.diagnosis.given import (
+    GivenSimulator,
+    frames_of,
+    open_simulator,
+    refuse_mistaken_geometry,
+    rendered_error,
+)
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.base_fit import SimulatorError
 from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.options import SimulatorOptions
@@ -32,6 +35,7 @@ MOUNT = np.eye(4)
 MOUNT[:3, 3] = 0.0, 0.2, 0.1
 # Rounding of depth to float32 at two metres.
 ROUNDING = 3e-7
+Render = Callable[..., Recording]
 
 
 @dataclass(frozen=True)
@@ -62,38 +66,36 @@ def observations(nothing_missing: Recording) -> Observations:
     return observe(nothing_missing, OPTIONS.most_pixels)
 
 
-def _written(
-    folder: Path,
-    recording: Recording,
-    options: SimulatorOptions,
-    frames: Frames,
-    order: np.ndarray | None = None,
-    **changes: Any,
-) -> Recording:
+@pytest.fixture
+def rendered(
+    nothing_missing: Recording, options: SimulatorOptions, frames: Frames, tmp_path: Path
+) -> Render:
     """Write frames with the rows of a recording; `order` says which row each frame has."""
-    order = np.arange(recording.num_frames) if order is None else order
-    parts: dict[str, Any] = {
-        "camera": recording.camera,
-        "depth_kind": recording.depth_kind,
-        "rows": recording.frames.select(order),
-        "depth": frames.depth,
-        "amplitude": frames.amplitude,
-        "modulation_frequency": recording.modulation_frequency,
-        "tool_from_camera": options.hand_eye.tool_from_camera().numpy(),
-    }
-    write_recording(folder, **parts | changes)
-    return Recording.open(folder)
+    every, pose = np.arange(nothing_missing.num_frames), options.hand_eye.tool_from_camera().numpy()
+
+    def written(
+        own: Frames = frames, order: np.ndarray = every, name: str = "sim", **changes: Any
+    ) -> Recording:
+        parts: dict[str, Any] = {
+            "camera": nothing_missing.camera,
+            "depth_kind": nothing_missing.depth_kind,
+            "rows": nothing_missing.frames.select(order),
+            "depth": own.depth,
+            "amplitude": own.amplitude,
+            "modulation_frequency": nothing_missing.modulation_frequency,
+            "tool_from_camera": pose,
+        }
+        write_recording(tmp_path / name, **parts | changes)
+        return Recording.open(tmp_path / name)
+
+    return written
 
 
 def test_rendered_frames_of_the_built_in_simulator_are_the_simulator_itself(
-    nothing_missing: Recording,
-    options: SimulatorOptions,
-    frames: Frames,
-    tmp_path: Path,
+    nothing_missing: Recording, options: SimulatorOptions, rendered: Render
 ) -> None:
-    rendered = RenderedSimulator(_written(tmp_path / "sim", nothing_missing, options, frames))
-    one = prepare(nothing_missing, OPTIONS, BuiltInSimulator(options))
-    other = prepare(nothing_missing, OPTIONS, rendered)
+    one = prepare(nothing_missing, OPTIONS, GivenSimulator(options))
+    other = prepare(nothing_missing, OPTIONS, GivenSimulator(frames=rendered()))
     assert one.as_given is not None
     assert other.as_given is not None
     assert torch.allclose(one.as_given, other.as_given, atol=ROUNDING)
@@ -101,76 +103,53 @@ def test_rendered_frames_of_the_built_in_simulator_are_the_simulator_itself(
     assert torch.allclose(one.study.fit.residual, other.study.fit.residual, atol=1e-4)
 
 
-def _error(simulated: SimulatorError) -> torch.Tensor:
-    return simulated.error
-
-
 def test_order_and_number_of_renders_do_not_matter(
-    nothing_missing: Recording,
-    options: SimulatorOptions,
-    frames: Frames,
-    observations: Observations,
-    tmp_path: Path,
+    frames: Frames, observations: Observations, rendered: Render
 ) -> None:
-    count = nothing_missing.num_frames
-    mixed = torch.randperm(count, generator=torch.Generator().manual_seed(3)).numpy()
-    once = _written(tmp_path / "once", nothing_missing, options, frames)
+    mixed = torch.randperm(len(frames.depth), generator=torch.Generator().manual_seed(3)).numpy()
     order = np.concatenate([mixed, mixed[::-1]])
     both = Frames(frames.depth[order], frames.amplitude[order])
-    twice = _written(tmp_path / "twice", nothing_missing, options, both, order)
-    plain = RenderedSimulator(once).simulate(observations, OPTIONS)
-    again = RenderedSimulator(twice).simulate(observations, OPTIONS)
-    assert torch.allclose(_error(plain), _error(again), atol=ROUNDING, equal_nan=True)
+    plain = rendered_error(rendered(), observations, OPTIONS)
+    again = rendered_error(rendered(both, order, "twice"), observations, OPTIONS)
+    assert torch.allclose(plain.error, again.error, atol=ROUNDING, equal_nan=True)
     assert not plain.limits
 
 
 def test_a_function_gives_what_its_frames_give(
-    nothing_missing: Recording,
-    options: SimulatorOptions,
-    frames: Frames,
-    observations: Observations,
-    tmp_path: Path,
+    options: SimulatorOptions, frames: Frames, observations: Observations, rendered: Render
 ) -> None:
-    written = _written(tmp_path / "sim", nothing_missing, options, frames)
     pose = options.hand_eye.tool_from_camera().numpy()
-    function = PythonSimulator(lambda _: {"depth": frames.depth, "tool_from_camera": pose})
-    ours = _error(function.simulate(observations, OPTIONS))
-    theirs = _error(RenderedSimulator(written).simulate(observations, OPTIONS))
-    assert torch.allclose(ours, theirs, atol=ROUNDING, equal_nan=True)
+    returned = {"depth": frames.depth, "tool_from_camera": pose}
+    function = open_simulator(lambda _: returned, observations.recording)
+    assert function is not None
+    ours = function.simulate(observations, OPTIONS)
+    theirs = rendered_error(rendered(), observations, OPTIONS)
+    assert torch.allclose(ours.error, theirs.error, atol=ROUNDING, equal_nan=True)
 
 
 def test_the_mean_of_several_renders_has_less_noise(
-    nothing_missing: Recording,
-    options: SimulatorOptions,
-    frames: Frames,
-    observations: Observations,
-    tmp_path: Path,
+    frames: Frames, observations: Observations, rendered: Render
 ) -> None:
     generator = np.random.default_rng(4)
-    count, times, sd = nothing_missing.num_frames, 4, 2e-3
-    noisy = Frames(
-        np.tile(frames.depth, (times, 1, 1))
-        + generator.normal(0, sd, (times * count, *frames.depth.shape[1:])).astype(np.float32),
-        np.tile(frames.amplitude, (times, 1, 1)),
-    )
-    order = np.tile(np.arange(count), times)
-    written = _written(tmp_path / "sim", nothing_missing, options, noisy, order)
-    simulated = RenderedSimulator(written).simulate(observations, OPTIONS)
+    times, sd = 4, 2e-3
+    order = np.tile(np.arange(len(frames.depth)), times)
+    noise = generator.normal(0, sd, frames.depth[order].shape).astype(np.float32)
+    noisy = Frames(frames.depth[order] + noise, frames.amplitude[order])
+    simulated = rendered_error(rendered(noisy, order), observations, OPTIONS)
     sigma = float(simulated.sigma.square().mean().sqrt())
     assert sigma == pytest.approx(sd / times**0.5, rel=0.05)
 
 
 def test_the_noise_of_dark_pixels_of_camera_and_renders_is_that_of_their_difference(
-    nothing_missing: Recording, options: SimulatorOptions, frames: Frames, tmp_path: Path
+    nothing_missing: Recording, frames: Frames, rendered: Render
 ) -> None:
     """Renders of read noise, A^-2 below a brightness and constant above: no law goes on so."""
     generator = np.random.default_rng(6)
     bright = np.nanmedian(frames.amplitude)
     sd = 3e-3 * np.clip(bright / np.maximum(frames.amplitude, 1.0), 1.0, 2.0)
     drawn = generator.standard_normal(frames.depth.shape) * sd
-    noisy = Frames(frames.depth + drawn.astype(np.float32), frames.amplitude)
-    rendered = RenderedSimulator(_written(tmp_path / "sim", nothing_missing, options, noisy))
-    study = prepare(nothing_missing, OPTIONS, rendered).study
+    noisy = rendered(Frames(frames.depth + drawn.astype(np.float32), frames.amplitude))
+    study = prepare(nothing_missing, OPTIONS, GivenSimulator(frames=noisy)).study
     fit, amplitude = study.fit, study.inputs.amplitude
     assert amplitude is not None
     darkest = amplitude < amplitude.quantile(0.05)
@@ -179,65 +158,68 @@ def test_the_noise_of_dark_pixels_of_camera_and_renders_is_that_of_their_differe
 
 
 def test_a_pixel_that_the_simulator_does_not_see_is_left_out(
-    nothing_missing: Recording, options: SimulatorOptions, frames: Frames, tmp_path: Path
+    nothing_missing: Recording, frames: Frames, rendered: Render
 ) -> None:
     depth = frames.depth.copy()
     depth[:, :6] = np.nan
-    holes = _written(tmp_path / "sim", nothing_missing, options, replace(frames, depth=depth))
-    prepared = prepare(nothing_missing, OPTIONS, RenderedSimulator(holes))
+    holes = GivenSimulator(frames=rendered(replace(frames, depth=depth)))
+    prepared = prepare(nothing_missing, OPTIONS, holes)
     rows = prepared.study.observations.pixel // nothing_missing.camera.width
     assert int(rows.min()) == 6
     assert any("left out" in warning for warning in prepared.warnings)
 
 
-def test_other_cameras_depths_and_shapes_are_refused_in_a_sentence(
-    nothing_missing: Recording,
-    options: SimulatorOptions,
-    frames: Frames,
-    observations: Observations,
-    tmp_path: Path,
+def test_other_cameras_and_depths_are_refused_in_a_sentence(
+    nothing_missing: Recording, frames: Frames, observations: Observations, rendered: Render
 ) -> None:
-    matrix = np.array(nothing_missing.camera.matrix)
+    camera, depth, bright = nothing_missing.camera, frames.depth, frames.amplitude
+    matrix = np.array(camera.matrix)
     matrix[0, 0] += 1.0
-    other = replace(nothing_missing.camera, matrix=tuple(map(tuple, matrix.tolist())))
-    cropped = Frames(frames.depth[:, 1:], frames.amplitude[:, 1:])
-    smaller = replace(nothing_missing.camera, height=nothing_missing.camera.height - 1)
-    cases: list[tuple[str, Callable[[], object]]] = []
-
-    def rendered(name: str, own: Frames = frames, **changes: Any) -> Callable[[], object]:
-        written = _written(tmp_path / name, nothing_missing, options, own, **changes)
-        return lambda: RenderedSimulator(written).simulate(observations, OPTIONS)
-
-    cases.append(("pixels look up to", rendered("lens", camera=other)))
-    cases.append(("32 x 23 pixels", rendered("size", cropped, camera=smaller)))
-    cases.append(("depth_kind radial", rendered("kind", depth_kind="z")))
-    cases.append(("unit of depth", rendered("unit", Frames(1e3 * frames.depth, frames.amplitude))))
+    other = replace(camera, matrix=tuple(map(tuple, matrix.tolist())))
+    smaller = replace(camera, height=camera.height - 1)
     # Both were diagnosed: flipped frames as "0.0 mm, no more than the noise".
-    flipped = Frames(frames.depth[:, ::-1], frames.amplitude[:, ::-1])
-    cases.append(("if one mistake is undone", rendered("flipped", flipped)))
-    cases.append(("degrees from its tool_from_camera", rendered("mount", tool_from_camera=MOUNT)))
-    wrong = PythonSimulator(lambda _: frames.depth[:-1])
-    cases.append(("recording's shape", lambda: wrong.simulate(observations, OPTIONS)))
-    for words, simulate in cases:
+    flipped = rendered(Frames(depth[:, ::-1], bright[:, ::-1]), name="flipped")
+    mounted = rendered(name="mount", tool_from_camera=MOUNT)
+    cases = {
+        "pixels look up to": rendered(name="lens", camera=other),
+        "32 x 23 pixels": rendered(Frames(depth[:, 1:], bright[:, 1:]), name="a", camera=smaller),
+        "depth_kind radial": rendered(name="kind", depth_kind="z"),
+        "unit of depth": rendered(Frames(1e3 * depth, bright), name="unit"),
+        "if one mistake is undone": flipped,
+        "degrees from its tool_from_camera": mounted,
+    }
+    for words, own in cases.items():
         with pytest.raises(CalibrationDataError, match=words) as refusal:
-            simulate()
+            rendered_error(own, observations, OPTIONS)
         assert str(refusal.value).count(". ") == 0
 
 
-def test_an_error_names_the_function_and_no_scratch_folder(observations: Observations) -> None:
-    shape = observations.distance_images.shape
-    simulator = PythonSimulator(lambda _: {"depth": np.ones(shape), "amplitude": -np.ones(shape)})
-    with pytest.raises(CalibrationDataError) as refusal:
-        simulator.simulate(observations, OPTIONS)
-    assert str(refusal.value).startswith(
-        "the frames that the function returned/amplitude.npy: frame 0, row 0"
-    )
-    with pytest.raises(CalibrationDataError, match=r"Use tensor\.detach\(\)"):
-        PythonSimulator(lambda _: torch.ones(shape, requires_grad=True)).simulate(
-            observations, OPTIONS
-        )
-    with pytest.raises(ConfigError, match=r"got ndarray\. Frames in memory are handed over"):
-        open_simulator(np.ones(shape))  # type: ignore[arg-type]
+def test_what_a_function_returned_is_refused_by_what_it_is(nothing_missing: Recording) -> None:
+    """A pose was refused as "recording.yaml: ...", and arrays by the name of a scratch folder."""
+    depth = np.ones(nothing_missing.depth.shape)
+    poses = np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)
+    of_pose = "The simulator's tool_from_camera: "
+    cases: list[tuple[str, Any]] = [
+        ("The simulator's depth must be numbers of the recording's shape", depth[:-1]),
+        (r".*Use tensor\.detach\(\)", torch.ones(depth.shape, requires_grad=True)),
+        (
+            "the frames that the function returned/amplitude.npy: frame 0, row 0",
+            {"depth": depth, "amplitude": -depth},
+        ),
+        *((of_pose, {"depth": depth, "tool_from_camera": pose}) for pose in poses),
+    ]
+    for words, returned in cases:
+        with pytest.raises(CalibrationDataError, match=f"^{words}"):
+            frames_of(returned, nothing_missing)
+
+
+@pytest.mark.parametrize("sim", [None, np.ones(3)])
+def test_what_names_no_simulator_is_refused(
+    sim: Any, nothing_missing: Recording, tmp_path: Path
+) -> None:
+    words = r"no recording\.yaml" if sim is None else r"got ndarray\. Frames in memory are handed"
+    with pytest.raises(ConfigError, match=words):
+        open_simulator(tmp_path if sim is None else sim, nothing_missing)
 
 
 @pytest.mark.parametrize("guess", [None, {"translation_mm": 3.0, "rotation_deg": 0.0}])
@@ -254,20 +236,3 @@ def test_a_recording_of_the_built_in_simulator_is_one_once_its_guess_is_exact(
     refuse_mistaken_geometry(replace(guessed, tool_from_camera=true.numpy()))
     exact = few | {"hand_eye": {"guess": {"translation_mm": 0.0, "rotation_deg": 0.0}}}
     refuse_mistaken_geometry(diagnosed_recordings.recorded(tmp_path / "exact", 5, changes=exact))
-
-
-def test_a_transform_that_a_function_returned_is_not_called_that_of_a_file(
-    observations: Observations,
-) -> None:
-    """It was refused as "recording.yaml: 'tool_from_camera': ..."."""
-    depth = np.ones(observations.distance_images.shape)
-    for wrong in (np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)):
-        frames = {"depth": depth, "tool_from_camera": wrong}
-        with pytest.raises(CalibrationDataError) as refusal:
-            PythonSimulator(lambda _, frames=frames: frames).simulate(observations, OPTIONS)
-        assert str(refusal.value).startswith("The simulator's tool_from_camera: ")
-
-
-def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no recording\.yaml"):
-        open_simulator(tmp_path)

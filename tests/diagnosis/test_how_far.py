@@ -17,7 +17,7 @@ from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.structure import noise_floor
 from tofcorr.diagnosis.findings.where import interval_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.base import BaseFit
 from tofcorr.diagnosis.sums.study import Study
 
 

@@ -32,7 +32,7 @@ from tofcorr.diagnosis.findings.naming import (
 )
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.base_fit import SimulatorError
+from tofcorr.diagnosis.sums.base import SimulatorError
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import ConfigError
 

@@ -21,7 +21,7 @@ def test_time_is_varied_only_where_the_stamps_are_of_a_clock(nothing_study: Stud
     for stamps, is_clock in ((number, False), (10.0 + 0.7 * number, True)):
         candidates = make_candidates(without_conditions(nothing_study, stamps), ["distance"])
         assert candidates is not None
-        assert ("after all others" in candidates.words) == is_clock
+        assert ("after all others" in candidates[0]) == is_clock
 
 
 def test_without_anything_to_vary_the_advice_is_how_to_observe_the_effect(

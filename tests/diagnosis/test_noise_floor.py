@@ -10,11 +10,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from diagnosed_recordings import recorded
+from diagnosed_recordings import altered, recorded
 from scipy.ndimage import gaussian_filter, uniform_filter
 from torch import Tensor
 
-from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.structure import noise_floor, shared_by_poses, unlike_waves
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -128,12 +127,10 @@ def test_a_bent_target_is_no_filter_of_the_noise_once_it_is_known(tmp_path: Path
     """Neighbours share what the target does: the noise would seem half as large again."""
     bent = {"name": "target_shape", "x2_y0": 0.02, "x1_y1": 0.02, "x3_y0": 0.015}
     recording = recorded(tmp_path / "bent", 48, [bent], STILL, noise=False)
-    depth = np.load(recording.path / "depth.npy")
-    white = np.random.default_rng(48).standard_normal(depth.shape)
+    white = np.random.default_rng(48).standard_normal(recording.depth.shape)
     noise = 5 * SIGMA * np.stack([uniform_filter(one, 5) for one in white])
-    np.save(recording.path / "depth.npy", (depth + noise).astype(np.float32))
     options = DiagnosisOptions(catalogue=("target_shape",))
-    study = prepare(Recording.open(recording.path), options).study
+    study = prepare(altered(recording, lambda z: z + noise), options).study
     assert _floor(study) > 1.3 * SIGMA
     assert _floor(study, "target_shape") == pytest.approx(SIGMA, rel=0.1)
 
@@ -143,13 +140,11 @@ def test_structure_that_waves_and_poses_both_show_is_taken_off_the_noise_once(
 ) -> None:
     """Quadrants of the image that are off by 4 mm in all images are waves, and poses share them."""
     recording = recorded(tmp_path / "quadrants", 61, noise=False)
-    depth = np.load(recording.path / "depth.npy")
-    height, width = depth.shape[1:]
-    noise = SIGMA * np.random.default_rng(61).standard_normal(depth.shape)
-    sides = [np.sign(np.arange(size) - (size - 1) / 2) for size in (height, width)]
-    depth += noise + 2 * SIGMA * np.outer(*sides)
-    np.save(recording.path / "depth.npy", depth)
-    study = prepare(Recording.open(recording.path), DiagnosisOptions()).study
+    shape = recording.depth.shape
+    noise = SIGMA * np.random.default_rng(61).standard_normal(shape)
+    sides = [np.sign(np.arange(size) - (size - 1) / 2) for size in shape[1:]]
+    odd = noise + 2 * SIGMA * np.outer(*sides)
+    study = prepare(altered(recording, lambda z: z + odd), DiagnosisOptions()).study
     assert _floor(study) == pytest.approx(SIGMA, rel=0.05)
 
 
@@ -157,15 +152,14 @@ def _recorded(folder: Path, frames: int) -> Study:
     """Twelve poses and two more with several frames each, whose noise a filter makes alike."""
     repeats = STILL["robot"] | {"repeat_poses": 2, "repeat_frames": frames}
     recording = recorded(folder, 48, [], STILL | {"robot": repeats}, noise=False)
-    depth = np.load(recording.path / "depth.npy")
-    noise = SIGMA * np.random.default_rng(7).standard_normal(depth.shape)
+    noise = SIGMA * np.random.default_rng(7).standard_normal(recording.depth.shape)
     pose = recording.frames.pose_id
     assert pose is not None
-    for frame in range(1, len(depth)):
+    for frame in range(1, len(noise)):
         if pose[frame] != "" and pose[frame] == pose[frame - 1]:
             noise[frame] = KEPT * noise[frame - 1] + np.sqrt(1 - KEPT**2) * noise[frame]
-    np.save(recording.path / "depth.npy", (depth + noise).astype(np.float32))
-    return prepare(Recording.open(recording.path), DiagnosisOptions(catalogue=("wiggling",))).study
+    options = DiagnosisOptions(catalogue=("wiggling",))
+    return prepare(altered(recording, lambda z: z + noise), options).study
 
 
 def test_a_filter_over_time_is_seen_in_five_frames_of_a_pose(tmp_path: Path) -> None:

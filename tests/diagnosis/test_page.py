@@ -17,8 +17,7 @@ from matplotlib.text import Text
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Estimated, Stage
 from tofcorr.diagnosis.report.figures import stage_bars
-from tofcorr.diagnosis.report.page import render
-from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.result import DiagnosisResult, render
 from tofcorr.diagnosis.report.words import (
     along,
     cause_words,
@@ -27,7 +26,7 @@ from tofcorr.diagnosis.report.words import (
     p_words,
     share_words,
 )
-from tofcorr.diagnosis.rerun.sensor import sensor_of
+from tofcorr.diagnosis.rerun.simulator import sensor_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 needs_browser = pytest.mark.skipif(
@@ -247,8 +246,7 @@ def test_base_terms_and_their_higher_orders_have_names_of_their_own(
 def test_every_fitted_value_stands_on_the_page_as_in_the_sensor_file(
     page: str, time_diagnosis: DiagnosisResult
 ) -> None:
-    evidence = time_diagnosis.evidence
-    sensor = sensor_of(evidence.study, evidence.named, time_diagnosis.simulator, None)
+    sensor = sensor_of(time_diagnosis.evidence, None)
     found = {(one.cause, one.name): one for one in time_diagnosis.fitted}
     for group, values in sensor.error.coefficients.items():
         for name, value in values.items():

@@ -14,9 +14,7 @@ from tofcorr.cli.simulate import diagnose_command as command
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.report.page import write_report
-from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.rerun.simulator import simulator_of, solution_of, twin_distance
+from tofcorr.diagnosis.report.result import DiagnosisResult, write_report
 from tofcorr.observables.figures import drawings
 from tofcorr.options import load_options
 from tofcorr.simulation.options import SimulatorOptions
@@ -79,9 +77,7 @@ def test_the_fitted_simulator_measures_what_the_fit_predicts(
 ) -> None:
     """Tables, hand-eye transform and effect pass through the whole simulator unharmed."""
     study, named = time_diagnosis.evidence.study, time_diagnosis.evidence.named
-    simulator = simulator_of(study, named, None)
-    pose = solution_of(study, named)[0]
-    twin = twin_distance(study.observations, simulator, pose)
+    twin = time_diagnosis.evidence.distance()
     fitted = study.observations.measured - named.study.system.residual_of(named.columns)
     # The fit is linear around the base fit; the simulator is not.
     assert float((twin - fitted).square().mean().sqrt()) < 2e-4

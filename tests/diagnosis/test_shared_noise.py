@@ -24,20 +24,17 @@ ONE_WAY: dict[str, Any] = {
     "conditions": {"integration_time_us": [500.0]},
     "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
 }
-REPEATED: dict[str, Any] = {
-    **ONE_WAY,
-    "robot": {**ONE_WAY["robot"], "repeat_poses": 2, "repeat_frames": 5},
-}
+REPEATS = {"repeat_poses": 2, "repeat_frames": 5}
+REPEATED: dict[str, Any] = ONE_WAY | {"robot": ONE_WAY["robot"] | REPEATS}
+both_ways = pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single", "repeats"])
 
 
 def _filtered(folder: Path, changes: dict[str, Any], width: int) -> Study:
     """A recording whose noise, of one standard deviation, is a moving average of that width."""
     recording = diagnosed_recordings.recorded(folder, 48, [], changes, noise=False)
-    depth = np.load(recording.path / "depth.npy")
-    noise = np.random.default_rng(48).normal(size=(len(depth), 40, 48)).astype(np.float32)
-    noise = width * SIGMA * np.stack([uniform_filter(image, width) for image in noise])
-    np.save(recording.path / "depth.npy", depth + noise[:, 8:32, 8:40])
-    return prepare(Recording.open(recording.path), OPTIONS).study
+    noise = np.random.default_rng(48).normal(size=(recording.num_frames, 40, 48))
+    noise = width * SIGMA * np.stack([uniform_filter(own, width) for own in noise])[:, 8:32, 8:40]
+    return prepare(diagnosed_recordings.altered(recording, lambda z: z + noise), OPTIONS).study
 
 
 def _shared_in_squares() -> float:
@@ -49,7 +46,7 @@ def _shared_in_squares() -> float:
     return float(np.mean(values))
 
 
-@pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single frames", "repeats"])
+@both_ways
 def test_what_a_filter_makes_neighbours_share_is_measured_and_is_no_structure(
     changes: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -62,7 +59,7 @@ def test_what_a_filter_makes_neighbours_share_is_measured_and_is_no_structure(
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
 
-@pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single frames", "repeats"])
+@both_ways
 def test_a_filter_is_measured_from_some_poses_of_a_long_recording(
     changes: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,20 +93,18 @@ def test_a_filter_is_seen_where_few_pixels_of_each_image_are_chosen(tmp_path: Pa
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
 
-@pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single frames", "repeats"])
+@both_ways
 def test_stripes_that_move_from_frame_to_frame_are_no_filtered_noise(
     changes: dict[str, Any], tmp_path: Path
 ) -> None:
     """Neighbours share them, but so do pixels farther apart than a filter reaches."""
     recording = diagnosed_recordings.recorded(tmp_path / "striped", 48, [], changes, noise=False)
-    depth = np.load(recording.path / "depth.npy")
     random = np.random.default_rng(48)
     row, column = np.mgrid[:24, :32]
-    start = random.uniform(0, 2 * np.pi, (len(depth), 1, 1))
+    start = random.uniform(0, 2 * np.pi, (recording.num_frames, 1, 1))
     stripes = 3 * SIGMA * np.sin(0.2 * column + 0.3 * row + start)
-    noise = SIGMA * random.normal(size=depth.shape)
-    np.save(recording.path / "depth.npy", (depth + stripes + noise).astype(np.float32))
-    study = prepare(Recording.open(recording.path), OPTIONS).study
+    odd = stripes + SIGMA * random.normal(size=stripes.shape)
+    study = prepare(diagnosed_recordings.altered(recording, lambda z: z + odd), OPTIONS).study
     assert study.fit.shared.striped
     assert study.fit.noise.repeats == 0
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.25)
@@ -134,9 +129,8 @@ def test_a_smooth_pattern_that_stands_still_is_no_filtered_noise(tmp_path: Path)
     recording = diagnosed_recordings.recorded(tmp_path / "ring", 48, [], ONE_WAY)
     row, column = np.mgrid[:24, :32]
     ring = np.exp(-0.5 * ((np.hypot(row - 11.5, column - 15.5) - 8) / 2) ** 2)
-    depth = np.load(recording.path / "depth.npy")
-    np.save(recording.path / "depth.npy", (depth + 0.02 * ring).astype(np.float32))
-    study = prepare(Recording.open(recording.path), OPTIONS).study
+    recording = diagnosed_recordings.altered(recording, lambda z: z + 0.02 * ring)
+    study = prepare(recording, OPTIONS).study
     assert set(study.fit.shared.share.values()) == {0.0}
 
 

@@ -9,11 +9,9 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
-from tofcorr.diagnosis.given.source import BuiltInSimulator
+from tofcorr.diagnosis.given import GivenSimulator, frames_of, rendered_error
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.base_fit import SimulatorError
 from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
 from tofcorr.simulation.options import SimulatorOptions
 
@@ -36,16 +34,12 @@ def observations(nothing_missing: Recording) -> Observations:
     return observe(nothing_missing, OPTIONS.most_pixels)
 
 
-def _error(simulated: SimulatorError) -> torch.Tensor:
-    return simulated.error
-
-
 def test_a_fixed_hand_eye_transform_is_that_of_the_simulator(
     nothing_missing: Recording, options: SimulatorOptions
 ) -> None:
     # It was the recording's guess, which the simulator does not share.
     fixed = OPTIONS.model_copy(update={"hand_eye": "fixed"})
-    prepared = prepare(nothing_missing, fixed, BuiltInSimulator(options))
+    prepared = prepare(nothing_missing, fixed, GivenSimulator(options))
     assert torch.equal(prepared.study.fit.tool_from_camera, options.hand_eye.tool_from_camera())
     assert float(prepared.study.fit.residual.abs().median()) < 5e-3
 
@@ -57,7 +51,7 @@ def test_the_gap_as_given_is_that_of_the_simulators_own_parameters(
     without = options.sensor.model_copy(update={"delays": type(options.sensor.delays)()})
     ideal = options.model_copy(update={"sensor": without})
     found = diagnose(nothing_missing, ideal, OPTIONS)
-    error = _error(BuiltInSimulator(options).simulate(observations, OPTIONS))
+    error = GivenSimulator(options).simulate(observations, OPTIONS).error
     truth = float(error.square().mean().sqrt())
     assert truth > 0.01
     assert found.gap.as_given is not None
@@ -81,13 +75,11 @@ def test_what_a_simulator_does_elsewhere_is_carried_to_the_recording(
     """The simulator saw 50 other poses; its error at the recording's own is known from options."""
     elsewhere = diagnosed_recordings.recorded(tmp_path / "sim", 931, noise=False)
     exact = options.hand_eye.tool_from_camera().numpy()
-    simulated = RenderedSimulator(replace(elsewhere, tool_from_camera=exact)).simulate(
-        observations, OPTIONS
-    )
-    truth = _error(BuiltInSimulator(options).simulate(observations, OPTIONS))
-    known = _error(simulated).isfinite()
+    simulated = rendered_error(replace(elsewhere, tool_from_camera=exact), observations, OPTIONS)
+    truth = GivenSimulator(options).simulate(observations, OPTIONS).error
+    known = simulated.error.isfinite()
     assert float(known.double().mean()) > 0.9
-    off = (_error(simulated) - truth)[known]
+    off = (simulated.error - truth)[known]
     assert float(off.square().mean().sqrt()) < 3e-4
     assert "other poses" in simulated.limits[0]
     assert simulated.carried
@@ -101,5 +93,5 @@ def test_the_truth_of_rendered_frames_is_their_own_plane(observations: Observati
     truth = torch.zeros(observations.num_frames, size, dtype=torch.float64)
     truth[observations.frame, observations.pixel] = predicted_distance(observations, pose)
     depth = (truth + 0.004).reshape(-1, camera.height, camera.width).numpy()
-    error = _error(PythonSimulator(lambda _: depth).simulate(observations, OPTIONS))
+    error = rendered_error(frames_of(depth, observations.recording), observations, OPTIONS).error
     assert torch.allclose(error, torch.full_like(error, 0.004), atol=ROUNDING)

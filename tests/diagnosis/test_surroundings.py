@@ -11,7 +11,7 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.rerun.simulator import twin_distance
-from tofcorr.diagnosis.sums.base_fit import BaseFit, filtered_inputs
+from tofcorr.diagnosis.sums.base import BaseFit, filtered_inputs
 from tofcorr.diagnosis.sums.observations import effect_inputs, observe, predicted_images
 from tofcorr.simulation.effects.stray_light import StrayLightEffect
 from tofcorr.simulation.simulator import default_hand_eye, twin_frames

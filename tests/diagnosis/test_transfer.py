@@ -10,9 +10,11 @@ from diagnosis.comparisons import resamples_of
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
-from tofcorr.diagnosis.rerun.checks import fitted_to, measure_transfer, noisy_frames, observables_of
+from tofcorr.diagnosis.given import open_simulator
+from tofcorr.diagnosis.rerun.checks import measure_transfer, noisy_frames
+from tofcorr.diagnosis.rerun.simulator import Evidence, fitted_to
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.observables.compare import compare_observables
 
 
 def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetre(
@@ -21,11 +23,12 @@ def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetr
     named = nothing_named
     generator = torch.Generator().manual_seed(1)
     resamples = resamples_of(nothing_study, 2)
-    transfer = measure_transfer(nothing_study, named, None, generator, resamples)
+    found = Evidence(study=nothing_study, named=named)
+    transfer = measure_transfer(found, generator, resamples)
     assert transfer is not None
     # Without an effect both simulators are one, and so are the corrections: also their noise.
     assert named.names == ()
-    assert transfer.gain_interval == (0.0, 0.0)
+    assert transfer.gain.interval == (0.0, 0.0)
     assert transfer.trained_on_sim_with_effects == transfer.trained_on_sim < 5e-4
     assert transfer.trained_on_real < 5e-4
 
@@ -46,36 +49,30 @@ def test_poses_that_are_held_out_have_no_influence_on_what_is_fitted(nothing_stu
 def test_the_simulator_that_took_the_recording_has_its_noise(
     nothing_missing: Recording,
 ) -> None:
-    simulator = diagnosed_recordings.options(31)
-    found = observables_of(nothing_missing, simulator, seed=7, level=0.05)
+    frames = noisy_frames(nothing_missing, diagnosed_recordings.options(31), 7)
+    assert frames.num_frames == nothing_missing.num_frames
+    poses = torch.from_numpy(frames.frames.world_from_tool)
+    torch.testing.assert_close(poses, torch.from_numpy(nothing_missing.frames.world_from_tool))
+    found = compare_observables(nothing_missing, frames, seed=7)
     assert found.noise is not None
     assert found.noise["same_poses"]
     assert found.noise["ratio"] == pytest.approx(1.0, abs=0.05)
     assert found.explained_by == ()
 
 
-def test_noisy_frames_have_the_poses_of_the_recording(
-    nothing_missing: Recording,
-) -> None:
-    simulator = diagnosed_recordings.options(31)
-    frames = noisy_frames(nothing_missing, simulator, 3)
-    assert frames.num_frames == nothing_missing.num_frames
-    poses = torch.from_numpy(frames.frames.world_from_tool)
-    torch.testing.assert_close(poses, torch.from_numpy(nothing_missing.frames.world_from_tool))
-
-
 def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
     nothing_missing: Recording,
 ) -> None:
     frames = noisy_frames(nothing_missing, diagnosed_recordings.options(31), 3)
-    rendered = RenderedSimulator(frames).rendered_frames(nothing_missing)
-    compared = observables_of(nothing_missing, rendered, seed=7, level=0.05)
+    depth = np.asarray(frames.depth)
+    found = []
+    for sim in (frames, lambda _: depth):
+        opened = open_simulator(sim, nothing_missing)
+        assert opened is not None
+        found.append(compare_observables(nothing_missing, opened.frames, seed=7))
+    compared, without_amplitude = found
     assert compared.noise is not None
     assert compared.noise["same_poses"]
-    depth = np.asarray(frames.depth)
-    function = PythonSimulator(lambda _: depth)
-    called = function.rendered_frames(nothing_missing)
-    without_amplitude = observables_of(nothing_missing, called, seed=7, level=0.05)
     assert without_amplitude.noise is not None
     assert without_amplitude.amplitude is None
     assert without_amplitude.noise["ratio"] == pytest.approx(compared.noise["ratio"], abs=0.15)

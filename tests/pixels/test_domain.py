@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.diagnosis.sums.base_model import domain_of
+from tofcorr.diagnosis.sums.base import domain_of
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from

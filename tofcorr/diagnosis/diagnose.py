@@ -20,19 +20,22 @@ from tofcorr.diagnosis.findings.gap import (
 )
 from tofcorr.diagnosis.findings.outliers import headline_of_given, refuse_impossible_gap
 from tofcorr.diagnosis.findings.shares import attribute, explained_squares, parts_of
-from tofcorr.diagnosis.given.simulator import GivenSimulator
-from tofcorr.diagnosis.given.source import Simulator, open_simulator
+from tofcorr.diagnosis.given import GivenSimulator, Simulator, open_simulator
 from tofcorr.diagnosis.next.advice import minimum_detectable, next_recording
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
-from tofcorr.diagnosis.report.page import write_report
-from tofcorr.diagnosis.report.result import DiagnosisResult, Evidence
+from tofcorr.diagnosis.report.result import DiagnosisResult, write_report
 from tofcorr.diagnosis.report.words import list_causes, list_remarks, write_verdict
-from tofcorr.diagnosis.rerun.checks import check_in_simulator, measure_transfer, observables_of
-from tofcorr.diagnosis.rerun.sensor import degraded_stage, fitted_values
-from tofcorr.diagnosis.rerun.simulator import simulator_of, tables_of, whole_patterns
+from tofcorr.diagnosis.rerun.checks import (
+    check_in_simulator,
+    degraded_stage,
+    measure_transfer,
+    noisy_frames,
+)
+from tofcorr.diagnosis.rerun.simulator import Evidence, fitted_values, whole_patterns
 from tofcorr.estimation.linear import solvable
 from tofcorr.files import staged_folder
+from tofcorr.observables.compare import compare_observables
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
 from tofcorr.plausibility.examine import vet
@@ -75,7 +78,6 @@ def diagnose(
     with staged_folder(out) if out is not None else nullcontext() as folder:
         if not isinstance(recording, Recording):
             recording = Recording.open(Path(recording))
-        simulator = open_simulator(sim)
         options = (
             DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
         )
@@ -87,6 +89,7 @@ def diagnose(
             begin("fitting the base model")
             planes = resolved_planes("auto", [recording])
             inspection = vet(Dataset((recording,)), planes, force=force)
+            simulator = open_simulator(sim, recording)
             prepared = prepare(recording, options, simulator)
             if not force:
                 refuse_impossible_gap(prepared.study, inspection)
@@ -111,12 +114,12 @@ def conclude(
     """
     study, residual = prepared.study, prepared.as_given
     options, recording = study.options, study.observations.recording
-    given = None if simulator is None else simulator.options
-    rendered = simulator is not None and given is None
     begin("naming effects")
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = resampled(study.sums.num_units, options.bootstraps, generator)
     named = name_in_two(study, resamples)
+    given = None if simulator is None else simulator.options
+    found = Evidence(study=study, named=named, given=given)
 
     begin("measuring the gap")
     parts, explained = parts_of(study, named, residual), None
@@ -130,22 +133,19 @@ def conclude(
     remainder = judge_remainder(study, named, gap, stages[-1])
     detectable = minimum_detectable(study, named, options.seed + 2)
 
-    patterns = whole_patterns(study, named, given)
-    with_effects = None if rendered else simulator_of(study, named, given)
     closure = transfer = degraded = None
     if options.simulate_anew:
-        transfer = measure_transfer(study, named, given, generator, resamples)
-        degraded = degraded_stage(study, named, with_effects, gap.floor, resamples)
-        closure = check_in_simulator(study, named, given)
-    frames = None
-    if simulator is not None:
-        frames = simulator.options or simulator.rendered_frames(recording)
-    level = options.tests.level
-    observables = observables_of(recording, frames, seed=options.seed + 3, level=level)
-    if patterns and with_effects is not None:
-        with_effects = simulator_of(study, named, given, patterns)
-
-    beyond = [] if rendered else tables_of(study, named, given)[1]
+        transfer = measure_transfer(found, generator, resamples)
+        degraded = degraded_stage(found, gap.floor, resamples)
+        closure = check_in_simulator(found)
+    frames = None if simulator is None else simulator.frames
+    if given is not None:
+        frames = noisy_frames(recording, given, options.seed + 3)
+    observables = compare_observables(
+        recording, frames, seed=options.seed + 3, level=options.tests.level
+    )
+    found = replace(found, patterns=whole_patterns(found))
+    beyond = [] if found.rendered else found.tables[1]
     warnings = list(prepared.warnings)
     if beyond:
         warnings.append(
@@ -153,10 +153,9 @@ def conclude(
             f"{', '.join(term.options.kind for term, _ in beyond)}. The simulator has no table for "
             "them; the findings include them."
         )
-    given_effects = () if given is None else given.effects
     return DiagnosisResult(
         verdict=write_verdict(named, gap, remainder, shares),
-        causes=list_causes(study, named, shares),
+        causes=list_causes(found, shares),
         remarks=list_remarks(study, named, gap, remainder, detectable),
         simulator_kind="fitted" if simulator is None else simulator.kind,
         stages=stages,
@@ -179,10 +178,10 @@ def conclude(
         advice=tuple(next_recording(study, named)),
         closure=closure,
         transfer=transfer,
-        fitted=fitted_values(study, named, given_effects, resamples),
+        fitted=fitted_values(found, resamples),
         degraded=degraded,
         observables=observables,
-        simulator=with_effects,
+        simulator=None if found.rendered else found.simulator,
         options=options,
-        evidence=Evidence(study=study, named=named, patterns=patterns),
+        evidence=found,
     )

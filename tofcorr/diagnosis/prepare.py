@@ -6,15 +6,24 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.absorption import without_absorbed
 from tofcorr.diagnosis.findings.outliers import Outliers, mask_warning, outliers_of
-from tofcorr.diagnosis.given.simulator import GivenSimulator
+from tofcorr.diagnosis.given import GivenSimulator
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base_fit import SimulatorError, filtered_inputs, fit_base
-from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, with_numbered_walls
+from tofcorr.diagnosis.sums.base import (
+    BaseModel,
+    SimulatorError,
+    definite_base,
+    filtered_inputs,
+    fit_base,
+)
 from tofcorr.diagnosis.sums.gains import FittedMap
-from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, observe
-from tofcorr.diagnosis.sums.study import Study, build_study, without_map
+from tofcorr.diagnosis.sums.observations import (
+    Observations,
+    effect_inputs,
+    observe,
+    with_numbered_walls,
+)
+from tofcorr.diagnosis.sums.study import Study, build_study, without_absorbed, without_map
 from tofcorr.error_terms.pixel_terms import FixedPatternOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect

@@ -492,7 +492,7 @@ def threads_at_once() -> int:
 def in_threads(
     work: Callable[[Item], Result], items: Iterable[Item], threads: int | None = None
 ) -> Iterator[Result]:
-    """Yield `work` of every item, in order; each thread takes a whole item and computes it alone.
+    """Return `work` of every item, in order; each thread takes a whole item and computes it alone.
 
     Args:
         work: May be called by several threads at once; its result must not depend on the order.
@@ -500,9 +500,12 @@ def in_threads(
         threads: How many; None: as many as the caller uses.
     """
     threads = threads_at_once() if threads is None else threads
-    if threads < 2:
-        yield from map(work, items)
-        return
+    return map(work, items) if threads < 2 else _in_several_threads(work, items, threads)
+
+
+def _in_several_threads(
+    work: Callable[[Item], Result], items: Iterable[Item], threads: int
+) -> Iterator[Result]:
     gradients = torch.is_grad_enabled()
 
     def alone(item: Item) -> Result:

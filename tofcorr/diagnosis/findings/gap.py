@@ -140,10 +140,7 @@ class Gap:
 
 
 def measure_gap(
-    study: Study,
-    named: NamedEffects,
-    resamples: Tensor,
-    explained: Tensor | None = None,
+    study: Study, named: NamedEffects, resamples: Tensor, explained: Tensor | None = None
 ) -> Gap:
     """Measure the gap as given, after refitting, and after the named effects.
 
@@ -161,7 +158,7 @@ def measure_gap(
     noise = noise._replace(size=min(noise.size, left[1] ** 0.5))
     squares = np.array(left)[None] - noise.size**2
     squares = np.concatenate([squares, squared_gaps(study, named, noise, resamples)])
-    (before, *befores), (after, *afters) = np.sqrt(squares.clip(min=0)).T.tolist()
+    before, after = map(Estimated.of, np.sqrt(squares.clip(min=0)).T)
     closed = np.zeros(len(squares))
     if named.names:
         known = squares[:, 0] > 0
@@ -171,19 +168,18 @@ def measure_gap(
     if explained is not None:
         own, least, most = explained.numpy().T
         given = np.minimum(np.maximum(own + squares[:, 1].clip(min=0), least), most.clip(min=0))
-        whole, *draws = np.sqrt(given.clip(min=0)).tolist()
-        as_given = Estimated(whole, draws)
+        as_given = Estimated.of(np.sqrt(given.clip(min=0)))
     structure = coherence(study, study.system.residual_of(()))
     between = float(np.clip(structure.between, 0.0, before**2))
     fixed = float(np.clip(structure.fixed, 0.0, before**2 - between))
     count = study.fit.model.num_hand_eye if named.columns else 0
     change = named.study.sums.ols.solve(named.columns)[:count] - study.sums.ols.solve(())[:count]
     return Gap(
-        before=Estimated(before, befores),
-        after=Estimated(after, afters),
+        before=before,
+        after=after,
         floor=noise.size,
         floor_from_repeats=study.fit.noise.repeats > 0,
-        closed=Estimated(closed[0], closed[1:].tolist()),
+        closed=Estimated.of(closed),
         as_given=as_given,
         structure=structure,
         between_images=between**0.5,
@@ -231,9 +227,9 @@ def _squared_gap(study: Study, squares: Tensor, floor: float, resamples: Tensor)
         floor: Noise that is no gap, metres; each pixel has its own share of it.
         resamples: How often each resample holds each pose, shape (B, U).
     """
-    fit, count = study.fit, study.sums.count
-    own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
-    return studentised(squares - (floor / fit.floor) ** 2 * own, count, resamples)
+    own = study.observations.per_pose(study.fit.share * study.fit.sigma**2)
+    left = squares - (floor / study.fit.floor) ** 2 * own
+    return studentised(left, study.sums.count, resamples)
 
 
 def _rivals(named: NamedEffects) -> list[dict[str, Tensor]]:
@@ -326,6 +322,9 @@ class OpenSet:
             1 to 3 mm. What depends on anything recorded is no scatter.
         least_variance: Least variance that others are divided by, m^2: a micrometre squared.
             Chosen, below any noise.
+        half_size: Size of an unknown gap at which the score is a half, metres. Chosen.
+        least_structure: The right causes leave little structure inside images: at most a third of
+            what there was before, and this size, metres. Chosen.
 
     Attributes:
         unknown: Whether a gap remains that no effect explains.
@@ -349,6 +348,8 @@ class OpenSet:
     least_poses: ClassVar[int] = 8
     most_scatter: ClassVar[float] = 0.003
     least_variance: ClassVar[float] = 1e-12
+    half_size: ClassVar[float] = 0.0007
+    least_structure: ClassVar[float] = 0.0003
 
     unknown: bool
     score: float
@@ -365,13 +366,7 @@ class OpenSet:
 
 
 def judge_remainder(
-    study: Study,
-    named: NamedEffects,
-    gap: Gap,
-    where: Stage | None = None,
-    *,
-    half_size: float = 0.0007,
-    significant: float = 3.0,
+    study: Study, named: NamedEffects, gap: Gap, where: Stage | None = None
 ) -> OpenSet:
     """Test whether more remains than poses, noise and the target gap allow.
 
@@ -380,9 +375,6 @@ def judge_remainder(
         named: The effects named.
         gap: Before and after them.
         where: Bias of what they leave along all covariates; None: it is computed.
-        half_size: Size of an unknown gap at which the score is a half, metres. Chosen.
-        significant: Structure counts for the score from this many standard errors on. The usual
-            convention.
     """
     options, tiny = study.options, OpenSet.least_variance
     theta, system = named.study.sums.ols.solve(named.with_probes), named.study.system
@@ -395,12 +387,13 @@ def judge_remainder(
 
     def size(structure: Coherence) -> float:
         """Return the variance of significant structure beyond the repeatability of poses, m^2."""
-        clear = structure.within > significant * structure.within_error
+        clear = structure.within > 3 * structure.within_error  # The usual convention.
         inside = max(structure.within, 0.0) if clear else 0.0
         return inside + max(structure.between - allowed, 0.0)
 
     share = float(np.clip(size(after) / max(size(gap.structure), tiny), 0.0, 1.0))
-    score = share * size(after) / (size(after) + half_size**2)
+    half = OpenSet.half_size**2
+    score = share * size(after) / (size(after) + half)
     if named.probes:
         without, probed, before = (
             float(held_out_squares(own, names).sum() / study.sums.count.sum())
@@ -412,7 +405,7 @@ def judge_remainder(
         )
         whole = max(before - study.fit.floor**2, before - probed, tiny)
         closed = max(without - probed, 0.0)
-        score = max(score, min(closed / whole, 1.0) * closed / (closed + half_size**2))
+        score = max(score, min(closed / whole, 1.0) * closed / (closed + half))
     enough = named.tested and study.sums.num_units >= OpenSet.least_poses
     return OpenSet(
         unknown=enough and p_value <= options.tests.level,
@@ -439,13 +432,7 @@ def allowed_scatter(study: Study, after: Coherence) -> float:
 
 
 def unknown_p_values(
-    study: Study,
-    named: NamedEffects,
-    gap: Gap,
-    after: Coherence,
-    where: Stage | None = None,
-    *,
-    least_structure: float = 0.0003,
+    study: Study, named: NamedEffects, gap: Gap, after: Coherence, where: Stage | None = None
 ) -> dict[str, float]:
     """Return the p-value of each test, by name.
 
@@ -463,8 +450,6 @@ def unknown_p_values(
         gap: Before and after them.
         after: Structure of what they leave.
         where: Bias of that along all covariates; None: it is computed.
-        least_structure: The right causes leave little structure inside images: at most a third of
-            what there was before, and this size, metres. Chosen.
     """
     options, tiny, poses = study.options, OpenSet.least_variance, study.sums.num_units
     # A part of the gap matters from half of the target on: enough where effects are named.
@@ -480,7 +465,7 @@ def unknown_p_values(
 
     def within(size: float) -> float:
         """Return the square of the structure within images that matters, m^2."""
-        right = max(gap.structure.within / 3, least_structure**2)
+        right = max(gap.structure.within / 3, OpenSet.least_structure**2)
         return min(size**2, right) if named.names else size**2
 
     left, before = beyond_poses(gap.after, after), beyond_poses(gap.before, gap.structure)
@@ -552,22 +537,19 @@ def _fingerprint(
         form = "patches" if after.form == "squares" else after.form
         clauses.append(f"is similar within {form} of an image")
     lag = _lag_of_offsets(named.study, left)
-    return (
-        clauses
-        if lag is None
-        else [*clauses, f"correlates by {lag:+.2f} between successive images"]
-    )
+    if lag is not None:
+        clauses.append(f"correlates by {lag:+.2f} between successive images")
+    return clauses
 
 
-def _lag_of_offsets(
-    study: Study, left: Tensor, *, least_frames: int = 12, level: float = 0.01
-) -> float | None:
+def _lag_of_offsets(study: Study, left: Tensor, *, level: float = 0.01) -> float | None:
     """Return the correlation of successive images' offsets, or None if it is not significant.
+
+    With fewer than twelve frames it is not reported.
 
     Args:
         study: The recording.
         left: A residual, shape (M,), metres.
-        least_frames: Frames that it is reported from. Chosen.
         level: Of significance. Chosen.
     """
     weight, frame, frames = study.weight, study.observations.frame, study.observations.num_frames
@@ -575,7 +557,7 @@ def _lag_of_offsets(
     offsets = torch.bincount(frame, weight * left, frames) / count
     centred = offsets - offsets.mean()
     square = float(centred.square().sum())
-    if frames < least_frames or square == 0:
+    if frames < 12 or square == 0:
         return None
     lag = float(centred[1:] @ centred[:-1]) / square
     return lag if 2 * special.ndtr(-abs(lag) * frames**0.5) < level else None

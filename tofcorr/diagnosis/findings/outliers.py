@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from tofcorr.diagnosis.findings.where import TILES
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
@@ -86,15 +87,10 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f} %" if round(100 * share, 1) else "fewer than 0.1 %"
 
 
-def outliers_of(study: Study, *, tiles: tuple[int, int] = (6, 8)) -> Outliers:
-    """Count the pixels that the base fit leaves out or weighs down, and find where they lie.
-
-    Args:
-        study: The recording.
-        tiles: Rows and columns of the map of outliers. Chosen: as in the map of the bias.
-    """
+def outliers_of(study: Study) -> Outliers:
+    """Count the pixels that the base fit leaves out or weighs down, and find where they lie."""
     odd, deleted = study.fit.trust < 1, study.fit.trust == 0
-    errors, (rows, columns) = study.fit.residual[deleted], tiles
+    errors, (rows, columns) = study.fit.residual[deleted], TILES
     tile = _tiles(study.observations, rows, columns)
     held, all_held = (torch.bincount(tile, x, rows * columns) for x in (odd.double(), None))
     frequency = study.observations.recording.modulation_frequency
@@ -103,27 +99,23 @@ def outliers_of(study: Study, *, tiles: tuple[int, int] = (6, 8)) -> Outliers:
         reduced=float((odd & ~deleted).double().mean()),
         size=float(errors.square().mean().sqrt()) if len(errors) else 0.0,
         noise=study.fit.floor,
-        tiles=(held / all_held).reshape(tiles).numpy(),
+        tiles=(held / all_held).reshape(TILES).numpy(),
         place=place_of(study, odd),
         wrapped_by=range_of_wrapped(errors.numpy(), frequency) if len(errors) else None,
     )
 
 
-def place_of(study: Study, chosen: Tensor, *, most_of_them: float = 0.5) -> str:
-    """Return a clause that says where the chosen pixels (M,) lie.
+def place_of(study: Study, chosen: Tensor) -> str:
+    """Return a clause that says where the chosen pixels (M,), bool, lie.
 
-    Args:
-        study: The recording.
-        chosen: Which pixels, shape (M,), bool.
-        most_of_them: Crowded groups are reported if together they hold this share of the outliers.
-            Chosen.
+    Crowded groups are reported if together they hold half of them.
     """
     if not bool(chosen.any()):
         return "nowhere"
     found = []
     for words, there in _places(study, chosen):
         held = float(there[chosen].double().mean())
-        if held >= most_of_them:
+        if held >= 0.5:
             found.append((held - float(there.double().mean()), held, words))
     if not found:
         return "all over the images"
@@ -152,12 +144,10 @@ def _places(
         found["at edges between dark and bright"] = at_edges
     members = chosen & _crowded(_tiles(observations, groups, groups), chosen)
     if bool(members.any()):
-        ends = [(int(x[members].min()), int(x[members].max())) for x in (row, column)]
-        words = "in rows {} to {} and columns {} to {}".format(*ends[0], *ends[1])
-        inside = [
-            (x >= low) & (x <= high) for x, (low, high) in zip((row, column), ends, strict=True)
-        ]
-        found[words] = inside[0] & inside[1]
+        places = torch.stack([row, column], dim=1)[members]
+        (top, left), (bottom, right) = places.amin(0).tolist(), places.amax(0).tolist()
+        words = f"in rows {top} to {bottom} and columns {left} to {right}"
+        found[words] = (row >= top) & (row <= bottom) & (column >= left) & (column <= right)
     for words, there in found.items():
         if bool(_crowded(there.long(), chosen)[there].any()):
             yield words, there
@@ -200,17 +190,18 @@ def _at_edges(observations: Observations, images: Tensor, ratio: float) -> Tenso
     return torch.cat(found)
 
 
-def _crowded(group: Tensor, chosen: Tensor, *, times: float = 3.0, by_chance: int = 10) -> Tensor:
+def _crowded(group: Tensor, chosen: Tensor) -> Tensor:
     """Return which pixels lie in groups with many chosen ones, shape (M,).
+
+    Three times as many as among all pixels, and ten more: above ten, chance does not triple a
+    count.
 
     Args:
         group: Of each pixel, shape (M,), int64.
         chosen: Which pixels, shape (M,), bool.
-        times: By how much the share of chosen ones exceeds that among all pixels. Chosen.
-        by_chance: And by so many pixels: above ten, chance alone does not triple a count.
     """
     expected = torch.bincount(group) * chosen.double().mean()
-    return (torch.bincount(group, chosen.double()) > times * expected + by_chance)[group]
+    return (torch.bincount(group, chosen.double()) > 3 * expected + 10)[group]
 
 
 def mask_warning(observations: Observations, *, least_share: float = 0.02) -> str:

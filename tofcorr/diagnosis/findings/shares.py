@@ -40,14 +40,13 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.absorption import fitted_coefficients
 from tofcorr.diagnosis.findings.gap import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.where import Estimated, interval_of
 from tofcorr.diagnosis.sums.linear_system import BASE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import predicted_distance
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.study import Study, fitted_coefficients
 from tofcorr.error_terms.base import Term
 from tofcorr.estimation.robust import student_quantile
 from tofcorr.geometry import se3

@@ -8,7 +8,7 @@ recalibrated, and with the effects named.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -57,28 +57,34 @@ class Estimated(float):
         made.draws, made.interval = draws, interval or interval_of(draws or [value], float(value))
         return made
 
+    @classmethod
+    def of(cls, values: Tensor | np.ndarray) -> "Estimated":
+        """Return the first of some values, and all others, (1 + B,), as its draws."""
+        first, *draws = values.tolist()
+        return cls(first, draws)
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True)
 class Region:
     """A bin of a covariate.
 
     Attributes:
         covariate: Its name.
         low, high: Its ends, in the unit of the covariate.
+        trend: Whether this is the change along the whole covariate, fitted by a line, not one bin.
         bias: Mean residual, metres; its interval is simultaneous over all regions.
         p_value: Adjusted for the number of regions.
-        trend: Whether this is the change along the whole covariate, fitted by a line, not one bin.
     """
 
     covariate: str
     low: float
     high: float
-    bias: Estimated
-    p_value: float
     trend: bool = False
+    bias: Estimated = field(default_factory=Estimated)
+    p_value: float = 1.0
 
 
-_TILES = (6, 8)
+TILES = (6, 8)
 """Rows and columns of tiles in the image. Chosen: few enough that each holds many poses."""
 
 
@@ -99,8 +105,8 @@ class Stage:
     name: StageName
     gap: Estimated | None = None
     regions: tuple[Region, ...] = ()
-    tiles: np.ndarray = field(default_factory=lambda: np.full(_TILES, np.nan))
-    tile_p_values: np.ndarray = field(default_factory=lambda: np.ones(_TILES))
+    tiles: np.ndarray = field(default_factory=lambda: np.full(TILES, np.nan))
+    tile_p_values: np.ndarray = field(default_factory=lambda: np.ones(TILES))
     offsets: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def by_covariate(self) -> dict[str, list[Region]]:
@@ -244,18 +250,18 @@ def find_where(
         residual = left_out_residual(study, chosen, study.sums.ols)
     flips = flipped(study, residual, fitted)
     weight, unit, units = study.weight, study.unit_of_pixel, study.sums.num_units
-    places, regions = list[tuple[Tensor, int, Tensor]](), list[tuple[str, float, float, bool]]()
+    places, regions = list[tuple[Tensor, int, Tensor]](), list[Region]()
     one_bin, ones = torch.zeros_like(unit), torch.ones_like(weight)
     for covariate, edges, place, scaled in binned or binned_covariates(study):
         # Around the weighted mean, the coefficient of a line is its end minus its start.
         line = scaled - (weight @ scaled) / weight.sum()
         places += [(place, len(edges) - 1, ones), (one_bin, 1, line)]
-        regions += [(covariate, low, high, False) for low, high in pairwise(edges)]
-        regions.append((covariate, edges[0], edges[-1], True))
+        regions += [Region(covariate, low, high) for low, high in pairwise(edges)]
+        regions.append(Region(covariate, edges[0], edges[-1], trend=True))
     tile = one_bin
-    for count, position in zip(_TILES, (study.inputs.rows, study.inputs.columns), strict=True):
+    for count, position in zip(TILES, (study.inputs.rows, study.inputs.columns), strict=True):
         tile = tile * count + ((position + 1) / 2 * count).long().clamp(max=count - 1)
-    places += [(tile, _TILES[0] * _TILES[1], ones), (one_bin, 1, ones)]
+    places += [(tile, TILES[0] * TILES[1], ones), (one_bin, 1, ones)]
 
     def per_pose(values: Tensor, place: Tensor, bins: int) -> Tensor:
         flat = torch.zeros(bins * units, dtype=torch.float64)
@@ -276,7 +282,7 @@ def _assembled(
     sums: Tensor,
     total: Tensor,
     counts: Tensor,
-    regions: Sequence[tuple[str, float, float, bool]],
+    regions: Sequence[Region],
     offsets: Tensor,
     least_left: float = 0.1,
     rounding: float = 1e-9,
@@ -288,7 +294,7 @@ def _assembled(
         sums: Weighted residuals of every bin and pose, shape (R, U).
         total: Observed, then of every flip, shape (R, 1 + B).
         counts: Sums of the weights, shape (R, U).
-        regions: Covariate, ends and whether it is a trend, of all bins but the image's.
+        regions: All bins but the image's, without their bias.
         offsets: Mean residual of each pose, shape (U,), metres.
         least_left: Least standard deviation of a sum that the model was fitted to, over that of
             residuals that it was not. Chosen: what the model absorbs so far shows no bias, and how
@@ -306,22 +312,15 @@ def _assembled(
     bias, half = total[:, 0] / weight, critical * spread / weight
     found = []
     for place in observed[: len(regions)].argsort(descending=True, stable=True).tolist():
-        covariate, low, high, trend = regions[place]
         size, reach = float(bias[place]), float(half[place])
-        shown = Region(
-            covariate=covariate,
-            low=low,
-            high=high,
-            bias=Estimated(size, interval=(size - reach, size + reach)),
-            p_value=float(p_values[place]),
-            trend=trend,
-        )
-        found += [shown] if bool(enough[place]) else []
+        size = Estimated(size, interval=(size - reach, size + reach))
+        if bool(enough[place]):
+            found.append(replace(regions[place], bias=size, p_value=float(p_values[place])))
     tiles = slice(len(regions), None)
     return Stage(
         name=name,
         regions=tuple(found),
-        tiles=torch.where(enough, bias, torch.nan)[tiles].reshape(_TILES).numpy(),
-        tile_p_values=p_values[tiles].reshape(_TILES).numpy(),
+        tiles=torch.where(enough, bias, torch.nan)[tiles].reshape(TILES).numpy(),
+        tile_p_values=p_values[tiles].reshape(TILES).numpy(),
         offsets=offsets.numpy(),
     )

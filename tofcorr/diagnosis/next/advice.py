@@ -2,13 +2,12 @@
 
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import NormalDist
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.absorption import absorbed_share, left_over, signal
 from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, pose_columns, pose_sums
@@ -19,7 +18,7 @@ from tofcorr.diagnosis.sums.observations import (
     effect_inputs,
     predicted_distance,
 )
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.study import Study, absorbed_share, left_over, signal
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.inputs import is_clock
@@ -29,37 +28,24 @@ Change = tuple[str, str, Tensor]
 """A description, what of the frames' facts it changes, and that of each changed frame."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Candidates:
-    """Frames that could be recorded.
-
-    Attributes:
-        words: How each differs from its source, C of them.
-        source: The recorded frame that each is made from.
-        sums: Over their pixels, each candidate one unit, poses as uncertain as the recorded.
-    """
-
-    words: list[str]
-    source: list[int]
-    sums: PoseSums
+Candidates = tuple[list[str], list[int], PoseSums]
+"""Frames that could be recorded: how each differs from the recorded frame that it is made from;
+that frame; and sums over their pixels, each candidate one unit, poses as uncertain as recorded."""
 
 
-def make_candidates(
-    study: Study, names: Collection[str], *, most_sources: int = 12
-) -> Candidates | None:
-    """Vary pose and conditions of some recorded frames, one at a time.
+def make_candidates(study: Study, names: Collection[str]) -> Candidates | None:
+    """Vary pose and conditions of a dozen recorded frames, one at a time.
 
     Args:
         study: The recording.
         names: Effects whose columns are needed; the sums hold no others.
-        most_sources: Recorded frames that candidates are made from, at most. Chosen for speed.
 
     Returns:
         None for a recording that states nothing which could be varied: neither poses of a moving
         tool, nor a clock, nor other conditions.
     """
     frames, facts = study.observations.num_frames, study.observations.facts
-    sources = torch.linspace(0, frames - 1, min(most_sources, frames)).round().long().unique()
+    sources = torch.linspace(0, frames - 1, min(12, frames)).round().long().unique()
     known = {name: own[sources] for name, own in vars(facts).items() if own is not None}
     changes = [*_other_conditions(study, known), *_other_poses(study, sources)]
     if not changes:
@@ -71,7 +57,7 @@ def make_candidates(
     source = sources.repeat(len(changes))
     shown = _observations(study, replace(facts, **joined), source)
     words = [words for words, _, _ in changes for _ in sources]
-    return Candidates(words=words, source=source.tolist(), sums=_sums(study, shown, names))
+    return words, source.tolist(), _sums(study, shown, names)
 
 
 def _other_conditions(study: Study, known: dict[str, Tensor]) -> list[Change]:
@@ -130,20 +116,17 @@ def _other_poses(study: Study, sources: Tensor, *, tilt: float = 0.35) -> list[C
 _NEAREST = 0.1
 
 
-def _observations(
-    study: Study, facts: FrameFacts, source: Tensor, *, per_frame: int = 150
-) -> Observations:
-    """Return the pixels of the candidates, with amplitudes scaled from their sources.
+def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observations:
+    """Return about 150 pixels of each candidate, with amplitudes scaled from their sources.
 
     Args:
         study: The recording.
         facts: Of the candidates.
         source: The recorded frame that each is made from.
-        per_frame: Pixels of each that are used, about. Chosen for speed.
     """
     old = study.observations
     ends = [old.frame_ends[frame] for frame in source.tolist()]
-    places = [torch.arange(low, end, max(1, (end - low) // per_frame)) for low, end in ends]
+    places = [torch.arange(low, end, max(1, (end - low) // 150)) for low, end in ends]
     place = torch.cat(places)
     made = replace(
         old.at(place),
@@ -186,8 +169,7 @@ def _sums(
     rest = base.new_zeros(len(base), layout.base - base.shape[1])
     columns = {BASE: torch.cat([base, rest], dim=1)}
     for name in names:
-        effect = study.candidates.effects[name]
-        columns[name] = effect.columns(inputs) * effect.prior_sd()
+        columns[name] = study.candidates.effects[name].scaled_columns(inputs)
     for part in columns.values():
         seen &= part.isfinite().all(dim=1)
     sigma = study.fit.noise.at(brightness_of(made), torch.zeros_like(made.frame))
@@ -207,21 +189,18 @@ def _sums(
     return replace(sums, pose_sd=study.sums.pose_sd, dispersion=study.sums.dispersion)
 
 
-def minimum_detectable(
-    study: Study, named: NamedEffects, seed: int, *, directions: int = 64
-) -> dict[str, float | None]:
+def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str, float | None]:
     """Return the size of each effect that would be found with 80 % probability, metres.
 
     The size is the root mean square of the effect's signal over all pixels, before base model and
     hand-eye transform absorb their share. Of random directions in the space of an effect's
-    coefficients it is the median. None: the effect is not identifiable, because they absorb all of
-    it.
+    coefficients, 64 of them, it is the median. None: the effect is not identifiable, because they
+    absorb all of it.
 
     Args:
         study: The recording.
         named: The effects named.
         seed: Of the random directions.
-        directions: Their number.
     """
     generator = torch.Generator().manual_seed(seed)
     critical = named.first.critical_score(0.05)
@@ -236,7 +215,7 @@ def minimum_detectable(
         if absorbed_share(study, name) > 0.999:  # The rest is rounding error.
             continue
         size = len(range(*study.sums.layout.effects[name]))
-        drawn = torch.randn(directions, size, generator=generator, dtype=torch.float64)
+        drawn = torch.randn(64, size, generator=generator, dtype=torch.float64)
         found[name] = _of_columns(study, test, critical, drawn)
     return found
 
@@ -304,32 +283,24 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
     ]
 
 
-def _questions(
-    study: Study, named: NamedEffects, *, most: int = 3, absorbed: float = 0.97
-) -> list[Question]:
+def _questions(study: Study, named: NamedEffects, *, absorbed: float = 0.97) -> list[Question]:
     """Return the cause sets to be separated, then the effects that calibration absorbs.
+
+    Three at most: what a person records in one go.
 
     Args:
         study: The recording.
         named: The effects named.
-        most: Questions, at most. Chosen: what a person records in one go.
         absorbed: From this share on, that calibration absorbs, another recording is needed. Chosen.
     """
     effects = study.candidates.effects
     sets = [(own[0], own[1:]) for own in named.cause_sets if len(own) > 1]
     hidden = [name for name in effects if absorbed_share(study, name) > absorbed]
     asked = [one for one in sets if effects.keys() >= {one[0], *one[1]}]
-    return [*asked, *((name, ()) for name in hidden if name not in named.names)][:most]
+    return [*asked, *((name, ()) for name in hidden if name not in named.names)][:3]
 
 
-def _advised(
-    study: Study,
-    named: NamedEffects,
-    candidates: Candidates,
-    question: Question,
-    *,
-    number: int = 8,
-) -> str:
+def _advised(study: Study, named: NamedEffects, candidates: Candidates, question: Question) -> str:
     """Choose the most informative frames for one question, one after another; describe them.
 
     Args:
@@ -337,14 +308,14 @@ def _advised(
         named: The effects named.
         candidates: What could be recorded.
         question: What the frames should tell.
-        number: Frames that are advised. Chosen: what a person records in one go.
     """
-    effect, others = question
+    (described, sources, sums), (effect, others) = candidates, question
+    number = 8  # Chosen: what a person records in one go.
     names, layout, ols = [*others, effect], study.sums.layout, study.sums.ols
     prior = layout.prior_of(layout.of(others))
     known, own = torch.arange(len(layout.of(names))).tensor_split([len(prior)])
     total, frames, _ = study.sums.gls.of(names)
-    total, frames = total.sum(0), candidates.sums.gls.of(names)[0]
+    total, frames = total.sum(0), sums.gls.of(names)[0]
 
     def information(gram: Tensor) -> Tensor:
         """Return the information on the effect, per coefficient, given calibration and others."""
@@ -358,10 +329,10 @@ def _advised(
         total = total + frames[picked[-1]]
     after = float(information(total))
     listed = []
-    for words, count in Counter(candidates.words[k] for k in picked).most_common():
-        sources = {candidates.source[k] for k in picked if candidates.words[k] == words}
-        numbers = ", ".join(map(str, sorted(sources)))
-        listed.append(f"{count} {words} (like frame{'s' * (len(sources) > 1)} {numbers})")
+    for words, count in Counter(described[k] for k in picked).most_common():
+        alike = sorted({sources[k] for k in picked if described[k] == words})
+        numbers = ", ".join(map(str, alike))
+        listed.append(f"{count} {words} (like frame{'s' * (len(alike) > 1)} {numbers})")
     advice = f", record {number} more frames: {'; '.join(listed)}. It could then be detected"
     columns = len(total) - len(known)
     raw = signal(study, effect) / (columns * ols.scale * float(study.sums.count.sum()))

@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from tofcorr.diagnosis.findings.absorption import absorption_table
 from tofcorr.diagnosis.findings.where import Estimated, Interval, Stage
 from tofcorr.diagnosis.report.words import (
     SHARE_ENDS,
@@ -27,6 +26,7 @@ from tofcorr.diagnosis.report.words import (
     share_words,
     stages_shown,
 )
+from tofcorr.diagnosis.sums.study import absorption_table
 from tofcorr.estimation.robust import student_quantile
 from tofcorr.observables.figures import BLUE, FAINT, GREY, RED, line_across, panels
 from tofcorr.observables.figures import drawings as observable_drawings

@@ -1,45 +1,56 @@
-"""The result of a diagnosis, and its content as plain values: `diagnosis.json`."""
+"""The result of a diagnosis, and what it writes: `diagnosis.json`, the page, `sensor.yaml`."""
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
+import numpy as np
+import torch
 
-from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.findings.effect_comparison import EffectTest, closed_gap
 from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.outliers import Outliers
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Estimated, Stage
-from tofcorr.diagnosis.given.simulator import SimulatorKind
+from tofcorr.diagnosis.given import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.rerun.checks import Closure, Transfer
-from tofcorr.diagnosis.rerun.sensor import DegradedStage, FittedValue
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.report.words import (
+    SMALL,
+    STAGE_WORDS,
+    along,
+    biases_of,
+    cause_words,
+    effect_words,
+    least_p,
+    mm,
+    p_words,
+    percent,
+    pose_errors,
+    share_words,
+    sized,
+    stages_shown,
+)
+from tofcorr.diagnosis.rerun.checks import Closure, DegradedStage, Transfer
+from tofcorr.diagnosis.rerun.simulator import Evidence, FittedValue, sensor_of
+from tofcorr.diagnosis.sums.study import Study, absorbed_share
+from tofcorr.digits import decimals, known, known_interval
 from tofcorr.observables.compare import Observables
+from tofcorr.observables.pairs import LEAST_P
+from tofcorr.options import dump_yaml
+from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
+from tofcorr.simulation.effects.registry import CATALOGUE
 from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.training.monitor import event_writer
+from tofcorr.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evidence:
-    """What the findings were computed from.
-
-    Attributes:
-        study: The recording, before any effect was named.
-        named: The effects named, with all comparisons.
-        patterns: Values of maps in all pixels, shape (cells,), metres, by name, where the study has
-            only some of them.
-    """
-
-    study: Study
-    named: NamedEffects
-    patterns: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
@@ -245,8 +256,8 @@ def content_of(result: DiagnosisResult) -> dict[str, Any]:
         "transfer_mm": transfer
         and {
             **{name: _mm(getattr(transfer, name)) for name in trainings},
-            "ci": dict(zip(trainings, map(_mm, transfer.intervals), strict=True)),
-            "gain_ci": _mm(transfer.gain_interval),
+            "ci": {name: _mm(getattr(transfer, name).interval) for name in trainings},
+            "gain_ci": _mm(transfer.gain.interval),
         },
         "fitted": [
             {name: getattr(one, name) for name in ("cause", "kind", "name", "unit")}
@@ -328,3 +339,131 @@ def _rounded(shares: tuple[float, float] | list[float]) -> list[float | None]:
 
 def _finite(number: float) -> float | None:
     return float(f"{number:.6g}") if math.isfinite(number) else None
+
+
+def write_report(result: DiagnosisResult, folder: Path) -> None:
+    """Write `diagnosis.json`, `sensor.yaml`, and `report.html` and `tb/` if wanted.
+
+    Where the built-in simulator was used, `simulator_with_effects.yaml` is written too.
+
+    Args:
+        result: What was found.
+        folder: Where to write; it exists.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    findings = json.dumps(result.to_mapping(), indent=1, ensure_ascii=False, allow_nan=False)
+    sensor = sensor_of(result.evidence, result.observables)
+    texts = {"diagnosis.json": findings + "\n", FILE_NAME: sensor_text(sensor)}
+    if result.simulator is not None:
+        texts["simulator_with_effects.yaml"] = dump_yaml(result.simulator.to_mapping())
+    if result.options.page:
+        texts["report.html"] = render(result)
+        write_events(result, folder / "tb")
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def render(result: DiagnosisResult) -> str:
+    """Return the page: one HTML file that needs nothing else."""
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    from tofcorr.diagnosis.report.figures import svg_of
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    study, named = result.evidence.study, result.evidence.named
+    environment.filters |= {
+        "mm": _mm_shown,
+        "metres": mm,
+        "known": known,
+        "known_interval": known_interval,
+        "sized": sized,
+        "percent": lambda share: "–" if share is None else percent(share),
+        "share": share_words,
+        "small": lambda share: abs(share) < SMALL,
+        "negative": lambda share: share < 0 and percent(share) != "0 %",
+        "p": lambda p: "–" if p is None else p_words(p, least_p(result)).removeprefix("= "),
+        "effect": partial(effect_words, study),
+        "cause": partial(cause_words, study),
+        "along": along,
+        "p_of_draws": lambda p: p_words(p, LEAST_P),
+        "with_digits": _with_digits,
+    }
+    folder, tests = files("tofcorr.diagnosis.report"), named.first.tests
+    template, style = (
+        folder.joinpath(f"report.{n}").read_text("utf-8") for n in ("html.j2", "css")
+    )
+    return environment.from_string(template).render(
+        style=Markup(style),
+        **result.to_mapping(),
+        result=result,
+        study=study,
+        options=result.options,
+        gap=result.gap,
+        recording=study.observations.recording,
+        shown=stages_shown(result),
+        pose_errors=pose_errors(result),
+        closed={n: closed_gap(study, named.first, test)[1] for n, test in tests.items()},
+        catalogue=CATALOGUE,
+        pictures={name: Markup(svg_of(own)) for name, own in result.all_figures().items()},
+        stage_words=STAGE_WORDS,
+        versions=f"tofcorr {__version__}, torch {torch.__version__}, NumPy {np.__version__}",
+        hand_eye_free=study.fit.model.hand_eye_free,
+        saturated_missing=result.observables.real_dropouts.saturated_missing,
+    )
+
+
+def _mm_shown(value: float | None) -> str:
+    if value is None:
+        return "–"
+    text = f"{value:.1f}" if round(abs(value), 1) >= 1 else f"{value:.2f}"
+    return text.removeprefix("-") if float(text) == 0 else text
+
+
+def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a fitted value and its interval with the digits that are known."""
+    value, ends = entry["value"], entry["ci"]
+    if value is None:
+        return "–", ""
+    interval = (value, value) if ends is None or None in ends else (ends[0], ends[1])
+    largest = max(abs(value), *map(abs, interval))
+    # Up to five digits before or after the point are read at a glance.
+    if largest == 0 or 1e-3 <= largest < 1e5:
+        numbers = [known(number, interval, 6) for number in (value, *interval)]
+    else:  # Pixel terms are as small as 1e-12 m / pixel^4.
+        digits = max(math.floor(math.log10(largest)) + decimals(interval, 16), 1)
+        numbers = [f"{number:.{min(digits, 3)}e}" for number in (value, *interval)]
+    return numbers[0], "" if interval[0] == interval[1] else " to ".join(numbers[1:])
+
+
+def write_events(result: DiagnosisResult, folder: Path | str) -> None:
+    """Write verdict, gap, effects, and the residual along covariates and poses for TensorBoard.
+
+    A curve has one step for each bin of its covariate, or for each pose; the page has pictures.
+
+    Args:
+        result: What was found.
+        folder: Usually REPORT/tb; made if it is missing.
+    """
+    gap, known_stages = result.gap, [one for one in result.stages if one.gap is not None]
+    numbers = {f"stage_mm/{stage.name}": 1e3 * (stage.gap or 0.0) for stage in known_stages}
+    numbers |= {f"gap_mm/{part}": 1e3 * getattr(gap, part) for part in ("before", "after", "floor")}
+    numbers |= {f"score/{entry.name}": entry.score for entry in result.ranking}
+    numbers |= {f"share/{cause.cause}": cause.share for cause in result.shares}
+    curves: dict[str, list[float]] = {}
+    for stage in stages_shown(result):
+        curves[f"pose_mm/{stage.name}"] = stage.offsets.tolist()
+        for covariate, regions in stage.by_covariate().items():
+            curves[f"bias_mm_{stage.name}/{covariate}"] = list(map(float, biases_of(regions)))
+    with event_writer(folder) as writer:
+        writer.add_text("verdict", result.verdict)
+        for tag, number in numbers.items():
+            writer.add_scalar(tag, number)
+        for tag, values in curves.items():
+            for step, value in enumerate(values):
+                if math.isfinite(value):
+                    writer.add_scalar(tag, 1e3 * value, step)

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
 from tofcorr.diagnosis.findings.where import Estimated, Interval, Region, Stage
-from tofcorr.diagnosis.rerun.simulator import solution_of
+from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.observations import TINY
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.study import Study, absorbed_share
 from tofcorr.digits import known, known_interval
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
@@ -234,25 +233,25 @@ def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     return f"{start}, and {nothing}{': calibrate it' if gap.as_given else ''}."
 
 
-def list_causes(study: Study, named: NamedEffects, causes: Sequence[Share]) -> tuple[str, ...]:
+def list_causes(found: Evidence, causes: Sequence[Share]) -> tuple[str, ...]:
     """Return a line for each cause, the largest share first."""
     # A parameter that was left as the simulator has it causes nothing.
     shown = (one for one in causes if one.kind == "effect" or one.share or any(one.share.interval))
     ordered = sorted(shown, key=lambda one: -one.share)
-    return tuple(_cause_line(study, named, one) for one in ordered if one.kind != "unexplained")
+    return tuple(_cause_line(found, one) for one in ordered if one.kind != "unexplained")
 
 
-def _cause_line(study: Study, named: NamedEffects, one: Share) -> str:
+def _cause_line(found: Evidence, one: Share) -> str:
     share = f"{share_words(one.share)} {interval_words(one.share.interval)}"
-    line = f"{cause_words(study, one)}: {share} of the squared gap"
+    line = f"{cause_words(found.study, one)}: {share} of the squared gap"
     if one.of_constant is not None and one.of_constant > SMALL:
         line += f" ({percent(one.of_constant)} by a constant offset, which any cause may have)"
     if one.kind == "effect":
-        return f"{line}; {effect_line(named, one.cause)}."
-    if one.cause != HAND_EYE or study.fit.known is None:
+        return f"{line}; {effect_line(found.named, one.cause)}."
+    known = found.study.fit.known
+    if one.cause != HAND_EYE or known is None:
         return f"{line}; a parameter of the simulator's error model."
-    given = study.fit.known.tool_from_camera
-    moved = se3.log(se3.inverse(given) @ solution_of(study, named)[0])
+    moved = se3.log(se3.inverse(known.tool_from_camera) @ found.tool_from_camera)
     return (
         f"{line}; the camera sits {mm(float(moved[:3].norm()))} mm and "
         f"{math.degrees(float(moved[3:].norm())):.2f} degrees from where the simulator has it."

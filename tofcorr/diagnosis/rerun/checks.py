@@ -1,46 +1,34 @@
 """The findings put to the test: simulator run again, corrections trained on it, poses held out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.where import Interval, interval_of
-from tofcorr.diagnosis.rerun.simulator import (
-    fitted_distance,
-    observed_by,
-    simulated_frames,
-    solution_of,
+from tofcorr.diagnosis.findings.where import Estimated
+from tofcorr.diagnosis.rerun.simulator import Evidence, sensor_of, simulated_frames
+from tofcorr.diagnosis.sums.observations import (
+    TINY,
+    Observations,
+    distance_images,
+    predicted_distance,
 )
-from tofcorr.diagnosis.sums.observations import TINY, Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.error_terms.model import Pixels
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
-from tofcorr.observables.compare import Observables, compare_observables
 from tofcorr.pixels.dataset import Dataset, HandEyeOptions, covered_domain
+from tofcorr.sensor.degrade import conditions_of_frames
+from tofcorr.sensor.model import SensorModel, SensorWarning
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.saturation import light_of
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import twin_frames
-
-
-def fitted_to(study: Study, units: Tensor, names: Sequence[str]) -> Study:
-    """Return the study with ordinary sums, and maps, of some poses alone.
-
-    Args:
-        study: The recording.
-        units: Which poses, shape (U,), bool.
-        names: Effects with columns that the model has; the sums of all others are left out.
-    """
-    used = units.double()
-    sums = study.sums.of(names)
-    sums = replace(sums, plain=sums.plain * used[:, None, None])
-    fit = replace(study.fit, trust=study.fit.trust * used[study.unit_of_pixel])
-    return replace(study, system=replace(study.system, sums=sums), fit=fit)
 
 
 def excess_gaps(
@@ -64,31 +52,12 @@ def excess_gaps(
     """
     share = share * left.isfinite()
     squares = share * (left.nan_to_num(0.0, 0.0, 0.0) ** 2 - noise**2)
-    poses = observations.unit[observations.frame]
-    sums = torch.zeros(observations.num_units, 2, dtype=torch.float64)
-    sums.index_add_(0, poses, torch.stack([squares, share], dim=1))
+    sums = torch.stack([observations.per_pose(values) for values in (squares, share)], dim=1)
     drawn = torch.ones(1, len(sums), dtype=torch.float64)
     if resamples is not None:
         drawn = torch.cat([drawn, resamples])
     square, weight = (drawn @ sums).unbind(dim=1)
     return (square / weight.clamp(min=TINY)).clamp(min=0.0).sqrt()
-
-
-def observables_of(
-    recording: Recording, sim: Recording | SimulatorOptions | None, *, seed: int, level: float
-) -> Observables:
-    """Compare noise, missing pixels and amplitude of a recording with those of a simulator.
-
-    Args:
-        recording: The real recording.
-        sim: Frames that any simulator rendered; or options of the built-in one, which is then run
-            with noise at the recording's poses; None: the recording alone is measured.
-        seed: Of noise, resamples and permutations.
-        level: Significance level of what is reported.
-    """
-    if isinstance(sim, SimulatorOptions):
-        sim = noisy_frames(recording, sim, seed)
-    return compare_observables(recording, sim, seed=seed, level=level)
 
 
 def noisy_frames(recording: Recording, simulator: SimulatorOptions, seed: int) -> Recording:
@@ -115,20 +84,25 @@ def noisy_frames(recording: Recording, simulator: SimulatorOptions, seed: int) -
         *((one.measured_distance, one.measured_amplitude.nan_to_num(0.0)) for one in states),
         strict=True,
     )
-    depth = torch.stack(depth)
-    if recording.depth_kind == "z":
-        depth = z_depth_from_radial_distance(depth, ray_directions(recording.camera))
-    return replace(
+    return _in_memory(
         recording,
-        saturation_amplitude=None,
-        frames=recording.frames.select(np.array(frames)),
-        depth=depth.float().numpy(),
-        amplitude=torch.stack(amplitude).float().numpy(),
-        mask=recording.read("mask", np.array(frames)),
-        raw=None,
-        true_depth=None,
-        planes="recorded",
+        torch.stack(depth),
+        {
+            "saturation_amplitude": None,
+            "frames": recording.frames.select(np.array(frames)),
+            "amplitude": torch.stack(amplitude).float().numpy(),
+            "mask": recording.read("mask", np.array(frames)),
+        },
     )
+
+
+def _in_memory(recording: Recording, distance: Tensor, changes: Mapping[str, Any]) -> Recording:
+    """Return a recording of other radial distances, shape (F, H, W), metres, and changed fields."""
+    if recording.depth_kind == "z":
+        distance = z_depth_from_radial_distance(distance, ray_directions(recording.camera))
+    depth = distance.float().numpy()
+    whole = {"raw": None, "true_depth": None, "planes": "recorded", "depth": depth}
+    return replace(recording, **whole, **changes)
 
 
 def recording_of(
@@ -144,25 +118,15 @@ def recording_of(
     recording = observations.recording
     images = torch.full(observations.distance_images.shape, torch.nan, dtype=torch.float64)
     images.flatten(1)[observations.frame, observations.pixel] = distance
-    depth = images.numpy()
-    if recording.depth_kind == "z":
-        depth = depth * ray_directions(recording.camera)[..., 2].numpy()
-    amplitude = observations.amplitude_images
-    return replace(
-        recording,
-        tool_from_camera=tool_from_camera.numpy(),
-        frames=replace(
-            recording.frames,
-            normal_world=observations.facts.normal_world.numpy(),
-            offset=observations.facts.offset.numpy(),
-        ),
-        depth=depth.astype(np.float32),
-        amplitude=None if amplitude is None else amplitude.clamp(min=0.0).numpy(),
-        mask=None,
-        raw=None,
-        true_depth=None,
-        planes="recorded",
-    )
+    amplitude, facts = observations.amplitude_images, observations.facts
+    planes = {"normal_world": facts.normal_world.numpy(), "offset": facts.offset.numpy()}
+    changes = {
+        "tool_from_camera": tool_from_camera.numpy(),
+        "frames": replace(recording.frames, **planes),
+        "amplitude": None if amplitude is None else amplitude.clamp(min=0.0).numpy(),
+        "mask": None,
+    }
+    return _in_memory(recording, images, changes)
 
 
 # Parts of the poses that are held out in turn, whole folds each. Chosen: every part costs a new
@@ -185,118 +149,86 @@ class Closure:
     frames: int
 
 
-def check_in_simulator(
-    study: Study, named: NamedEffects, given: SimulatorOptions | None
-) -> Closure:
-    """Run the simulator without and with the effects, and compare the recording with both.
-
-    Args:
-        study: The recording.
-        named: The effects named.
-        given: The simulator under diagnosis; None: one made from the recording alone.
-    """
+def check_in_simulator(found: Evidence) -> Closure:
+    """Run the simulator without and with the effects, and compare the recording with both."""
+    study = found.study
     frames = simulated_frames(study.observations.recording)
-    measured = study.observations.measured
-    bare = replace(named, names=(), refined_terms=(), study=study)
-    models = (bare, named) if named.adds_something else (bare,)
-    gaps = [
-        float(
-            excess_gaps(
-                study.observations,
-                measured - _held_out(study, model, given, frames),
-                study.fit.share,
-                study.fit.sigma,
-            )
-        )
-        for model in models
-    ]
+    gaps = []
+    for model in _compared(found):
+        left = study.observations.measured - _held_out(model, frames)
+        share, sigma = study.fit.share, study.fit.sigma
+        gaps.append(float(excess_gaps(study.observations, left, share, sigma)))
     return Closure(without_effects=gaps[0], with_effects=gaps[-1], frames=len(frames))
 
 
-def _held_out(
-    study: Study, named: NamedEffects, given: SimulatorOptions | None, frames: list[int]
-) -> Tensor:
+def _compared(found: Evidence) -> list[Evidence]:
+    """Return the model without effects, and with them if they add something."""
+    return [found.without_effects(), *([found] if found.named.adds_something else [])]
+
+
+def _held_out(found: Evidence, frames: list[int]) -> Tensor:
     """Return what the simulator measures, fitted without the poses it is run at, (M,), metres."""
-    folds, unit = study.folds, study.observations.unit
+    folds, unit = found.study.folds, found.study.observations.unit
     part = folds.argmax(0) * _PARTS // len(folds)
-    distance = torch.full_like(study.observations.measured, torch.nan)
+    distance = torch.full_like(found.study.observations.measured, torch.nan)
     for number in range(_PARTS):
         held_out = part == number
         own = [frame for frame in frames if bool(held_out[unit[frame]])]
         if own:
-            fitted = replace(named, study=fitted_to(named.study, ~held_out, named.columns))
-            found = fitted_distance(study, fitted, given, None, own)
-            distance = torch.where(found.isfinite(), found, distance)
+            measured = found.fitted_to(~held_out).distance(None, own)
+            distance = torch.where(measured.isfinite(), measured, distance)
     return distance
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Transfer:
     """Root mean square errors on held-out real poses in excess of the noise, metres.
+
+    Intervals are over the held-out poses; the trainings are not repeated.
 
     Attributes:
         trained_on_sim: Of the correction trained on the simulator.
         trained_on_sim_with_effects: On the simulator with the named effects.
         trained_on_real: On real images.
-        intervals: Of the three, 95 %, over the held-out poses; the trainings are not repeated.
-        gain_interval: Of the first less the second, 95 %: what the effects save.
+        gain: The first less the second: what the effects save.
     """
 
-    trained_on_sim: float
-    trained_on_sim_with_effects: float
-    trained_on_real: float
-    intervals: tuple[Interval, Interval, Interval]
-    gain_interval: Interval
+    trained_on_sim: Estimated
+    trained_on_sim_with_effects: Estimated
+    trained_on_real: Estimated
+    gain: Estimated
 
 
 def measure_transfer(
-    study: Study,
-    named: NamedEffects,
-    given: SimulatorOptions | None,
-    generator: torch.Generator,
-    resamples: Tensor,
+    found: Evidence, generator: torch.Generator, resamples: Tensor
 ) -> Transfer | None:
     """Train on simulated and on real images; test on held-out real ones.
 
     Args:
-        study: The recording.
-        named: The effects named.
-        given: The simulator under diagnosis; None: one made from the recording alone.
+        found: The simulator, and the recording.
         generator: Of the split and the noise.
         resamples: How often each resample holds each pose, shape (B, U).
 
     Returns:
         None with too few poses to hold a half of them out.
     """
-    observations = study.observations
-    frames = np.array(simulated_frames(observations.recording))
+    study = found.study
+    frames = np.array(simulated_frames(study.observations.recording))
     first_half = _half_of_the_poses(study, generator)
-    of_frame = first_half[observations.unit[frames]].numpy()
+    of_frame = first_half[study.observations.unit[frames]].numpy()
     split = frames[of_frame], frames[~of_frame]
     # Two fix a plane and a slope; fewer leave a half empty.
     if min(map(len, split)) < 2:
         return None
-    half = bare = replace(named, names=(), refined_terms=(), study=study)
-    found, pose = [], study.fit.tool_from_camera
+    gaps, half = [], found
     noise = generator.get_state()
-    for model in (bare, named) if named.adds_something else (bare,):
+    for model in _compared(found):
         generator.set_state(noise)  # The same for both: only the effects make a difference.
-        half = replace(model, study=fitted_to(model.study, first_half, model.columns))
-        distance = fitted_distance(half.study, half, given, generator, split[0].tolist())
-        pose = solution_of(half.study, half)[0]
-        walls = observed_by(study, half)
-        found.append(_tested(study, walls, distance, pose, split, resamples))
-    walls = observed_by(study, half)
-    real = _tested(study, walls, observations.measured, pose, split, resamples)
-    compared = found[0], found[-1], real, found[0] - found[-1]
-    intervals = [interval_of(gaps[1:].tolist(), float(gaps[0])) for gaps in compared]
-    return Transfer(
-        trained_on_sim=float(found[0][0]),
-        trained_on_sim_with_effects=float(found[-1][0]),
-        trained_on_real=float(real[0]),
-        intervals=(intervals[0], intervals[1], intervals[2]),
-        gain_interval=intervals[3],
-    )
+        half = model.fitted_to(first_half)
+        simulated = half.distance(generator, split[0].tolist())
+        gaps.append(_tested(study, half, simulated, split, resamples))
+    real = _tested(study, half, study.observations.measured, split, resamples)
+    return Transfer(*map(Estimated.of, (gaps[0], gaps[-1], real, gaps[0] - gaps[-1])))
 
 
 def _half_of_the_poses(study: Study, generator: torch.Generator) -> Tensor:
@@ -304,55 +236,155 @@ def _half_of_the_poses(study: Study, generator: torch.Generator) -> Tensor:
 
     So both halves see the same distances; outside of those trained on, a correction extrapolates.
     """
-    unit, share = study.unit_of_pixel, study.fit.share
-    units = study.sums.num_units
-    weights, sums = torch.zeros(2, units, dtype=torch.float64)
-    weights = weights.index_add(0, unit, share)
-    sums = sums.index_add(0, unit, share * study.observations.measured.nan_to_num(0.0))
-    rank = (sums / weights).argsort().argsort()
-    first_of_pair = torch.randint(2, (units // 2 + 1,), generator=generator)
+    observations, share = study.observations, study.fit.share
+    sums = observations.per_pose(share * observations.measured.nan_to_num(0.0))
+    rank = (sums / observations.per_pose(share)).argsort().argsort()
+    first_of_pair = torch.randint(2, (len(sums) // 2 + 1,), generator=generator)
     return rank % 2 == first_of_pair[rank // 2]
 
 
 def _tested(
     study: Study,
-    observations: Observations,
+    found: Evidence,
     distance: Tensor,
-    pose: Tensor,
     split: tuple[np.ndarray, np.ndarray],
     resamples: Tensor,
 ) -> Tensor:
     """Train a correction on distances (M,), and return its error on held-out real poses.
 
     Args:
-        study: The recording.
-        observations: Its pixels, with estimated walls where the model has them.
+        study: The recording, with all its poses.
+        found: The simulator, fitted to some of them, where the training starts.
         distance: What the camera to train on measures in the chosen pixels; NaN: not used.
-        pose: Its hand-eye transform, where the fit starts, shape (4, 4).
         split: Which frames train, and which test.
         resamples: As of `excess_gaps`, and so is what is returned.
     """
     training, test = split
-    use, free = study.fit.trust > 0, study.fit.model.hand_eye_free
+    observations, pose = found.observations, found.tool_from_camera
+    free, use = study.fit.model.hand_eye_free, study.fit.trust > 0
     hand_eye = HandEyeOptions(estimate="yes" if free else "no", start="recording")
     options = FitOptions(model=study.fit.model.options, hand_eye=hand_eye)
     dataset = Dataset((recording_of(observations, torch.where(use, distance, torch.nan), pose),))
     domain = covered_domain(dataset, training)
     trained = fit(dataset, training, options, domain).model
-    measured, width = observations.measured, observations.distance_images.shape[2]
-    pixels = Pixels(
-        measured,
-        measured if observations.amplitude is None else observations.amplitude,
-        (observations.pixel // width).double(),
-        (observations.pixel % width).double(),
-        observations.conditions[observations.frame],
-    )
     with torch.no_grad():
-        corrected = torch.where(use, measured - trained.error.error_at(pixels), torch.nan)
+        error = trained.error.error_at(observations.term_inputs(observations.measured))
+    corrected = torch.where(use, observations.measured - error, torch.nan)
     if free:
         real = Dataset((recording_of(observations, corrected, pose),))
         pose = fit(real, training, options, domain).hand_eye_only.tool_from_camera
     left = corrected - predicted_distance(observations, pose)
     tested = torch.from_numpy(np.isin(observations.frame.numpy(), test))
     weights = study.fit.share * tested
-    return excess_gaps(study.observations, left, weights, study.fit.sigma, resamples)
+    return excess_gaps(observations, left, weights, study.fit.sigma, resamples)
+
+
+def expected_images(
+    model: SensorModel,
+    recording: Recording,
+    frames: Tensor,
+    distance: Tensor,
+    amplitude: Tensor | None,
+) -> Tensor:
+    """Return the expected radial distances of F frames, shape (F, H, W), metres.
+
+    Args:
+        model: The sensor.
+        recording: Conditions of all frames: effects of whole frames depend on those before.
+        frames: Numbers of the F frames, int64.
+        distance: True distances along the rays, shape (F, H, W), metres.
+        amplitude: Light that returns, shape (F, H, W), counts; None: unknown.
+    """
+    shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
+    slant = ray_directions(recording.camera)[..., 2]
+    scale = slant if model.sensor.depth_kind == "z" else torch.ones_like(slant)
+    measured = torch.empty_like(distance, dtype=torch.float64)
+    with torch.inference_mode():
+        for place, number in enumerate(frames.tolist()):
+            found = model(
+                distance[place].double() * scale,
+                None if amplitude is None else amplitude[place].double(),
+                noise=False,
+                frame_shift=shift[number],
+                **conditions_of_frames(recording, number),
+            )
+            measured[place] = found.depth / scale
+    return measured
+
+
+def light_images(
+    model: SensorModel, observations: Observations, inputs: EffectInputs
+) -> Tensor | None:
+    """Return the light that reached the camera, shape (F, H, W), counts; None: not recorded.
+
+    It is the recorded amplitude. Where a sensor clips bright pixels, that of the chosen pixels is
+    what it would have been without clipping, as in the fit.
+    """
+    images = observations.amplitude_images
+    if images is None or not model.effects.reads_light:
+        return images
+    lit = images.double().flatten(1)
+    lit[observations.frame, observations.pixel] = light_of(inputs)
+    return lit.reshape(images.shape)
+
+
+# Pixels that are degraded at most; of larger recordings evenly chosen poses. Chosen: 32 VGA frames,
+# some seconds.
+_MOST_PIXELS = 10_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class DegradedStage:
+    """Ideal frames through the sensor that was found, against real frames of other poses.
+
+    Attributes:
+        gap: Root mean square in excess of the noise, metres; its interval has poses as the unit,
+            and the fit is not repeated.
+        poses: How many poses were compared.
+        left_out: Effects of the sensor that no depth image can show, and why, a sentence each.
+    """
+
+    gap: Estimated
+    poses: int
+    left_out: tuple[str, ...]
+
+
+def degraded_stage(found: Evidence, floor: float, resamples: Tensor) -> DegradedStage:
+    """Fit the sensor without each fold of the poses, and degrade ideal frames of that fold.
+
+    The effects were chosen with all poses; hand-eye transform and coefficients are those of the
+    other folds. Ideal frames show the target's plane, and off the target what was measured.
+
+    Args:
+        found: The final model.
+        floor: Noise of a pixel, root mean square, metres, as in the other stages.
+        resamples: How often each resample holds each pose, shape (B, U).
+    """
+    study = found.study
+    observations = study.observations
+    frames = max(_MOST_PIXELS // observations.distance_images[0].numel(), 1)
+    units = observations.num_units
+    count = int(np.clip(units * frames / observations.num_frames, 1, units))
+    chosen = torch.linspace(0, units - 1, count).round().long()
+    among = torch.zeros(units, dtype=torch.bool)
+    among[chosen] = True
+    expected = torch.full_like(observations.measured, torch.nan)
+    left_out: tuple[str, ...] = ()
+    for held in filter(torch.any, ((members > 0) & among for members in study.folds)):
+        own = found.fitted_to(~held)
+        with catch_warnings():
+            simplefilter("ignore", SensorWarning)  # `left_out` says so once, and not in each fold.
+            model = SensorModel(sensor_of(own, None), torch.float64)
+            left_out = model.left_out
+            frames_held = torch.nonzero(held[observations.unit]).reshape(-1)
+            light = light_images(model, observations, study.inputs)
+            ideal = distance_images(own.observations, own.tool_from_camera, frames_held)
+            lit = None if light is None else light[frames_held]
+            seen = own.observations.recording
+            images = expected_images(model, seen, frames_held, ideal, lit).flatten(1)
+        pixels = held[study.unit_of_pixel].nonzero().reshape(-1)
+        place = torch.searchsorted(frames_held, observations.frame[pixels])
+        expected[pixels] = images[place, observations.pixel[pixels]]
+    left = observations.measured - expected
+    gaps = excess_gaps(observations, left, study.fit.share, floor, resamples)
+    return DegradedStage(gap=Estimated.of(gaps), poses=len(chosen), left_out=left_out)

@@ -1,25 +1,42 @@
-"""The simulator that a fit describes: its options can be written out, and run at the same poses."""
+"""The simulator and the sensor that a fit describes.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from types import MappingProxyType
-from typing import Any, Literal
+The simulator's options can be written out, and run at the same poses. The sensor is the content of
+`sensor.yaml`: the camera as a diagnosis found it.
+"""
+
+import copy
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import accumulate, pairwise
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.absorption import fitted_coefficients
+from tofcorr.data.recording import Recording, RigidTransform
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.findings.shares import HAND_EYE
+from tofcorr.diagnosis.findings.where import Interval, interval_of
 from tofcorr.diagnosis.sums.gains import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.study import Study, fitted_coefficients
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions, unambiguous_range
+from tofcorr.observables.compare import Observables, compare_observables
+from tofcorr.sensor.parts import section_of
+from tofcorr.sensor.sensor_file import (
+    ErrorSection,
+    SensorFile,
+    dropout_section,
+    light_section,
+    validity_of,
+)
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.options import (
     CameraMountOptions,
     CameraOptions,
@@ -45,74 +62,199 @@ from tofcorr.simulation.simulator import twin_frames
 # Chosen; a test compares simulator and fit to 0.2 mm.
 _LEAST_KNOTS, _AMPLITUDE_KNOTS, _LATTICE = 13, 26, 9
 
-Variable = Literal["distance", "amplitude", "normalised_amplitude"]
 Numbered = tuple[Any, Tensor]
 """A term, and the numbers of its coefficients in the model."""
 
+# Pixels that are simulated at most, and frames at least: of larger recordings only some frames are
+# simulated, evenly spread. Chosen to bound the time.
+_MOST_PIXELS, _LEAST_FRAMES = 6_000_000, 8
 
-def tables_of(
-    study: Study, named: NamedEffects | None, given: SimulatorOptions | None
-) -> tuple[MeasuredErrorOptions, list[Numbered]]:
-    """Return a fitted error model as tables, added to those that a given simulator has.
 
-    The simulator has one table of the distance, one of the image, and one of the amplitude or the
-    normalised amplitude. Terms of conditions, of distance and amplitude together, or of a second
-    amplitude variable fit into none.
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What the findings were computed from; it describes a simulator.
 
-    Returns:
-        The tables, and the terms that fit into none.
+    Attributes:
+        study: The recording, before any effect was named.
+        named: The effects named, with all comparisons.
+        given: The built-in simulator under diagnosis, to which the refitted errors are added; None:
+            they are added to one made from the recording alone.
+        patterns: Values of maps in all pixels, shape (cells,), metres, by name, where the study has
+            only some of them. Other maps are zero outside the pixels that the diagnosis chose.
     """
+
+    study: Study
+    named: NamedEffects
+    given: SimulatorOptions | None = None
+    patterns: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @cached_property
+    def theta(self) -> Tensor:
+        """Coefficients of the final model, as steps from the base fit, shape (K,)."""
+        return self.named.study.sums.ols.solve(self.named.columns)
+
+    @property
+    def rendered(self) -> bool:
+        """Whether another simulator than the built-in one rendered frames."""
+        return self.given is None and self.study.fit.known is not None
+
+    @property
+    def tool_from_camera(self) -> Tensor:
+        """Hand-eye transform of the final model, shape (4, 4)."""
+        pose, count = self.study.fit.tool_from_camera, self.study.fit.model.num_hand_eye
+        return pose @ se3.exp(self.theta[:count]) if count else pose
+
+    @property
+    def coefficients(self) -> Tensor:
+        """Coefficients of the final model's constant and error terms, shape (K,)."""
+        model = self.study.fit.model
+        steps = self.theta[model.num_geometry : model.num_columns]
+        return self.study.fit.coefficients + steps
+
+    @property
+    def observations(self) -> Observations:
+        """The observations, with estimated walls where the final model has them."""
+        return self.study.fit.model.moved(self.theta).observations
+
+    @cached_property
+    def effects(self) -> list[CatalogueEffect]:
+        """The effects of the final model with their fitted coefficients."""
+        study, named = self.study, self.named
+        fitted = fitted_coefficients(named.study, named.columns)
+        effects: list[CatalogueEffect] = [
+            named.study.candidates.effects[name].with_coefficients(c) for name, c in fitted.items()
+        ]
+        for name in filter(study.candidates.maps.__contains__, named.names):
+            values, effect = self.patterns.get(name), study.candidates.maps[name]
+            if values is None:
+                # Estimated from all poses; cross-fitted values were subtracted.
+                residual = study.system.residual_of(named.columns)
+                values = FittedMap(study, effect, residual).whole()
+            effects.append(effect.with_coefficients(values))
+        return effects
+
+    def without_effects(self) -> "Evidence":
+        """Return the same of the base model alone."""
+        bare = replace(self.named, names=(), refined_terms=(), study=self.study)
+        return replace(self, named=bare)
+
+    def fitted_to(self, units: Tensor) -> "Evidence":
+        """Return the same model fitted to some poses alone, bool (U,)."""
+        columns, named = self.named.columns, self.named
+        own, of_model = (fitted_to(study, units, columns) for study in (self.study, named.study))
+        return replace(self, study=own, named=replace(named, study=of_model))
+
+    @cached_property
+    def tables(self) -> tuple[MeasuredErrorOptions, list[Numbered]]:
+        """The error model as tables, added to those of a given simulator; terms without a table.
+
+        The simulator has one table of the distance, one of the image, and one of the amplitude or
+        the normalised amplitude. Terms of conditions, of distance and amplitude together, or of a
+        second amplitude variable fit into none.
+        """
+        return _tables(self)
+
+    @cached_property
+    def simulator(self) -> SimulatorOptions:
+        """The simulator that the fit describes."""
+        pattern = self.study.pattern
+        options = _plain(self.study) if self.given is None else self.given
+        delays = options.sensor.delays.model_copy(update={"measured": self.tables[0]})
+        own = [*([] if pattern is None else [pattern]), *self.effects]
+        changes: dict[str, Any] = {
+            "sensor": options.sensor.model_copy(update={"delays": delays}),
+            "effects": (*options.effects, *(effect.to_mapping() for effect in own)),
+            "hand_eye": CameraMountOptions.from_matrix(self.tool_from_camera),
+        }
+        return options.model_copy(update=changes)
+
+    def distance(
+        self, generator: torch.Generator | None = None, frames: list[int] | None = None
+    ) -> Tensor:
+        """Return what the simulator measures in the chosen pixels, as `twin_distance` does, (M,).
+
+        The error that frames of another simulator showed is added to its distances, and so are
+        errors of base terms that it has no table for.
+        """
+        observations, pose = self.observations, self.tool_from_camera
+        distance = twin_distance(observations, self.simulator, pose, generator, frames)
+        if self.rendered:
+            assert self.study.fit.known is not None
+            distance = distance + self.study.fit.known.error
+        for _, numbers in self.tables[1]:
+            columns = self.study.fit.model.error_columns(predicted_distance(observations, pose))
+            distance = distance + columns[:, numbers] @ self.coefficients[numbers]
+        return distance
+
+
+def fitted_to(study: Study, units: Tensor, names: Sequence[str]) -> Study:
+    """Return the study with ordinary sums, and maps, of some poses alone.
+
+    Args:
+        study: The recording.
+        units: Which poses, shape (U,), bool.
+        names: Effects with columns that the model has; the sums of all others are left out.
+    """
+    used = units.double()
+    sums = study.sums.of(names)
+    sums = replace(sums, plain=sums.plain * used[:, None, None])
+    fit = replace(study.fit, trust=study.fit.trust * used[study.unit_of_pixel])
+    return replace(study, system=replace(study.system, sums=sums), fit=fit)
+
+
+def _tables(found: Evidence) -> tuple[MeasuredErrorOptions, list[Numbered]]:
+    """Return `Evidence.tables`."""
+    observations, model, given = found.study.observations, found.study.fit.model, found.given
     already = MeasuredErrorOptions() if given is None else given.sensor.delays.measured
-    coefficients, model, start = solution_of(study, named)[1], study.fit.model, 1
-    numbered: list[Numbered] = []
-    for term in model.terms:
-        numbered.append((term, torch.arange(start, start + len(term.symbols))))
-        start += len(term.symbols)
-    count, pixels = len(model.error_model.signal_terms), len(model.error_model.pixel_terms)
-    signal, rest = numbered[:count], numbered[count:]
-    of_pixels, beyond = rest[:pixels], rest[pixels:]
-    reads = [_variable_of(term, study.observations) for term, _ in signal]
+    terms: list[Any] = model.terms
+    counts = len(model.error_model.signal_terms), len(model.error_model.pixel_terms)
+    reads = [_variable_of(term, observations) for term in terms[: counts[0]]]
+    reads += ["pixel"] * counts[1] + [None] * (len(terms) - sum(counts))
     variable = next((one for one in reads if one in ("amplitude", "normalised_amplitude")), None)
     if already.amplitude is not None:
         variable = already.amplitude.variable
-    by_distance = [each for each, one in zip(signal, reads, strict=True) if one == "distance"]
-    by_amplitude = [each for each, one in zip(signal, reads, strict=True) if one == variable]
-    known = ("distance", variable)
-    beyond += [each for each, one in zip(signal, reads, strict=True) if one not in known or not one]
+    ends = accumulate((len(term.symbols) for term in terms), initial=1)
+    spans = zip(terms, reads, pairwise(ends), strict=True)
+    numbered = [(read, term, torch.arange(*span)) for term, read, span in spans]
 
-    def total(terms: Sequence[Numbered], first: Tensor, second: Tensor) -> Tensor:
-        found = torch.zeros(len(first), dtype=torch.float64)
-        for term, numbers in terms:
-            found = found + coefficients[numbers] @ term.basis(first, second).detach()
-        return found
+    def total(kind: str, first: Tensor, second: Tensor) -> Tensor:
+        """Return the sum of all terms of one variable at values (N,) of a term's two."""
+        own = [
+            found.coefficients[numbers] @ term.basis(first, second).detach()
+            for read, term, numbers in numbered
+            if read == kind
+        ]
+        return torch.stack([torch.zeros(len(first), dtype=torch.float64), *own]).sum(0)
 
     def curve(at: Tensor, values: Tensor, known: CurveTable | None) -> dict[str, Any]:
         if known is not None:
             values = values + Curve(known.knots, known.values_m)(at)
         return {"knots": tuple(at.tolist()), "values_m": tuple(values.tolist())}
 
-    measured, seen = study.observations.measured, study.observations.amplitude
-    finest = max((len(numbers) for _, numbers in by_distance), default=0)
+    measured, seen = observations.measured, observations.amplitude
+    finest = max((len(numbers) for read, _, numbers in numbered if read == "distance"), default=0)
     count = max(_LEAST_KNOTS, 2 * finest + 1)
     at = torch.linspace(float(measured.min()), float(measured.max()), count, dtype=torch.float64)
-    distance = CurveTable(**curve(at, total(by_distance, at, at), already.distance))
+    distance = CurveTable(**curve(at, total("distance", at, at), already.distance))
     amplitude = already.amplitude
-    if by_amplitude and variable is not None and seen is not None:
+    if variable is not None and variable in reads and seen is not None:
         at = _dense_where_dark(seen if variable == "amplitude" else seen * measured**2)
-        values = total(by_amplitude, torch.ones_like(at), at)
-        found = curve(at, values, amplitude) | {"variable": variable}
-        amplitude = AmplitudeTable.model_validate(found)
-    camera = study.observations.recording.camera
+        values = total(variable, torch.ones_like(at), at)
+        own = curve(at, values, amplitude) | {"variable": variable}
+        amplitude = AmplitudeTable.model_validate(own)
+    camera = observations.recording.camera
     sides = (torch.linspace(0, end - 1, _LATTICE).double() for end in (camera.height, camera.width))
-    lattice = total(of_pixels, *torch.cartesian_prod(*sides).T).reshape(_LATTICE, _LATTICE)
+    lattice = total("pixel", *torch.cartesian_prod(*sides).T).reshape(_LATTICE, _LATTICE)
     if already.pixel is not None:
         lattice = lattice + image_from_lattice(already.pixel.values_m, _LATTICE, _LATTICE)
     tables = {
-        "constant_m": float(coefficients[0]) + already.constant_m,
+        "constant_m": float(found.coefficients[0]) + already.constant_m,
         "distance": distance,
         "pixel": LatticeTable(values_m=tuple(map(tuple, lattice.tolist()))),
         "amplitude": amplitude,
     }
+    held = ("distance", "pixel", *([] if variable is None else [variable]))
+    beyond = [(term, numbers) for read, term, numbers in numbered if read not in held]
     return already.model_copy(update=tables), beyond
 
 
@@ -124,7 +266,7 @@ def _dense_where_dark(values: Tensor) -> Tensor:
     return low + reach * torch.linspace(0.0, 1.0, _AMPLITUDE_KNOTS, dtype=torch.float64) ** 2
 
 
-def _variable_of(term: SignalTerm, observations: Observations) -> Variable | None:
+def _variable_of(term: SignalTerm, observations: Observations) -> str | None:
     """Return the one variable that a term depends on; None: it depends on two."""
     if not term.needs_amplitude:
         return "distance"
@@ -142,110 +284,10 @@ def _variable_of(term: SignalTerm, observations: Observations) -> Variable | Non
     return None
 
 
-Patterns = Mapping[str, Tensor]
-"""Values of maps in all pixels, shape (cells,), metres, by the name of the effect."""
-
-NO_PATTERNS: Patterns = MappingProxyType({})
-# Pixels that are simulated at most, and frames at least: of larger recordings only some frames are
-# simulated, evenly spread. Chosen to bound the time.
-_MOST_PIXELS, _LEAST_FRAMES = 6_000_000, 8
-
-
-def solution_of(study: Study, named: NamedEffects | None) -> tuple[Tensor, Tensor]:
-    """Return the hand-eye transform (4, 4) and the error model's coefficients (K,) of a model.
-
-    Args:
-        study: The recording.
-        named: The model with effects; None: the base model alone.
-    """
-    fit = study.fit
-    if named is None:
-        return fit.tool_from_camera, fit.coefficients
-    theta = named.study.sums.ols.solve(named.columns)
-    pose = fit.tool_from_camera
-    if fit.model.hand_eye_free:
-        pose = pose @ se3.exp(theta[: fit.model.num_hand_eye])
-    return pose, fit.coefficients + theta[fit.model.num_geometry : fit.model.num_columns]
-
-
-def observed_by(study: Study, named: NamedEffects | None) -> Observations:
-    """Return the observations with estimated walls where a model has them.
-
-    Args:
-        study: The recording.
-        named: The model with effects; None: the base model alone.
-    """
-    if named is None:
-        return study.observations
-    theta = named.study.sums.ols.solve(named.columns)
-    return study.fit.model.moved(theta).observations
-
-
-def fitted_effects(
-    study: Study, named: NamedEffects, patterns: Patterns = NO_PATTERNS
-) -> list[CatalogueEffect]:
-    """Return the effects of the final model with their fitted coefficients.
-
-    Args:
-        study: The recording.
-        named: The model.
-        patterns: Values of maps in all pixels; those of other maps are zero outside the pixels
-            that the diagnosis chose.
-    """
-    fitted = fitted_coefficients(named.study, named.columns)
-    effects: list[CatalogueEffect] = [
-        named.study.candidates.effects[name].with_coefficients(c) for name, c in fitted.items()
-    ]
-    for name in named.names:
-        if name in study.candidates.maps:
-            effect = study.candidates.maps[name]
-            values = patterns.get(name)
-            if values is None:
-                # Estimated from all poses; cross-fitted values were subtracted.
-                residual = study.system.residual_of(named.columns)
-                values = FittedMap(study, effect, residual).whole()
-            effects.append(effect.with_coefficients(values))
-    return effects
-
-
-def simulator_of(
-    study: Study,
-    named: NamedEffects | None,
-    given: SimulatorOptions | None,
-    patterns: Patterns = NO_PATTERNS,
-) -> SimulatorOptions:
-    """Return the simulator that the fit describes.
-
-    Args:
-        study: The recording.
-        named: With these effects; None: base model alone.
-        given: The simulator under diagnosis, to which the refitted errors are added; None: one
-            made from the recording alone.
-        patterns: As in `fitted_effects`.
-    """
-    recording = study.observations.recording
-    pose = solution_of(study, named)[0]
-    options = _plain(recording, study.observations, study.fit) if given is None else given
-    measured = tables_of(study, named, given)[0]
-    delays = options.sensor.delays.model_copy(update={"measured": measured})
-    sensor = options.sensor.model_copy(update={"delays": delays})
-    effects = tuple(options.effects)
-    if study.pattern is not None:
-        effects += (study.pattern.to_mapping(),)
-    if named is not None:
-        effects += tuple(effect.to_mapping() for effect in fitted_effects(study, named, patterns))
-    changes: dict[str, Any] = {
-        "sensor": sensor,
-        "effects": effects,
-        "hand_eye": CameraMountOptions.from_matrix(pose),
-    }
-    return options.model_copy(update=changes)
-
-
-def _plain(recording: Recording, observations: Observations, fit: BaseFit) -> SimulatorOptions:
+def _plain(study: Study) -> SimulatorOptions:
     """Return a sensor without errors, as noisy as the recording, with its targets and frames."""
-    names = sorted(set(recording.frames.target.tolist()))
-    counts = {name: int((recording.frames.target == name).sum()) for name in names}
+    observations, recording = study.observations, study.observations.recording
+    names, counts = np.unique(recording.frames.target, return_counts=True)
     # A common frequency; errors are tables of the distance, so that it hardly matters.
     frequency = recording.modulation_frequency or 20.0e6
     light = LightOptions()
@@ -254,7 +296,7 @@ def _plain(recording: Recording, observations: Observations, fit: BaseFit) -> Si
     if observations.amplitude is not None:
         amplitude = float(observations.amplitude.median())
         scale = unambiguous_range(frequency) / (2 * np.pi)
-        noise = float(fit.sigma.median())
+        noise = float(study.fit.sigma.median())
         # Shot noise: sigma = scale sqrt(B / 2) / A, with the mean B = A / contrast.
         electrons = scale**2 / (2 * light.demodulation_contrast * noise**2)
         electrons_per_count = max(electrons / max(amplitude, 1e-12), 1e-9)
@@ -264,9 +306,12 @@ def _plain(recording: Recording, observations: Observations, fit: BaseFit) -> Si
     return SimulatorOptions(
         camera=CameraOptions.of(recording.camera),
         depth_kind=recording.depth_kind,
-        shots=tuple(ShotOptions(target=name, poses=n) for name, n in counts.items()),
+        shots=tuple(
+            ShotOptions(target=name, poses=n)
+            for name, n in zip(names.tolist(), counts.tolist(), strict=True)
+        ),
         scene=SceneOptions(
-            targets={name: UniformTarget() for name in names} | SceneOptions().targets
+            targets=dict.fromkeys(names.tolist(), UniformTarget()) | SceneOptions().targets
         ),
         sensor=SensorOptions(
             modulation_frequency_hz=frequency,
@@ -290,42 +335,6 @@ def simulated_frames(recording: Recording) -> list[int]:
     return torch.linspace(0, frames - 1, most).round().long().unique().tolist()
 
 
-def fitted_distance(
-    study: Study,
-    named: NamedEffects | None,
-    given: SimulatorOptions | None,
-    generator: torch.Generator | None = None,
-    frames: list[int] | None = None,
-) -> Tensor:
-    """Return what the fitted simulator measures in the chosen pixels, shape (M,), metres.
-
-    The error that frames of another simulator showed is added to its distances, and so are errors
-    of base terms that it has no table for.
-
-    Args:
-        study: The recording.
-        named: With these effects; None: base model alone.
-        given: The simulator under diagnosis; None: one made from the recording alone.
-        generator: Source of noise; None: the expected measurement.
-        frames: Which frames; None: all.
-
-    Returns:
-        NaN in frames left out and where the simulated camera has no distance.
-    """
-    pose = solution_of(study, named)[0]
-    simulator = simulator_of(study, named, given)
-    observations = observed_by(study, named)
-    distance = twin_distance(observations, simulator, pose, generator, frames)
-    if given is None and study.fit.known is not None:
-        distance = distance + study.fit.known.error
-    beyond, coefficients = tables_of(study, named, given)[1], solution_of(study, named)[1]
-    if beyond:
-        numbers = torch.cat([own for _, own in beyond])
-        columns = study.fit.model.error_columns(predicted_distance(observations, pose))
-        distance = distance + columns[:, numbers] @ coefficients[numbers]
-    return distance
-
-
 def twin_distance(
     observations: Observations,
     simulator: SimulatorOptions,
@@ -346,28 +355,24 @@ def twin_distance(
         NaN in frames left out and where the simulated camera has no distance.
     """
     recording = observations.recording
-    known = observations.amplitude is not None
     measured = torch.full_like(observations.measured, torch.nan)
     chosen = list(range(observations.num_frames)) if frames is None else frames
-    ends = observations.frame_ends
     states = twin_frames(
         simulator,
         recording,
         generator,
         tool_from_camera=tool_from_camera,
-        reflectivity="from_recording" if known else "pattern",
+        reflectivity="pattern" if observations.amplitude is None else "from_recording",
         indices=chosen,
     )
     for frame, state in zip(chosen, states, strict=True):
-        start, end = ends[frame]
+        start, end = observations.frame_ends[frame]
         pixels = observations.pixel[start:end]
         measured[start:end] = state.measured_distance.reshape(-1)[pixels]
     return measured
 
 
-def whole_patterns(
-    study: Study, named: NamedEffects, given: SimulatorOptions | None
-) -> dict[str, Tensor]:
+def whole_patterns(found: Evidence) -> dict[str, Tensor]:
     """Return the maps of the model, with values in all pixels, by name; metres.
 
     Of large images the diagnosis chooses some pixels, and knows a map in these alone. A simulator
@@ -377,37 +382,30 @@ def whole_patterns(
 
     Nothing is returned where all pixels were chosen, or where the built-in simulator cannot do all
     that the model does: other pixels have the value zero then.
-
-    Args:
-        study: The recording, before any effect was named.
-        named: The effects named.
-        given: The simulator under diagnosis; None: one made from the recording alone.
     """
-    maps = [study.candidates.maps[name] for name in named.names if name in study.candidates.maps]
-    rendered = given is None and study.fit.known is not None
-    if not maps or not study.observations.is_sample or rendered:
+    maps = found.study.candidates.maps
+    names = [name for name in found.named.names if name in maps]
+    cannot = not names or not found.study.observations.is_sample or found.rendered
+    if cannot or found.tables[1]:
         return {}
-    if tables_of(study, named, given)[1]:
-        return {}
-    return {effect.name: _of_all_pixels(study, named, given, effect) for effect in maps}
+    return {name: _of_all_pixels(found, maps[name]) for name in names}
 
 
-def _of_all_pixels(
-    study: Study, named: NamedEffects, given: SimulatorOptions | None, effect: MapEffect
-) -> Tensor:
+def _of_all_pixels(found: Evidence, effect: MapEffect) -> Tensor:
     """Return the value of each cell from all pixels, shape (cells,), metres."""
-    observations = study.observations
-    camera = observations.recording.camera
-    others = replace(named, names=tuple(name for name in named.names if name != effect.name))
+    study, named = found.study, found.named
+    observations, camera = study.observations, study.observations.recording.camera
+    names = tuple(name for name in named.names if name != effect.name)
+    others = replace(found, named=replace(named, names=names))
     spread = FittedMap(study, effect, study.system.residual_of(named.columns)).prior_sd
     frames, usable = simulated_frames(observations.recording), observations.usable
     weights = torch.zeros(observations.num_frames, dtype=torch.float64)
     weights = weights.index_add(0, observations.frame, study.fit.weight)
     weights = weights / torch.bincount(observations.frame, minlength=len(weights)).clamp(min=1)
     states = twin_frames(
-        simulator_of(study, others, given),
+        others.simulator,
         observations.recording,
-        tool_from_camera=solution_of(study, others)[0],
+        tool_from_camera=others.tool_from_camera,
         reflectivity="pattern" if observations.amplitude is None else "from_recording",
         indices=frames,
     )
@@ -431,3 +429,166 @@ def _of_all_pixels(
             sums.index_add_(0, cell, left)
             total.index_add_(0, cell, weight.expand_as(left))
     return sums / (total + spread**-2)
+
+
+def sensor_of(found: Evidence, observables: Observables | None) -> SensorFile:
+    """Return the sensor that a diagnosis found: base terms, named effects, noise, missing pixels.
+
+    Args:
+        found: The final model.
+        observables: Noise and missing pixels of the recording; None: the sensor has neither.
+    """
+    study, model = found.study, found.study.fit.model
+    recording = study.observations.recording
+    own: list[CatalogueEffect] = [] if study.pattern is None else [study.pattern]
+    own += found.effects
+    entries = [effect.in_other_recordings().to_mapping() for effect in own]
+    error, remainder = given_error(found)
+    terms, error_model = model.options.with_columns().terms, copy.deepcopy(model.error_model)
+    error_model.set_coefficient_vector(found.coefficients + error)
+    sentences = [
+        f"{study.observations.num_units} poses, {recording.num_frames} frames.",
+        *([] if found.named.names else ["No effect beyond the error terms was found."]),
+    ]
+    if remainder > 1e-4:  # A tenth of the least gap that matters.
+        sentences.append(
+            f"The simulator under diagnosis makes an error of {1e3 * remainder:.1f} mm RMS that no "
+            "term or effect of this file holds."
+        )
+    return SensorFile(
+        format="tofcorr-sensor",
+        version=1,
+        title="A time-of-flight camera, as a diagnosis found it.",
+        measured_from=tuple(sentences),
+        camera=CameraOptions.of(recording.camera),
+        depth_kind=recording.depth_kind,
+        modulation_frequency_hz=recording.modulation_frequency,
+        tool_from_camera=cast(RigidTransform, tuple(map(tuple, found.tool_from_camera.tolist()))),
+        error=section_of(error_model, ErrorSection(reads="true_distance", terms=terms)),
+        effects=(*_given_effects(found), *entries),
+        **({} if observables is None else _sections(study, observables, own)),
+        validity=validity_of(model.domain),
+    )
+
+
+def _given_effects(found: Evidence) -> tuple[dict[str, Any], ...]:
+    return () if found.given is None else tuple(map(dict, found.given.effects))
+
+
+def given_error(found: Evidence) -> tuple[Tensor, float]:
+    """Return a given simulator's own error as coefficients of the base terms, and what is left.
+
+    Without a given simulator both are zero.
+
+    Returns:
+        Shape (K,), metres; root mean square of the rest, metres.
+    """
+    study = found.study
+    fit, observations = study.fit, study.observations
+    if fit.known is None:
+        return torch.zeros_like(fit.coefficients), 0.0
+    distance = predicted_distance(observations, fit.tool_from_camera)
+    columns = fit.model.error_columns(distance)
+    known = observations.measured - fit.residual - distance - columns @ fit.coefficients
+    for effect in build_effects(_given_effects(found)):
+        assert isinstance(effect, CatalogueEffect)
+        known = known - effect.shift(study.inputs, effect.coefficients)
+    root = fit.share.sqrt()[:, None]
+    solved = torch.linalg.lstsq(root * columns, root * known[:, None], driver="gelsd").solution
+    rest = known - columns @ solved[:, 0]
+    return solved[:, 0], float(((fit.share * rest**2).sum() / fit.share.sum()).sqrt())
+
+
+def _sections(
+    study: Study, observables: Observables, own: Sequence[CatalogueEffect]
+) -> dict[str, Any]:
+    """Return the sections of noise, missing pixels and light."""
+    pattern = any(isinstance(effect, MapEffect) for effect in own)
+    recording = study.observations.recording
+    if observables.seen.recording is not recording:  # Its planes were estimated with the rest.
+        observables = compare_observables(recording, None, seed=study.options.seed)
+    curve = observables.real_noise.curve
+    return {
+        # The fixed part may stand among the effects, pixel by pixel.
+        "noise": curve.with_fixed_share(0.0) if pattern else curve,
+        "dropouts": dropout_section(observables.real_dropouts.model, observables.seen),
+        "light": light_section(observables.seen),
+    }
+
+
+@dataclass(frozen=True)
+class FittedValue:
+    """One parameter of the final model.
+
+    Attributes:
+        cause: `hand_eye`, a group of the base model's terms, or an effect.
+        kind: `parameter` or `effect`.
+        name: Its symbol, as in sensor.yaml.
+        unit: As in sensor.yaml.
+        value: The estimate.
+        interval: 95 %, with poses as the unit; None for a map, of which the size is given.
+    """
+
+    cause: str
+    kind: str
+    name: str
+    unit: str
+    value: float
+    interval: Interval | None
+
+
+def fitted_values(found: Evidence, resamples: Tensor) -> tuple[FittedValue, ...]:
+    """Return hand-eye transform, coefficients of the base terms, and those of the named effects.
+
+    Args:
+        found: The final model.
+        resamples: How often each resample holds each pose, shape (B, U).
+    """
+    gram, score, prior = found.named.study.sums.ols.of(found.named.columns)
+    normal = torch.tensordot(resamples, gram, dims=1) + prior
+    draws = torch.linalg.solve(normal, (resamples @ score)[..., None])[..., 0]
+    values = []
+    thetas = torch.cat([found.theta[None], draws])
+    for cause, kind, name, unit, (value, *drawn) in _parameters(found, thetas):
+        known = bool(drawn) and all(map(math.isfinite, (value, *drawn)))
+        interval = interval_of(drawn, value) if known else None
+        values.append(FittedValue(cause, kind, name, unit, value, interval))
+    return tuple(values)
+
+
+def _parameters(
+    found: Evidence, thetas: Tensor
+) -> Iterator[tuple[str, str, str, str, list[float]]]:
+    """Yield cause, kind, name and unit of each parameter, its estimate, and those of resamples.
+
+    Args:
+        found: The final model.
+        thetas: The estimate of all columns and those of the resamples, shape (1 + B, K).
+    """
+    model, fit, given = found.study.fit.model, found.study.fit, given_error(found)[0]
+    if model.num_hand_eye:
+        poses = fit.tool_from_camera @ se3.exp(thetas[:, : model.num_hand_eye])
+        turns = torch.rad2deg(se3.log(poses)[:, 3:])
+        for place, axis in enumerate("xyz"):
+            shift = (1e3 * poses[:, place, 3]).tolist()
+            yield HAND_EYE, "parameter", f"tool_from_camera, {axis}", "mm", shift
+        for place, axis in enumerate("xyz"):
+            yield HAND_EYE, "parameter", f"rotation vector, {axis}", "deg", turns[:, place].tolist()
+    error, drawn = copy.deepcopy(model.error_model), []
+    for own in fit.coefficients + given + thetas[:, model.num_geometry : model.num_columns]:
+        error.set_coefficient_vector(own)
+        drawn.append(error.paper_coefficients())
+    for group, units in error.paper_units().items():
+        for name in drawn[0].get(group, ()):
+            yield group, "parameter", name, units[name], [one[group][name] for one in drawn]
+    start = found.named.study.sums.layout.base
+    for effect in found.effects:
+        if isinstance(effect, MapEffect):
+            size = float(effect.coefficients.square().mean().sqrt())
+            yield effect.name, "effect", "a value for each pixel, RMS", "m", [size]
+            continue
+        terms = effect.terms(effect.shape)
+        values = thetas[:, start : start + len(terms)] * effect.prior_sd()
+        for term, own in zip(terms, values.T.tolist(), strict=True):
+            yield effect.name, "effect", term.name, term.unit, own
+        start += len(terms)

@@ -34,8 +34,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.options import TestOptions
-from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.base_model import unknown_amplitude_columns
+from tofcorr.diagnosis.sums.base import BaseFit, unknown_amplitude_columns
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.pixels.dataset import in_threads
 from tofcorr.simulation.effects.inputs import EffectInputs

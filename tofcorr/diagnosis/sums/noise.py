@@ -173,7 +173,7 @@ def gap_weight(sigma: Tensor) -> Tensor:
 
 
 def common_of_neighbours(
-    observations: Observations, residual: Tensor, *, pixels: int = 32, most: float = 0.1
+    observations: Observations, residual: Tensor, *, most: float = 0.1
 ) -> Tensor:
     """Return what each residual has in common with equally bright neighbours, shape (M,), metres.
 
@@ -184,11 +184,11 @@ def common_of_neighbours(
     Args:
         observations: The pixels.
         residual: Of the pixels, shape (M,), metres.
-        pixels: Of a square. Chosen: a gross error of one pixel cannot move the median of 32.
         most: Largest common value, metres. Chosen.
     """
     camera, pixel = observations.recording.camera, observations.pixel
-    side = max(2, round((pixels / observations.density) ** 0.5))
+    # A gross error of one pixel cannot move the median of 32.
+    side = max(2, round((32 / observations.density) ** 0.5))
     across, down = (length // side + 1 for length in (camera.width, camera.height))
     tile = pixel // camera.width // side * across + pixel % camera.width // side
     group = observations.frame * (across * down) + tile
@@ -206,9 +206,7 @@ def _group_median(group: Tensor, values: Tensor) -> Tensor:
     return torch.empty_like(values).index_copy(0, order, middle[row])
 
 
-def robust_weights(
-    residual: Tensor, sigma: Tensor, common: Tensor | float = 0.0, *, huber: float = 4.0
-) -> Tensor:
+def robust_weights(residual: Tensor, sigma: Tensor, common: Tensor | float = 0.0) -> Tensor:
     """Return 1 for ordinary residuals, less for large ones and 0 for gross ones, shape (M,).
 
     The scale is at least the robust standard deviation of the residuals, so that an effect of
@@ -219,14 +217,14 @@ def robust_weights(
         sigma: Noise of the pixels, shape (M,), metres.
         common: What each pixel has in common with its neighbours, shape (M,), metres; it is
             subtracted first.
-        huber: Residuals beyond this many robust standard deviations get a weight that falls as 1 /
-            size (Huber). Chosen; it is reached by 1 in 16 000 normal residuals.
     """
     residual = residual - common
     ratio = residual / sigma
     typical = sigma_from_mad(float((ratio - ratio.median()).abs().median()))
     size = (residual - residual.median()).abs() / (sigma * max(typical, 1.0))
-    return torch.where(size > GROSS, 0.0, huber / size.clamp(min=huber))
+    # Beyond four standard deviations, as 1 in 16 000 normal residuals, the weight falls as 1 / size
+    # (Huber). Chosen.
+    return torch.where(size > GROSS, 0.0, 4.0 / size.clamp(min=4.0))
 
 
 def no_gross_error(values: np.ndarray) -> np.ndarray:

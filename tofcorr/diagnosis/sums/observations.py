@@ -1,7 +1,18 @@
-"""The pixels of a recording that a diagnosis uses, and what geometry predicts of them.
+r"""The pixels of a recording that a diagnosis uses, and what geometry predicts of them.
 
 Pixels are flattened frame by frame. Distances and other inputs of effects follow from poses, planes
 and the hand-eye transform.
+
+Planes that an importer found in the depth are nuisance parameters. An estimated plane has absorbed
+part of the camera's errors. The diagnosis therefore fits every such wall again, together with
+hand-eye transform and error terms, in the base fit, in each fold and beside each effect. A wall
+n . x + d = 0 has three parameters: two turns of its normal and a shift of d. For a point p, seen
+along the ray r, the predicted distance D changes by
+
+.. math:: \frac{\partial D}{\partial a} = -\frac{t \cdot p}{n \cdot r}, \quad
+          \frac{\partial D}{\partial d} = -\frac{1}{n \cdot r}
+
+with the normal's tangent vector t.
 """
 
 from collections.abc import Iterator
@@ -14,8 +25,11 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
+from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
+from tofcorr.fit.walls import name_walls
+from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance, tangents
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
 from tofcorr.simulation.hooks import FrameFacts
@@ -117,6 +131,20 @@ class Observations:
         # In memory one coordinate follows the other: elementwise operations are fastest so.
         return ray_directions(self.recording.camera).reshape(-1, 3).T[:, self.pixel].T
 
+    def per_pose(self, values: Tensor) -> Tensor:
+        """Return the sums of values (M,) over the pixels of each pose, shape (U,)."""
+        return torch.bincount(self.unit[self.frame], values, self.num_units)
+
+    def term_inputs(self, distance: Tensor) -> Pixels:
+        """Return what error terms depend on, at distances (M,), metres.
+
+        An amplitude that was not recorded is zero: no term reads it.
+        """
+        amplitude = torch.zeros_like(distance) if self.amplitude is None else self.amplitude
+        width, conditions = self.recording.camera.width, self.conditions[self.frame]
+        row, column = (self.pixel // width).double(), (self.pixel % width).double()
+        return Pixels(distance, amplitude, row, column, conditions)
+
     def products(self, left: Tensor, right: Tensor) -> Tensor:
         """Return the sums of products of values (M, J) and (M, K) over each pose, (U, J, K)."""
         sums = np.zeros((self.num_units, left.shape[1], right.shape[1]))
@@ -147,28 +175,22 @@ class Observations:
         Args:
             pixels: Which ones, in their order: a slice, or bool of shape (M,).
         """
-        return replace(
-            self,
-            frame=self.frame[pixels],
-            pixel=self.pixel[pixels],
-            measured=self.measured[pixels],
-            amplitude=None if self.amplitude is None else self.amplitude[pixels],
-        )
+        known = {name: getattr(self, name) for name in ("frame", "pixel", "measured", "amplitude")}
+        return replace(self, **{n: own[pixels] for n, own in known.items() if own is not None})
 
 
-def observe(recording: Recording, most_pixels: int, *, least_per_frame: int = 64) -> Observations:
+def observe(recording: Recording, most_pixels: int) -> Observations:
     """Read a recording and choose its pixels.
 
     Args:
         recording: What to diagnose.
-        most_pixels: More usable pixels are thinned out evenly, to the same places in all frames.
-        least_per_frame: Least number of pixels of a frame that are kept, however many frames there
-            are. Chosen.
+        most_pixels: More usable pixels are thinned out evenly, to the same places in all frames; 64
+            of a frame are kept, however many frames there are.
 
     Raises:
         CalibrationDataError: Fewer than two frames hold usable pixels.
     """
-    budget = max(least_per_frame, most_pixels // recording.num_frames)
+    budget = max(64, most_pixels // recording.num_frames)
     order = even_order(recording.camera.height, recording.camera.width)
     chosen, images, distances, masks = [], [], [], []
     for batch in iterate_frames(recording, image_dtype=torch.float32):
@@ -185,13 +207,12 @@ def observe(recording: Recording, most_pixels: int, *, least_per_frame: int = 64
             f"{recording.path}: a diagnosis needs at least two frames with usable pixels, "
             f"got {seen}."
         )
-    none = torch.empty(0, dtype=torch.int64)
     every = Observations(
         recording=recording,
         facts=facts_of(recording),
-        frame=none,
-        pixel=none,
-        measured=torch.empty(0, dtype=torch.float64),
+        frame=counts,
+        pixel=counts,
+        measured=counts,
         amplitude=None,
         amplitude_images=torch.cat(images) if images else None,
         distance_images=torch.cat(distances),
@@ -333,3 +354,75 @@ def predicted_images(
     """Return the distance of the plane in all pixels of some frames and rows; NaN where none."""
     normal, offset = (x[part] for x in _planes_in_camera(observations, tool_from_camera))
     return ray_plane_distance(ray_directions(observations.recording.camera)[rows], normal, offset)
+
+
+PER_WALL = 3
+"""Parameters of a wall: two turns, radians, and a shift, metres."""
+
+
+def with_numbered_walls(observations: Observations) -> Observations:
+    """Return the observations that know which wall each frame shows, where planes are estimated.
+
+    Recorded planes that were measured stay as they are: no wall is numbered. A wall has three
+    parameters, and one pose determines about three: fewer than three poses, as in training, tell
+    hardly anything but where the wall is.
+
+    Raises:
+        CalibrationDataError: The planes are estimated, and no robot moves, or a wall is seen from
+            fewer than three poses.
+    """
+    recording = observations.recording
+    if recording.planes != "estimated":
+        return observations
+    if not recording.moves:
+        raise CalibrationDataError(
+            f"{recording.path}: its planes are estimated from the depth (recording.yaml: planes) "
+            "and no robot moves: nothing but the depth itself says where they are. Measure them, "
+            "or import a checkerboard."
+        )
+    of_frame, names = name_walls(Dataset((recording,)))
+    wall = torch.from_numpy(of_frame)
+    seen = observations.frame.unique()
+    for number, name in enumerate(names):
+        poses = len(observations.unit[seen][wall[seen] == number].unique())
+        if poses < 3:
+            raise CalibrationDataError(
+                f"{recording.path}: its planes are estimated from the depth (recording.yaml: "
+                f"planes), and '{name}' is seen from {poses} pose{'s' * (poses != 1)}; 3 are "
+                "needed to estimate it anew. Record more, or leave its frames out."
+            )
+    return replace(observations, wall=wall, num_walls=len(names))
+
+
+def wall_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor:
+    """Return the derivative of the predicted distance by the G walls' parameters, (M, 3G)."""
+    wall, frame = observations.wall, observations.frame
+    assert wall is not None
+    _, slope, points = seen_points(observations, tool_from_camera)
+    across = by_frame(points, tangents(observations.facts.normal_world).mT, frame)
+    own = -torch.cat([across, torch.ones_like(across[:, :1])], dim=1) / slope[:, None]
+    shown = torch.nn.functional.one_hot(wall[frame], observations.num_walls)
+    return (shown[:, :, None] * own[:, None]).flatten(1)
+
+
+def with_walls_moved(observations: Observations, step: Tensor) -> Observations:
+    """Return the observations after a step (3G,) of the walls; recording and facts both follow."""
+    wall, facts = observations.wall, observations.facts
+    if wall is None:
+        return observations
+    change = step.reshape(-1, PER_WALL)[wall]
+    turned = facts.normal_world + (change[:, :2, None] * tangents(facts.normal_world)).sum(1)
+    normal = torch.nn.functional.normalize(turned, dim=1)
+    return with_planes(
+        observations, replace(facts, normal_world=normal, offset=facts.offset + change[:, 2])
+    )
+
+
+def with_planes(observations: Observations, facts: FrameFacts) -> Observations:
+    """Return the observations with the planes of other facts about the same frames."""
+    if observations.wall is None:
+        return observations
+    planes = {"normal_world": facts.normal_world, "offset": facts.offset}
+    table = replace(observations.recording.frames, **{k: v.numpy() for k, v in planes.items()})
+    recording = replace(observations.recording, frames=table)
+    return replace(observations, facts=replace(observations.facts, **planes), recording=recording)

@@ -4,18 +4,22 @@ Effects of the catalogue that the recording can test may be added to the base mo
 patterns of effects that the catalogue does not contain. A probe is never reported as a cause. Where
 one explains what no effect of the catalogue explains, the cause is unknown, and the probe describes
 its pattern.
+
+Calibration, estimated planes and other effects absorb a share of an effect. What planes absorb is
+said by name, and not judged where hardly anything remains.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import product
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.base import BaseFit
 from tofcorr.diagnosis.sums.linear_system import (
     LinearSystem,
     PoseSums,
@@ -30,7 +34,8 @@ from tofcorr.diagnosis.sums.observations import TINY, Observations
 from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.pixels.dataset import in_threads
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import testable
+from tofcorr.simulation.effects.inputs import MEASURED_PLANES, EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
 
 # Prior standard deviation of a probe, metres. Chosen.
@@ -44,26 +49,22 @@ class Probe:
     Attributes:
         name: For programs.
         trace: What it looks like: a clause that follows "It".
-        columns: Computes its columns, shape (M, K), metres at one prior standard deviation.
+        scaled_columns: Computes its columns, (M, K), metres at one prior standard deviation.
         part_of: Effects of the catalogue that may look like it.
     """
 
     name: str
     trace: str
-    columns: Callable[[EffectInputs], Tensor]
+    scaled_columns: Callable[[EffectInputs], Tensor]
     part_of: tuple[str, ...] = ()
 
 
 def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
     """Return the probes that a recording allows."""
+    maps, shape = ("fixed_pattern", "row_column_pattern"), "finer than the pixel effect"
     found = [
         Probe("frame_period", "repeats every few frames", _frame_period),
-        Probe(
-            "image_shape",
-            "has one shape in every image, finer than the pixel effect",
-            _map,
-            part_of=("fixed_pattern", "row_column_pattern"),
-        ),
+        Probe("image_shape", f"has one shape in every image, {shape}", _map, part_of=maps),
     ]
     if len(inputs.facts.timestamp) > 2:
         found.append(Probe("previous_frame", "depends on the previous frame", _previous_frame))
@@ -97,14 +98,11 @@ def _map(inputs: EffectInputs) -> Tensor:
     return torch.stack(columns, dim=-1)[number]
 
 
-def _previous_frame(inputs: EffectInputs, *, most_brighter: float = 20.0) -> Tensor:
+def _previous_frame(inputs: EffectInputs) -> Tensor:
     """Return the change since the previous frame, and the error by a tenth of its signal, metres.
 
-    That is added to the pixel's own.
-
-    Args:
-        inputs: The pixels.
-        most_brighter: Ratios of amplitudes are clamped here, so that dark pixels do not dominate.
+    That is added to the pixel's own. Ratios of amplitudes are clamped, so that dark pixels do not
+    dominate.
     """
     before = (inputs.frame - 1).clamp(min=0)
     assert inputs.distance_images is not None
@@ -115,7 +113,7 @@ def _previous_frame(inputs: EffectInputs, *, most_brighter: float = 20.0) -> Ten
         amplitude = inputs.amplitude_images.flatten(1)[before, inputs.pixel].double()
         share = torch.where(seen, amplitude, 0.0) / inputs.known_amplitude.clamp(min=TINY)
         phase = phase_from_radial_distance(distance, inputs.known_frequency) - inputs.phase
-        share = share.clamp(max=most_brighter) * torch.sin(phase)
+        share = share.clamp(max=20) * torch.sin(phase)
         columns.append(inputs.metres_per_radian / 10 * share)
     return torch.stack(columns, dim=-1)
 
@@ -144,9 +142,8 @@ class CandidateEffects:
 def candidate_effects(options: DiagnosisOptions, inputs: EffectInputs) -> CandidateEffects:
     """Return the effects asked for, sorted by how they are tested, and the probes."""
     wanted = options.catalogue if options.catalogue is not None else tuple(CATALOGUE)
-    wanted = [name for name in wanted if name not in options.leave_out]
-    missing = {name: wants for name in wanted if (wants := CATALOGUE[name].missing(inputs))}
-    known = {n: CATALOGUE[n].for_recording(inputs) for n in wanted if n not in missing}
+    kinds = {name: CATALOGUE[name] for name in wanted if name not in options.leave_out}
+    known, missing = testable(kinds, inputs)
     return CandidateEffects(
         effects={n: each for n, each in known.items() if not isinstance(each, MapEffect)},
         maps={n: each for n, each in known.items() if isinstance(each, MapEffect)},
@@ -251,7 +248,7 @@ def build_study(
     signs = draw_signs(tests.flips, num_units, generator)
     candidates = candidate_effects(options, inputs)
     sources = {**candidates.effects, **candidates.probes}
-    found = in_threads(partial(_scaled_columns, inputs), sources.values())
+    found = in_threads(lambda source: source.scaled_columns(inputs), sources.values())
     system = linear_system(observations, fit, inputs, dict(zip(sources, found, strict=True)))
     study = Study(
         options=options,
@@ -271,11 +268,6 @@ def build_study(
     energy = gls.gram.diagonal(dim1=1, dim2=2)[:, gls.layout.of(few)[base:]].sum(1)
     filtered = max(fit.shared.share.values()) > 0
     return replace(study, tiles=cut_into_tiles(observations, energy, tests, generator, filtered))
-
-
-def _scaled_columns(inputs: EffectInputs, source: CatalogueEffect | Probe) -> Tensor:
-    columns = source.columns(inputs)
-    return columns if isinstance(source, Probe) else columns * source.prior_sd()
 
 
 def absent_forms(study: Study) -> list[str]:
@@ -336,7 +328,7 @@ def without_map(study: Study, values: Tensor, spent: Collection[str]) -> Study:
     return replace(changed, candidates=replace(study.candidates, maps=maps))
 
 
-def relinearised(study: Study, names: Sequence[str], *, most_linearisations: int = 3) -> Study:
+def relinearised(study: Study, names: Sequence[str]) -> Study:
     """Return the study with effects of the model linearised at their fitted coefficients.
 
     Columns are derivatives at zero. Mixed or saturated signals are not linear in their strength.
@@ -347,8 +339,6 @@ def relinearised(study: Study, names: Sequence[str], *, most_linearisations: int
     Args:
         study: The recording.
         names: Effects of the model.
-        most_linearisations: Most linearisations of effects that are not linear; the second or third
-            changes nothing any more.
     """
     effects = study.candidates.effects
     bent = [name for name in names if name in effects and not effects[name].linear]
@@ -358,7 +348,7 @@ def relinearised(study: Study, names: Sequence[str], *, most_linearisations: int
         return float((study.fit.share * study.system.residual_of(names) ** 2).sum())
 
     best, best_loss, current = study, loss(study), study
-    for _ in range(most_linearisations if bent else 0):
+    for _ in range(3 if bent else 0):  # The second or third changes nothing any more.
         ols, residual, changed = current.sums.ols, study.system.residual, dict[str, Tensor]()
         theta, places = ols.solve(names), ols.layout.only(names).effects
         for name in bent:
@@ -372,3 +362,127 @@ def relinearised(study: Study, names: Sequence[str], *, most_linearisations: int
             break
         best, best_loss = current, loss(current)
     return best
+
+
+# If calibration leaves less than this share of an effect, its overlap with other effects is not
+# computed: it would be a quotient of two rounding errors. Chosen.
+_NOTHING_LEFT = 0.005
+
+
+def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float:
+    """Return the share of an effect's signal that base model and other effects absorb.
+
+    The share is averaged over the effect's prior. 1 means that nothing of it can be observed.
+    """
+    layout = study.sums.layout
+    total, left = signal(study, name), _left(study, name, layout.of(others))
+    return float(np.clip(1.0 - left / total, 0.0, 1.0)) if total > 0 else 1.0
+
+
+def signal(study: Study, name: str) -> float:
+    """Return the sum of an effect's squares, averaged over its prior."""
+    low, high = study.sums.layout.effects[name]
+    return float(study.sums.ols.total.diagonal()[low:high].sum())
+
+
+def _left(study: Study, name: str, members: Tensor) -> float:
+    """Return what regression on columns (K,) leaves of an effect, averaged over its prior."""
+    ols, own = study.sums.ols, torch.arange(*study.sums.layout.effects[name])
+    return float(left_over(ols.total, members, own, ols.layout.prior_of(members)).trace())
+
+
+def left_over(gram: Tensor, members: Tensor, own: Tensor, prior: Tensor) -> Tensor:
+    """Return the Gram matrix of an effect after regression on other columns, a Schur complement.
+
+    Args:
+        gram: Of all columns, one or many, shape (..., P, P).
+        members: Numbers of the other columns, shape (K,).
+        own: Numbers of the effect's columns, shape (E,).
+        prior: Prior precision of the other coefficients, shape (K, K).
+    """
+    inner, cross = gram[..., members[:, None], members] + prior, gram[..., members[:, None], own]
+    return gram[..., own[:, None], own] - cross.mT @ torch.linalg.solve(inner, cross)
+
+
+def absorption_table(study: Study) -> np.ndarray:
+    """Return what calibration and every other effect absorb of every effect with columns.
+
+    Returns:
+        The share of each effect (row) that base model and hand-eye transform absorb, then of what
+        remains the share that each other effect (column) absorbs; NaN of itself and where nothing
+        remains. Shape (E, 1 + E).
+    """
+    names = tuple(study.candidates.effects)
+    table = np.full((len(names), 1 + len(names)), np.nan)
+    for row, name in enumerate(names):
+        own = table[row, 0] = absorbed_share(study, name)
+        for column, other in enumerate(names, start=1):
+            if other != name and 1 - own > _NOTHING_LEFT:
+                table[row, column] = (absorbed_share(study, name, [other]) - own) / (1 - own)
+    return table
+
+
+def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor]:
+    """Return the coefficients of chosen effects in their own units, by name."""
+    known = [name for name in chosen if name in study.candidates.effects]
+    theta, effects = study.sums.ols.solve(known), study.candidates.effects
+    parts = theta[study.sums.layout.base :].split([len(effects[n].coefficients) for n in known])
+    return {n: own * effects[n].prior_sd() for n, own in zip(known, parts, strict=True)}
+
+
+def without_absorbed(
+    study: Study, *, not_judged: float = 0.95, worth_saying: float = 0.5
+) -> tuple[Study, list[str]]:
+    """Return the study without the effects that estimated planes absorb, and a warning.
+
+    The effects left out are among `missing`: they need measured planes. A study of measured planes
+    stays as it is.
+
+    Args:
+        study: The recording.
+        not_judged: An effect is not judged if estimated planes absorb more than this share of what
+            measured planes would leave of it: a twentieth of an effect looks like others. Chosen.
+        worth_saying: Above this share a warning names the effect. Chosen: its smallest detectable
+            size has grown by more than a factor of 1.4.
+    """
+    if not study.observations.num_walls:
+        return study, []
+    shares = {name: absorbed_by_planes(study, name) for name in study.candidates.effects}
+    hidden = [name for name, share in shares.items() if share > not_judged]
+    if hidden:
+        # Drawn again from the same seed.
+        options = study.options
+        fewer = options.model_copy(update={"leave_out": (*options.leave_out, *hidden)})
+        generator = torch.Generator().manual_seed(options.seed)
+        again = build_study(fewer, study.observations, study.fit, study.inputs, generator)
+        wants = {name: [MEASURED_PLANES.words] for name in hidden}
+        candidates = replace(again.candidates, missing={**again.candidates.missing, **wants})
+        study = replace(again, options=options, candidates=candidates)
+    partly = [
+        f"{name} ({100 * share:.0f} %)"
+        for name, share in shares.items()
+        if worth_saying < share <= not_judged
+    ]
+    return study, [_warning(study, partly)]
+
+
+def _warning(study: Study, partly: Sequence[str]) -> str:
+    count, missing = study.observations.num_walls, study.candidates.missing
+    unjudged = [name for name, wants in missing.items() if MEASURED_PLANES.words in wants]
+    planes = "plane of 1 wall is" if count == 1 else f"planes of {count} walls are"
+    sentence = f"The {planes} estimated together with the base model (recording.yaml: planes)."
+    if unjudged:
+        sentence += f" Not judged, because measured planes are needed: {', '.join(unjudged)}."
+    if partly:
+        sentence += f" Estimated planes absorb a large share of {', '.join(partly)}."
+    return sentence
+
+
+def absorbed_by_planes(study: Study, name: str) -> float:
+    """Return the share that estimated planes absorb of what measured planes would leave."""
+    model, everything = study.fit.model, torch.arange(study.sums.layout.base)
+    planes = (everything >= model.num_hand_eye) & (everything < model.num_geometry)
+    measured = _left(study, name, everything[~planes])
+    if measured <= _NOTHING_LEFT * signal(study, name):
+        return 0.0
+    return 1.0 - _left(study, name, everything) / measured

@@ -136,6 +136,10 @@ class CatalogueEffect(Effect, ABC):
         """Return the effect's columns in a linear fit, shape (M, K), metres: `slope` at zero."""
         return self.slope(inputs, torch.zeros_like(self.coefficients))
 
+    def scaled_columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the columns at one prior standard deviation, shape (M, K), metres."""
+        return self.columns(inputs) * self.prior_sd()
+
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the derivative of `shift` by the coefficients (K,), shape (M, K), metres."""
         return by_parameters(lambda at: self.shift(inputs, at), coefficients)
@@ -161,6 +165,15 @@ class CatalogueEffect(Effect, ABC):
         names = [term.name for term in self.terms(self.shape)]
         values = dict(zip(names, self.coefficients.tolist(), strict=True))
         return {"name": self.name, **self.shape.to_mapping(), **values}
+
+
+def testable(
+    kinds: Mapping[str, type[CatalogueEffect]], inputs: EffectInputs
+) -> tuple[dict[str, CatalogueEffect], dict[str, list[str]]]:
+    """Return the effects that a recording can test, and what it lacks for each of the others."""
+    missing = {name: wants for name, kind in kinds.items() if (wants := kind.missing(inputs))}
+    known = {n: kind.for_recording(inputs) for n, kind in kinds.items() if n not in missing}
+    return known, missing
 
 
 class LinearEffect(CatalogueEffect):

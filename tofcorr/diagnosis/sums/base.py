@@ -1,39 +1,285 @@
-"""Fits the base model in the forward form: robustly, from several starts.
+r"""The base model: hand-eye transform, estimated walls, constant and error terms; and its fit.
 
-A simulator under diagnosis already makes an error; it is split from the geometry and known to the
-fit. Where a camera filters its images and neighbours share noise, effects that mix neighbouring
-pixels of measured images would explain the noise of the very pixel whose error is to be explained:
-they look at images without it.
+Where no amplitude was recorded, an error that depends on it would pass for another effect:
+wiggling, incidence, pixel, lens. The amplitude of a uniform target follows from geometry and
+exposure,
+
+.. math:: b = \tau \cos\theta / D^2 ,
+
+up to its reflectivity and the vignetting. The columns b, b^2 and b r^2, for each target, with r the
+distance from the image centre, are therefore part of the base model. What looks like them is not
+named. What differs within a target, as between the squares of a checkerboard, stays in the
+residual.
+
+The fit is robust and in the forward form, from several starts. A simulator under diagnosis already
+makes an error; it is split from the geometry and known to the fit. Where a camera filters its
+images and neighbours share noise, effects that mix neighbouring pixels of measured images would
+explain the noise of the very pixel whose error is to be explained: they look at images without it.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.base_model import BaseModel, with_planes
+from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.sums.noise import (
     PixelNoise,
     brightness_of,
     common_of_neighbours,
     estimate_noise,
     gap_weight,
+    inverse_square,
     robust_weights,
     with_residuals,
 )
 from tofcorr.diagnosis.sums.observations import (
+    PER_WALL,
     Observations,
     frame_chunks,
+    hand_eye_columns,
     predicted_distance,
     predicted_images,
+    wall_columns,
+    with_planes,
+    with_walls_moved,
 )
 from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, whole_images
+from tofcorr.error_terms.base import Domain, Term
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.regularisation import penalties_of
+from tofcorr.fit.fitting import fit
+from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.spread import sigma_from_mad
+
+
+def unknown_amplitude_columns(
+    observations: Observations, inputs: EffectInputs, *, amplitude_error: float = 0.02
+) -> Tensor:
+    """Return the columns, shape (M, K), metres at one prior standard deviation.
+
+    K is 0 where the amplitude is known.
+
+    Args:
+        observations: The pixels.
+        inputs: What effects may depend on.
+        amplitude_error: Prior standard deviation of the error at the root mean square of a column,
+            metres. Lindner and Kolb (2007) and Fuchs and May (2007) report errors of one to three
+            centimetres by amplitude.
+    """
+    if inputs.amplitude is not None:
+        return torch.zeros(len(inputs.pixel), 0, dtype=torch.float64)
+    bright = inputs.incidence_cosine * inverse_square(inputs.radial_distance)
+    exposure = inputs.facts.integration_time
+    if exposure is not None and bool((exposure > 0).all()):
+        bright = bright * inputs.of_frame(exposure / exposure.mean())
+    bright = bright / bright.square().mean().sqrt()
+    forms = torch.stack([bright, bright**2, bright * (inputs.rows**2 + inputs.columns**2)], dim=1)
+    forms = amplitude_error * forms / forms.square().mean(0).sqrt()
+    # Four targets at most get columns of their own; all frames of rarer ones share the last.
+    names = list(observations.recording.frames.target)
+    common = sorted(set(names), key=lambda name: (-names.count(name), name))
+    target = inputs.of_frame(torch.tensor([min(common.index(name), 3) for name in names]))
+    return torch.cat([forms * (target == k)[:, None] for k in target.unique()], dim=1)
+
+
+def definite_base(
+    recording: Recording, base: ErrorModelOptions
+) -> tuple[ErrorModelOptions, list[str]]:
+    """Return the terms that the recording can support, with every `auto` replaced, and warnings.
+
+    Amplitude terms are left out, with a warning, where no amplitude was recorded. What else says
+    `auto`, a smoothness or a time constant, is determined by the fit of `tofcorr train`. The spread
+    of a fixed pattern stays open: it is estimated from the residual of the base fit.
+
+    Args:
+        recording: The recording under diagnosis.
+        base: The terms asked for.
+
+    Raises:
+        CalibrationDataError: The recording lacks what another term needs; names the term.
+    """
+    warnings, kept = [], tuple(term for term in base.terms if "amplitude" not in term.needs)
+    if recording.amplitude is None and len(kept) < len(base.terms):
+        dropped = ", ".join(term.kind for term in base.terms if term not in kept)
+        warnings = [
+            f"{recording.path}: amplitude.npy is missing; the base model has no amplitude term "
+            f"({dropped} left out). An error that depends on the amplitude cannot be named. What "
+            "could be one, by distance, incidence, exposure and place in the image, is not counted "
+            "for other effects; on a patterned target it also raises the noise floor, an upper "
+            "bound therefore."
+        ]
+        base = ErrorModelOptions(terms=kept)
+    dataset, columns = Dataset((recording,)), base.with_columns()
+    refuse_missing_inputs(dataset, base)
+    if not any(term.is_open(option) for term in columns.terms for option in term.found_in_data):
+        return base, warnings
+    frames = np.arange(dataset.num_frames)
+    found = fit(dataset, frames, FitOptions(model=columns), covered_domain(dataset, frames))
+    definite = iter(found.options.terms)
+    terms = tuple(next(definite) if term.has_columns else term for term in base.terms)
+    return ErrorModelOptions(terms=terms), warnings
+
+
+def supported_base(
+    recording: Recording, base: ErrorModelOptions
+) -> tuple[ErrorModelOptions, list[str]]:
+    """Return the terms whose inputs a recording has, and the kinds of the others."""
+    dataset, kept, lacking = Dataset((recording,)), [], []
+    for term in base.terms:
+        try:
+            refuse_missing_inputs(dataset, ErrorModelOptions(terms=(term,)))
+        except CalibrationDataError:
+            lacking.append(term.kind)
+        else:
+            kept.append(term)
+    return ErrorModelOptions(terms=tuple(kept)), lacking
+
+
+class BaseModel:
+    """Hand-eye transform, estimated walls and error model, linear around a start.
+
+    The walls are where the observations have them. Measured planes are no part of the model.
+
+    Args:
+        observations: The recording; its ranges scale the variables of the error terms.
+        options: Terms of the error model; a fixed pattern among them has no columns here.
+        hand_eye_free: Whether the hand-eye transform is estimated.
+
+    Attributes:
+        domain: The ranges of the recording's variables.
+
+    Class attributes:
+        hand_eye_sd: Prior standard deviations of the hand-eye transform, metres and radians.
+        wall_sd: The same of an estimated wall: two turns, radians, and a shift, metres.
+        error_sd: The same of the coefficients of error terms, metres. All are chosen so wide that
+            they matter only in directions without data.
+
+    Raises:
+        CalibrationDataError: The recording lacks what a term needs.
+    """
+
+    hand_eye_sd: ClassVar = (0.3, 0.3, 0.3, 0.5, 0.5, 0.5)
+    wall_sd: ClassVar = (0.5, 0.5, 0.3)
+    error_sd: ClassVar = 1.0
+
+    def __init__(
+        self, observations: Observations, options: ErrorModelOptions, *, hand_eye_free: bool
+    ) -> None:
+        self.observations, self.options = observations, options
+        self.hand_eye_free = hand_eye_free
+        self.domain = domain_of(observations)
+        self.error_model = ErrorModel(options, self.domain)
+
+    def on(self, observations: Observations) -> "BaseModel":
+        """Return the same model, scaled alike, on other pixels or walls."""
+        other = copy(self)
+        other.observations = observations
+        return other
+
+    @property
+    def terms(self) -> list[Term]:
+        """All terms with columns, in their order."""
+        return self.error_model.terms()
+
+    @property
+    def groups(self) -> set[str]:
+        """Groups of the terms, as in `Term.group`."""
+        return {term.group for term in self.terms}
+
+    @property
+    def num_hand_eye(self) -> int:
+        """Number of columns of the hand-eye transform."""
+        return 6 if self.hand_eye_free else 0
+
+    @property
+    def num_geometry(self) -> int:
+        """Number of columns of hand-eye transform and estimated walls; they come first."""
+        return self.num_hand_eye + PER_WALL * self.observations.num_walls
+
+    @property
+    def num_columns(self) -> int:
+        """Number of columns."""
+        return self.num_geometry + len(self.error_model.symbols())
+
+    def moved(self, step: Tensor) -> "BaseModel":
+        """Return the model after a step of the geometry columns, with its walls moved."""
+        walls = step[self.num_hand_eye : self.num_geometry]
+        return self.on(with_walls_moved(self.observations, walls))
+
+    def prior_precision(self, total_weight: float) -> Tensor:
+        r"""Return the precision of the coefficients' priors, with curves held smooth, (K, K).
+
+        To the diagonal of their variances comes :math:`\sum \lambda F^T F`: a strength weighs
+        roughness against the mean square, as in training.
+
+        Args:
+            total_weight: Sum of the weights of the residuals.
+        """
+        hand_eye = self.hand_eye_sd[: self.num_hand_eye]
+        walls = self.wall_sd * self.observations.num_walls
+        sd = [*hand_eye, *walls, *[self.error_sd] * (self.num_columns - self.num_geometry)]
+        matrix = torch.diag(torch.tensor(sd, dtype=torch.float64) ** -2)
+        for penalty in penalties_of(self.error_model):
+            roughness = penalty.factor.T @ penalty.factor
+            matrix[self.num_geometry :, self.num_geometry :].add_(
+                roughness, alpha=total_weight * float(penalty.strength)
+            )
+        return matrix
+
+    def error_columns(self, distance: Tensor) -> Tensor:
+        """Return constant and terms at predicted distances (M,), metres, shape (M, K)."""
+        return self.error_model.columns_at(self.observations.term_inputs(distance)).detach().T
+
+    def residual(self, tool_from_camera: Tensor, coefficients: Tensor) -> Tensor:
+        """Return measured less fitted distance with coefficients of the terms, (M,), metres."""
+        distance = predicted_distance(self.observations, tool_from_camera)
+        error = self.error_columns(distance) @ coefficients
+        return self.observations.measured - distance - error
+
+    def columns(self, tool_from_camera: Tensor) -> Tensor:
+        """Return all columns around a hand-eye transform (4, 4), shape (M, K)."""
+        return self.linearised(tool_from_camera)[1]
+
+    def linearised(self, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the predicted distance, (M,), metres, and all columns, (M, K)."""
+        observations, parts = self.observations, []
+        distance, columns = hand_eye_columns(observations, tool_from_camera)
+        if self.hand_eye_free:
+            parts.append(columns)
+        if observations.num_walls:
+            parts.append(wall_columns(observations, tool_from_camera))
+        # Rows (K, M) are filled several times faster than columns.
+        return distance, torch.cat([part.T for part in (*parts, self.error_columns(distance))]).T
+
+
+def domain_of(observations: Observations, outside_share: float = 0.0005) -> Domain:
+    """Return the ranges of the recording's variables.
+
+    Args:
+        observations: The pixels.
+        outside_share: Share of the values below and above a range, so that single gross errors do
+            not stretch it. Chosen; training takes 0.001.
+    """
+    recording = observations.recording
+    return domain_from(
+        recording.camera,
+        observations.measured,
+        observations.amplitude,
+        recording.modulation_frequency,
+        observations.conditions,
+        outside_share=outside_share,
+        method="nearest",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,12 +315,8 @@ class SimulatorError:
 
     def at(self, pixels: Tensor | slice) -> "SimulatorError":
         """Return the same at some of the pixels."""
-        return replace(
-            self,
-            error=self.error[pixels],
-            sigma=self.sigma[pixels],
-            uncertain=self.uncertain[pixels],
-        )
+        of_pixels = ("error", "sigma", "uncertain")
+        return replace(self, **{name: getattr(self, name)[pixels] for name in of_pixels})
 
     def residual(self, observations: Observations) -> Tensor:
         """Return measured less simulated distance, the simulator as given, shape (M,), metres."""

@@ -14,8 +14,13 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base_fit import SimulatorError, fit_base
-from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, supported_base
+from tofcorr.diagnosis.sums.base import (
+    BaseModel,
+    SimulatorError,
+    definite_base,
+    fit_base,
+    supported_base,
+)
 from tofcorr.diagnosis.sums.gains import FittedMap
 from tofcorr.diagnosis.sums.observations import (
     TINY,

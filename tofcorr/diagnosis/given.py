@@ -1,0 +1,433 @@
+"""A simulator that a user named: options of the built-in one, or frames that any other rendered.
+
+Options are run without noise at the recording's poses. Frames are written as a recording, or
+returned by a Python function; each frame of the recording is compared with the renders that show
+what it shows. Frames that cannot be compared, or whose geometry is not what they say, are refused.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from scipy.spatial.distance import cdist
+from torch import Tensor
+
+from tofcorr.conditions import CONDITIONS
+from tofcorr.data.arrays import IMAGE_ARRAYS
+from tofcorr.data.recording import (
+    HEADER_FILE,
+    Recording,
+    planes_in_tool,
+)
+from tofcorr.data.table import UNIT_LENGTH_TOLERANCE
+from tofcorr.diagnosis.elsewhere import simulated_elsewhere
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.rerun.simulator import twin_distance
+from tofcorr.diagnosis.sums.base import SimulatorError
+from tofcorr.diagnosis.sums.noise import PixelNoise, brightness_of, estimate_noise
+from tofcorr.diagnosis.sums.observations import TINY, Observations, observe, predicted_distance
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry import se3
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.plausibility.alignment import Alignment, judged
+from tofcorr.plausibility.checks.geometry import agreement
+from tofcorr.plausibility.look import Look
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.simulator import default_hand_eye
+
+SimulatorKind = Literal["given", "rendered", "fitted"]
+"""`given`: options of the built-in simulator; `rendered`: frames of any other; `fitted`: none was
+named, so that a simulator is fitted to the recording."""
+
+
+class GivenSimulator:
+    """A simulator that a user named.
+
+    Args:
+        options: Of the built-in simulator; None where another one rendered frames.
+        frames: These frames; their hand-eye transform and planes are exact.
+    """
+
+    def __init__(
+        self, options: SimulatorOptions | None = None, frames: Recording | None = None
+    ) -> None:
+        self.options, self.frames = options, frames
+
+    @property
+    def kind(self) -> SimulatorKind:
+        """What `diagnosis.json` calls it."""
+        return "rendered" if self.options is None else "given"
+
+    def simulate(self, observations: Observations, options: DiagnosisOptions) -> SimulatorError:
+        """Return the error that the simulator makes in the chosen pixels of a recording.
+
+        Raises:
+            CalibrationDataError: The simulator cannot be compared with the recording.
+        """
+        if self.options is None:
+            assert self.frames is not None
+            return rendered_error(self.frames, observations, options)
+        pose = default_hand_eye(self.options, observations.recording)
+        distance = twin_distance(observations, self.options, pose)
+        return SimulatorError.exact(distance - predicted_distance(observations, pose), pose)
+
+
+Simulator = SimulatorOptions | Mapping[str, Any] | Path | str | Recording | Callable[..., Any]
+"""All that `diagnose` accepts as a simulator."""
+
+
+def open_simulator(sim: Simulator | None, recording: Recording) -> GivenSimulator | None:
+    """Return the simulator that `sim` names; None for None.
+
+    Args:
+        sim: The name of a shipped configuration, a YAML file, keys and values or options of the
+            built-in simulator; a recording that any simulator rendered, or its folder; or a
+            function from a recording to frames at its poses.
+        recording: The real recording.
+
+    Raises:
+        ConfigError: There is no such configuration, a key is unknown, or it is something else, such
+            as an array.
+        CalibrationDataError: The folder is not a recording, or the function does not return frames
+            of the recording's shape.
+    """
+    if sim is None:
+        return None
+    if isinstance(sim, Recording):
+        return GivenSimulator(frames=sim)
+    if isinstance(sim, str | Path) and Path(sim).is_dir():
+        if not (Path(sim) / HEADER_FILE).exists():
+            raise ConfigError(
+                f"{sim}: a simulator is a YAML file, the name of a shipped configuration, or the "
+                f"folder of a recording; this folder has no {HEADER_FILE}."
+            )
+        return GivenSimulator(frames=Recording.open(sim))
+    if callable(sim):
+        return GivenSimulator(frames=frames_of(sim(recording), recording))
+    if not isinstance(sim, SimulatorOptions | Mapping | str | Path):
+        raise ConfigError(
+            "sim: expected a shipped name, a file, options, a recording or a function, got "
+            f"{type(sim).__name__}. Frames in memory are handed over by a function: "
+            "sim=lambda recording: frames."
+        )
+    return GivenSimulator(resolve_options(SimulatorOptions, sim))
+
+
+def frames_of(returned: Any, recording: Recording) -> Recording:  # noqa: ANN401 - checked here
+    """Check what a function returned for a recording; return it as a recording in memory.
+
+    Args:
+        returned: Depth in metres, an array (N, H, W), of the recording's own kind, NaN or 0 where
+            there is none; or a mapping with `depth` and optionally `amplitude` (N, H, W) and
+            `tool_from_camera` (4, 4). Without the last the hand-eye transform of the recording is
+            taken to be the simulator's.
+        recording: The real recording.
+
+    Raises:
+        CalibrationDataError: It does not have the shape of the recording.
+    """
+    given = dict(returned) if isinstance(returned, Mapping) else {"depth": returned}
+    if "depth" not in given or not given.keys() <= {"depth", "amplitude", "tool_from_camera"}:
+        raise CalibrationDataError(
+            "The simulator must return an array of depth, or a mapping with 'depth' and optionally "
+            "'amplitude' and 'tool_from_camera'; it returned "
+            f"{', '.join(map(str, given)) or 'nothing'}."
+        )
+    source = Path("the frames that the function returned")
+    images = (recording.num_frames, recording.camera.height, recording.camera.width)
+    checked: dict[str, Any] = {"amplitude": None}
+    for name, values in given.items():
+        of_pose = name == "tool_from_camera"
+        shape, number = ((4, 4), np.float64) if of_pose else (images, np.float32)
+        try:
+            checked[name] = np.asarray(values, dtype=number)
+            found = str(checked[name].shape)
+        except (TypeError, ValueError, RuntimeError) as error:
+            # Of a tensor that has a gradient, or lies on a GPU, torch says what to call first.
+            found = f"{type(values).__name__} ({error})"
+        if found != str(shape):
+            raise CalibrationDataError(
+                f"The simulator's {name} must be numbers of the recording's shape {shape}, got "
+                f"{found}."
+            )
+        if not of_pose:
+            IMAGE_ARRAYS[name].check(checked[name], range(recording.num_frames), source)
+            continue
+        try:
+            se3.refuse_unless_rigid(checked[name], UNIT_LENGTH_TOLERANCE)
+        except ValueError as error:
+            raise CalibrationDataError(f"The simulator's tool_from_camera: {error}.") from None
+        checked[name] = se3.nearest_rigid(checked[name])
+    return replace(
+        recording,
+        path=source,
+        saturation_amplitude=None,
+        raw=None,
+        true_depth=None,
+        planes="recorded",
+        **checked,
+    )
+
+
+# A frame was rendered at the pose of a recorded one if tool and target differ by no more than this:
+# metres for the position of the tool and the distance of the target's plane, radians for the turn
+# of either. Chosen: geometry is corrected for the difference, and errors of a camera hardly change.
+_TOLERANCE = 1e-3
+# Frames within this share of the tolerance of the nearest one are renders of one pose. Chosen: what
+# the rounding of a text file leaves.
+_SAME_POSE = 0.01
+# Relative difference of two equal values of a condition. Chosen: the rounding of a text file.
+_SAME_CONDITION = 1e-5
+
+
+def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
+    """Find the renders of each recorded frame: the nearest pose, the same target and conditions.
+
+    Several renders of one pose all count. A target, a time or another condition chooses among them
+    where some of them agree with the recorded frame.
+
+    Args:
+        real: The recording.
+        simulated: The rendered frames, in any order.
+    """
+    away = np.max([cdist(*pair) for pair in zip(_places(real), _places(simulated), strict=True)], 0)
+    found = away <= np.minimum(away.min(1, keepdims=True) + _SAME_POSE, 1.0)
+    alike = [real.frames.target[:, None] == simulated.frames.target]
+    for name in CONDITIONS:
+        own, others = (getattr(recording.frames, name) for recording in (real, simulated))
+        if own is not None and others is not None:
+            limit = _SAME_CONDITION * np.abs(own[:, None])
+            alike.append(np.abs(others - own[:, None]) <= limit)
+    for same in alike:
+        found = np.where((found & same).any(1, keepdims=True), found & same, found)
+    return [torch.from_numpy(np.flatnonzero(row)) for row in found]
+
+
+def _places(recording: Recording) -> list[np.ndarray]:
+    """Return position and turn of the tool, and normal and distance of the plane there, (F, ...).
+
+    Unit: the tolerance.
+    """
+    pose = recording.frames.world_from_tool
+    normal, offset = (values.numpy() for values in planes_in_tool(recording))
+    # A turn by a small angle changes a rotation matrix by sqrt(2) times the angle.
+    turn = pose[:, :3, :3].reshape(-1, 9) / np.sqrt(2)
+    return [part / _TOLERANCE for part in (pose[:, :3, 3], offset[:, None], turn, normal)]
+
+
+def repeats_of(recording: Recording) -> np.ndarray:
+    """Return a number for each frame without a pose_id; renders of one pose share it, (F,)."""
+    table = recording.frames
+    _, target = np.unique(table.target, return_inverse=True)
+    rows = [np.round(np.concatenate(_places(recording), axis=1) / _SAME_POSE), target[:, None]]
+    if table.integration_time is not None:
+        rows.append(np.round(np.log(table.integration_time) / _SAME_CONDITION)[:, None])
+    keys = np.nan_to_num(np.concatenate(rows, axis=1), nan=-1.0)
+    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def rendered_error(
+    rendered: Recording, observations: Observations, options: DiagnosisOptions
+) -> SimulatorError:
+    """Compare frames pixel by pixel at the same poses; at others, through the covariates.
+
+    Args:
+        rendered: The frames; their hand-eye transform and their planes are exact.
+        observations: Of the real recording.
+        options: Of the diagnosis.
+
+    Raises:
+        CalibrationDataError: The frames cannot be compared with the recording.
+    """
+    refuse_other_camera(observations.recording, rendered)
+    frames = observe(rendered, options.most_pixels)
+    if rendered.frames.pose_id is None:
+        frames = replace(frames, unit=torch.from_numpy(repeats_of(rendered)))
+    if rendered.true_depth is None:
+        refuse_without_truth(rendered, frames)
+        refuse_mistaken_geometry(rendered)
+    pose = torch.from_numpy(rendered.tool_from_camera)
+    noise = estimate_noise(frames, pose)
+    matches = match_frames(observations.recording, rendered)
+    # Where half of the recorded frames have no render, renders of other poses say more.
+    missing = sum(len(found) == 0 for found in matches)
+    if missing > len(matches) / 2:
+        return simulated_elsewhere(frames, observations, options)
+    error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
+    known = SimulatorError.exact(error, pose, sigma)
+    if not missing:
+        return known
+    limit = (
+        f"{rendered.path}: {missing} of {len(matches)} recorded frames were not "
+        "rendered (no pose within 1 mm and 1 mrad); they are left out."
+    )
+    return replace(known, limits=(limit,))
+
+
+def _pixel_by_pixel(
+    frames: Observations, noise: PixelNoise, matches: Sequence[Tensor], real: Observations
+) -> tuple[Tensor, Tensor]:
+    """Return the mean error of the renders in each chosen pixel, and its standard deviation, (M,).
+
+    The truth of a render is the plane at the render's own pose, so that a pose that was rounded
+    differently changes nothing.
+    """
+    pose = torch.from_numpy(frames.recording.tool_from_camera)
+    row, source = [], []
+    for renders, (start, end) in zip(matches, real.frame_ends, strict=True):
+        row.append(torch.arange(start, end).repeat(len(renders)))
+        source.append(renders.repeat_interleave(end - start))
+    row = torch.cat(row)
+    seen = frames.choosing(torch.cat(source), real.pixel[row])
+    truth, spread = predicted_distance(seen, pose), noise.at(brightness_of(seen), seen.frame)
+    usable, full = frames.usable, frames.recording.saturation_amplitude
+    if full is not None and frames.amplitude_images is not None:
+        usable &= frames.amplitude_images < full
+    use = usable.flatten(1)[seen.frame, seen.pixel] & (truth > 0)
+
+    def total(values: Tensor) -> Tensor:
+        return torch.zeros_like(real.measured).index_add(0, row, torch.where(use, values, 0.0))
+
+    count = total(torch.ones_like(truth))
+    error = total(seen.measured - truth) / count  # 0 / 0: no render shows this pixel.
+    return error, (total(spread**2).sqrt() / count).nan_to_num(0.0)
+
+
+def refuse_other_camera(real: Recording, simulated: Recording) -> None:
+    """Refuse frames of another image size or of other viewing rays.
+
+    Two cameras are the same if no pixel's ray differs by more than a hundredth of a pixel: at an
+    incidence of 45 degrees it changes a distance of 1 m by 0.1 mm at 100 pixels of focal length.
+
+    Args:
+        real: The recording.
+        simulated: The rendered frames.
+
+    Raises:
+        CalibrationDataError: The cameras differ; the sentence says by how much.
+    """
+    one, other = real.camera, simulated.camera
+    if (one.width, one.height) != (other.width, other.height):
+        raise CalibrationDataError(
+            f"{simulated.path}: its images have {other.width} x {other.height} pixels, those of "
+            f"{real.path} {one.width} x {one.height}; render with the recording's own camera."
+        )
+    apart = (ray_directions(one) - ray_directions(other)).norm(dim=-1).max()
+    pixels = float(apart) * max(one.matrix[0][0], one.matrix[1][1])
+    if not 100 * pixels <= 1:
+        raise CalibrationDataError(
+            f"{simulated.path}: its pixels look up to {pixels:.2g} pixels beside those of "
+            f"{real.path}; render with the recording's own K and distortion (recording.yaml: "
+            "camera)."
+        )
+
+
+def refuse_without_truth(simulated: Recording, observations: Observations) -> None:
+    """Refuse frames that disagree with their own geometry beyond what any camera does.
+
+    Args:
+        simulated: The rendered frames.
+        observations: Their pixels.
+
+    Raises:
+        CalibrationDataError: Planes, hand-eye transform, axes, unit or kind of depth are wrong.
+    """
+    if simulated.planes == "estimated":
+        raise CalibrationDataError(
+            f"{simulated.path}: its planes are estimated from the depth (recording.yaml: planes); "
+            "a simulator knows its walls: write them to frames.csv."
+        )
+    pose = torch.from_numpy(simulated.tool_from_camera)
+    difference = observations.measured - predicted_distance(observations, pose)
+    off = float(difference.abs().nan_to_num(torch.inf).median())
+    other = "z" if simulated.depth_kind == "radial" else "radial"
+    cosine = ray_directions(simulated.camera).reshape(-1, 3)[observations.pixel, 2]
+    factor = 1 / cosine if other == "z" else cosine
+    # The slope of a line through the differences of pixels whose plane is known.
+    between = (observations.measured * (factor - 1))[difference.isfinite()]
+    between = between - between.mean()
+    slope = float(between @ difference[difference.isfinite()] / (between @ between).clamp(min=TINY))
+    # It is 0 if the kind of depth is right, and -1 if it is the other one.
+    if abs(slope + 1) < 0.3:
+        raise CalibrationDataError(
+            f"{simulated.path}: its depth differs from its own planes as depth_kind {other} "
+            f"does from {simulated.depth_kind}; render {simulated.depth_kind} depth, or correct "
+            "depth_kind in their own recording.yaml."
+        )
+    # No depth camera is as wrong, and every mistaken axis or unit gives more.
+    if not off <= 0.3:
+        raise CalibrationDataError(
+            f"{simulated.path}: its depth is {off:.2f} m off from its own planes; check "
+            "tool_from_camera and its axes (x right, y down, z forward), the planes in "
+            "frames.csv, and the unit of depth.npy (metres)."
+        )
+
+
+# Where `simulation.simulator` keeps its options in a recording.
+_OPTIONS_OF_SIMULATE = "truth/options.yaml"
+
+
+def refuse_mistaken_geometry(simulated: Recording) -> None:
+    """Refuse frames that a usual mistake keeps from agreeing with their own planes.
+
+    The recording under diagnosis is looked at in the same way. The hand-eye transform of a
+    simulator is exact besides.
+
+    Raises:
+        CalibrationDataError: Images are mirrored, poses inverted, or the like, or tool_from_camera
+            is not that of the simulator.
+    """
+    if simulated.moves:
+        _refuse_guess(simulated)
+    look = Look(Dataset((simulated,)))
+    found = [one.sentence for one in agreement(look) if one.severity == "impossible"]
+    if found:
+        raise CalibrationDataError(f"{simulated.path}: {' '.join(found)}")
+    if look.as_given is not None and simulated.moves:
+        _refuse_other_mounting(simulated, look, look.as_given)
+
+
+def _refuse_guess(simulated: Recording) -> None:
+    """Refuse a transform that `tofcorr simulate` wrote as a guess, however close it is."""
+    path = simulated.path / _OPTIONS_OF_SIMULATE
+    if not path.exists():
+        return
+    try:
+        true = resolve_options(SimulatorOptions, path).hand_eye.tool_from_camera()
+    except ConfigError:  # Not a file of this program: the frames themselves tell.
+        return
+    shift, turn = se3.apart(true, torch.as_tensor(simulated.tool_from_camera))
+    # A tenth of the least gap that matters, metres and radians.
+    if max(shift, turn) <= 1e-4:
+        return
+    raise CalibrationDataError(
+        f"{simulated.path}: its tool_from_camera is a guess, as a robot's user would make it: "
+        f"{1e3 * shift:.3g} mm and {math.degrees(turn):.2g} degrees from the true one. Give the "
+        "configuration of `tofcorr simulate` to --sim in place of this recording, or simulate with "
+        "--set hand_eye.guess.translation_mm=0 --set hand_eye.guess.rotation_deg=0."
+    )
+
+
+def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) -> None:
+    """Refuse a transform far from where the frames agree with their planes.
+
+    Errors of a depth camera move it by millimetres and tenths of a degree, not by 50 mm or two
+    degrees. Directions that the frames do not determine leave no misfit.
+    """
+    stated = np.asarray(simulated.tool_from_camera)
+    shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
+    if shift <= 0.05 and turn <= math.radians(2.0):
+        return
+    misfit = judged(look.scene, stated, best.constant, best.slope).misfit
+    if misfit > max(0.02, 4 * best.misfit):
+        raise CalibrationDataError(
+            f"{simulated.path}: its frames agree with its planes if the camera sits "
+            f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "
+            "tool_from_camera; write the one that they were rendered with."
+        )

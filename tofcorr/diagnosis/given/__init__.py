@@ -1,1 +1,0 @@
-"""The simulator under diagnosis, in whichever form a user has it."""
