@@ -3,7 +3,8 @@
 In float64 it is the reference: the runtime is folded from it, every export must agree with it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -386,9 +387,8 @@ class FrameCorrection(DescribedModule):
         """Return the error in the camera's kind of depth, in the module's dtype, and where seen."""
         model = self.error_model
         seen, radial, strength, distance, held = self._variables(depth, amplitude)
-        error = model.pixel_error() + signal_error(
-            model, distance, held, self.ranges.normalised_amplitude
-        )
+        bounds = self.ranges.normalised_amplitude.unbind()
+        error = model.pixel_error() + signal_error(model, distance, held, bounds)
         known = self._conditions(depth, conditions)
         if known is not None:
             error = error + model.condition_error(known)[..., None, None]
@@ -432,7 +432,7 @@ class FrameCorrection(DescribedModule):
 
 
 def signal_error(
-    model: ErrorModel, distance: Tensor, amplitude: Tensor, normalised_range: Tensor
+    model: ErrorModel, distance: Tensor, amplitude: Tensor, normalised_range: Iterable[Any]
 ) -> Tensor:
     """Return the sum of the signal terms, shape (...), metres.
 
@@ -440,14 +440,14 @@ def signal_error(
         model: The error model.
         distance: Radial distances inside their range, shape (...), metres.
         amplitude: Amplitudes inside their range, same shape.
-        normalised_range: Range of N = I D^2, shape (2,), to which N is clamped here.
+        normalised_range: Both ends of the range of N = I D^2, to which N is clamped here.
     """
     error = torch.zeros_like(distance)
     for term in model.signal_terms:
         strength = amplitude
         if term.uses_normalised_amplitude:
             square = distance.square()
-            strength = (strength * square).clamp(*normalised_range.unbind()) / square
+            strength = (strength * square).clamp(*normalised_range) / square
         error = error + term(distance, strength)
     return error
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv1d
 
+from tofcorr.correction.model import signal_error
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
@@ -80,12 +81,8 @@ class BaseError(nn.Module):
         error = torch.zeros_like(true)
         for _ in range(1 + _ITERATIONS if self.reads_measured else 1):
             distance = (true + error).clamp(*self.limits.radial_distance)
-            square = distance.square()
-            normalised = (held * square).clamp(*(self.limits.normalised_amplitude or _ANY)) / square
-            error = fixed
-            for term in self.model.signal_terms:
-                strength = normalised if term.uses_normalised_amplitude else held
-                error = error + term(distance, strength)
+            bounds = self.limits.normalised_amplitude or _ANY
+            error = fixed + signal_error(self.model, distance, held, bounds)
         return error.expand(true.shape)
 
     def covers(self, distance: Tensor, amplitude: Tensor | None) -> Tensor:

@@ -69,7 +69,7 @@ def _tabulate(state: CalibrationState) -> np.ndarray:
         distance, amplitude = (
             low + (high - low) * u for (low, high), u in zip(ranges, places, strict=True)
         )
-        bounds = reference.ranges.normalised_amplitude
+        bounds = reference.ranges.normalised_amplitude.unbind()
         return signal_error(error, distance, amplitude, bounds).numpy()
 
     probes = torch.rand(2, 50_000, generator=torch.Generator().manual_seed(0)).double()
