@@ -55,46 +55,35 @@ def test_a_configuration_is_printed_as_it_is(program: Program, name: str, file: 
     assert printed == (CONFIGS / f"{file}.yaml").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["configs", "paper"], "'paper' stands for evaluate/paper and select/paper; name one"),
-        (["configs", "ladde"], "no configuration 'ladde' is shipped. Did you mean 'ladder'?"),
-        (["train", "--config", "eaa", "--recording", "r", "--out", "o"], "Did you mean 'ea'?"),
-        (
-            ["train", "--set", "solver.max_iteration=3", "--recording", "r", "--out", "o"],
-            "'solver.max_iteration' is not a known key. Did you mean 'max_iterations'?",
-        ),
-        (["evaluate", "--set", "folds", "--recording", "r", "--out", "o"], "expected KEY=VALUE"),
-        (["select", "--config", "papr", "--recording", "r", "--out", "o"], "Did you mean 'paper'?"),
-        (["simulate", "--config", "dmo", "--out", "o"], "Did you mean 'demo'?"),
-        (["simulate", "--out", "o"], "Missing option '--config'"),
-        (["no-such-command"], "No such command 'no-such-command'"),
-        (["correct", "--modle", "x"], "No such option"),
-        (["correct", "--model", "a", "--recording", "b", "--out", "c"], "b: there is no such fold"),
-        (["export", "--run", "a", "--format", "lut", "--out", "b"], "state.pt: there is no such"),
-        (["train", "--config", "none.yaml", "--recording", "x", "--out", "y"], "none.yaml"),
-        (["diagnose", "--set", "sed=2", "--recording", "r", "--out", "o"], "Did you mean 'seed'?"),
-        (
-            [
-                *("import", "checkerboard", ".", "--out", "o", "--board", "5x7"),
-                *("--square-mm", "30", "--intrinsics", "kinect"),
-            ],
-            "neither a file nor a configuration shipped for 'import'. Did you mean 'kinect2'?",
-        ),
-    ],
-)
-def test_a_wrong_name_or_key_ends_with_two_and_a_hint(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    program: Program,
-    arguments: list[str],
-    message: str,
+WRONG = {
+    "configs paper": "'paper' stands for evaluate/paper and select/paper; name one",
+    "configs ladde": "no configuration 'ladde' is shipped. Did you mean 'ladder'?",
+    "train --config eaa --recording r --out o": "Did you mean 'ea'?",
+    "train --set solver.max_iteration=3 --recording r --out o": "Did you mean 'max_iterations'?",
+    "train --config none.yaml --recording x --out y": "none.yaml",
+    "evaluate --set folds --recording r --out o": "expected KEY=VALUE",
+    "select --config papr --recording r --out o": "Did you mean 'paper'?",
+    "simulate --config dmo --out o": "Did you mean 'demo'?",
+    "simulate --out o": "Missing option '--config'",
+    "diagnose --set sed=2 --recording r --out o": "Did you mean 'seed'?",
+    "no-such-command": "No such command 'no-such-command'",
+    "correct --modle x": "No such option",
+    "correct --model a --recording b --out c": "b: there is no such folder",
+    "export --run a --format lut --out b": "state.pt: there is no such",
+    "import checkerboard . --out o --board 5x7 --square-mm 30 --intrinsics kinect": (
+        "neither a file nor a configuration shipped for 'import'. Did you mean 'kinect2'?"
+    ),
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_is_wrong_ends_with_two_and_a_hint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program, words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, _, printed = program(*arguments)
+    code, _, printed = program(*words.split())
     assert code == 2
-    assert message in printed
+    assert WRONG[words] in printed
     assert "Traceback" not in printed
     assert list(tmp_path.iterdir()) == []
 
@@ -148,23 +137,21 @@ def test_the_module_is_the_same_program(tmp_path: Path) -> None:
     assert by_module == by_program
 
 
-@pytest.mark.parametrize(
-    ("command", "options", "config"),
-    [
-        ("train", TrainingOptions, "ea"),
-        ("poses", TrainingOptions, "ea"),
-        ("evaluate", EvaluationOptions, "paper"),
-        ("select", SelectionOptions, "paper"),
-        ("simulate", SimulatorOptions, "demo"),
-        ("diagnose", DiagnosisOptions, "default"),
-    ],
-)
+KINDS: dict[str, tuple[type[Options], str]] = {
+    "train": (TrainingOptions, "ea"),
+    "poses": (TrainingOptions, "ea"),
+    "evaluate": (EvaluationOptions, "paper"),
+    "select": (SelectionOptions, "paper"),
+    "simulate": (SimulatorOptions, "demo"),
+    "diagnose": (DiagnosisOptions, "default"),
+}
+
+
+@pytest.mark.parametrize("command", KINDS)
 def test_the_changed_option_that_the_help_shows_is_one_of_the_command(
-    program: Program,
-    command: str,
-    options: type[Options],
-    config: str,
+    program: Program, command: str
 ) -> None:
+    options, config = KINDS[command]
     # `tofcorr simulate --help` once showed an option of the training.
     _, printed, _ = program(command, "--help")
     example = re.search(r"such as --set\s+(\S+=\S+);", printed)

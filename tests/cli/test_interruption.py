@@ -14,11 +14,11 @@ import pytest
 from tofcorr.cli.main import group, main
 from tofcorr.files import remove_begun, scratch_folder, staged_file, staged_folder
 
+Run = Callable[[Callable[[], object]], tuple[object, str]]
+
 
 @pytest.fixture
-def program(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[[Callable[[], object]], tuple[object, str]]:
+def program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     """The program with a command of the test's own; it returns exit code and standard error."""
 
     def run(command: Callable[[], object]) -> tuple[object, str]:
@@ -34,7 +34,7 @@ def program(
 
 @pytest.mark.parametrize("told_to_end", [True, False])
 def test_only_an_interruption_excuses_the_error_of_a_library_that_is_being_imported(
-    told_to_end: bool, program: Callable[[Callable[[], object]], tuple[object, str]]
+    told_to_end: bool, program: Run
 ) -> None:
     def work() -> None:
         try:
@@ -54,7 +54,7 @@ def test_only_an_interruption_excuses_the_error_of_a_library_that_is_being_impor
 def test_what_a_second_interruption_kept_from_being_removed_is_removed_at_the_end(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    program: Callable[[Callable[[], object]], tuple[object, str]],
+    program: Run,
 ) -> None:
     remove = shutil.rmtree
 

@@ -1,6 +1,7 @@
 """A recording appears whole or not at all."""
 
 import resource
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def _with_row(**changes: Any) -> dict[str, Any]:
         ({"depth": np.ones((6, 4, 7))}, r"frame 0, depth: expected shape \(5, 7\), got \(4, 7\)"),
         ({"depth": np.ones((5, 5, 7))}, r"depth has 5 frames, but there are 6 rows"),
         (
-            {"depth": np.ones((0, 5, 7)), "rows": [], "amplitude": None, "mask": None, "raw": None},
+            dict.fromkeys(("amplitude", "mask", "raw")) | {"depth": np.ones((0, 5, 7)), "rows": []},
             r"a recording of no frame",
         ),
         (
@@ -128,14 +129,7 @@ def _with_row(**changes: Any) -> dict[str, Any]:
         ({"depth_kind": "depth"}, r"'depth_kind'"),
         ({"modulation_frequency": -1.0}, r"'modulation_frequency_hz'"),
         ({"tool_from_camera": np.ones((4, 4))}, r"'tool_from_camera'"),
-        (
-            {
-                "camera": CameraIntrinsics(
-                    width=7, height=5, matrix=CAMERA.matrix, distortion=(0.1,)
-                )
-            },
-            r"'camera\.distortion'",
-        ),
+        ({"camera": replace(CAMERA, distortion=(0.1,))}, r"'camera\.distortion'"),
     ],
 )
 def test_what_the_reader_would_refuse_is_not_written(
