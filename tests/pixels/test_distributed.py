@@ -5,12 +5,10 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import yaml
 from simulated_walls import simulated_wall
 
@@ -20,7 +18,7 @@ TRAIN = str(Path(__file__).resolve().parents[2] / "scripts" / "train.py")
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 
 
-def start_by_hand(script: tuple[str, ...]) -> None:
+def start_both(script: tuple[str, ...]) -> None:
     """Start two processes with the variables that `torchrun` sets, and wait for them."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -39,18 +37,6 @@ def start_by_hand(script: tuple[str, ...]) -> None:
     assert [process.returncode for process in started] == [0, 0], told
 
 
-def start_by_torchrun(script: tuple[str, ...]) -> None:
-    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    done = subprocess.run(
-        [sys.executable, *launcher, *script],
-        capture_output=True,
-        text=True,
-        env=os.environ | ONE_THREAD,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-
-
 def numbers_in(value: Any) -> list[float]:
     """Return all numbers in nested mappings and lists, in their order."""
     if isinstance(value, dict):
@@ -60,16 +46,11 @@ def numbers_in(value: Any) -> list[float]:
     return [float(value)] if isinstance(value, int | float) else []
 
 
-@pytest.mark.parametrize(
-    "start", [start_by_hand, pytest.param(start_by_torchrun, marks=pytest.mark.slow)]
-)
-def test_two_processes_fit_what_one_fits(
-    start: Callable[[tuple[str, ...]], None], tmp_path: Path
-) -> None:
+def test_two_processes_fit_what_one_fits(tmp_path: Path) -> None:
     recording = simulated_wall(tmp_path / "recording").first.path
     train(recording, "ea", out=tmp_path / "one")
     files = ("--recording", str(recording), "--out", str(tmp_path / "two"))
-    start((TRAIN, "--config", "ea", "--set", "advice=0", *files))
+    start_both((TRAIN, "--config", "ea", "--set", "advice=0", *files))
     one, two = (
         json.loads((tmp_path / name / "report.json").read_text()) for name in ("one", "two")
     )

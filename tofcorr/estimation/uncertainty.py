@@ -267,7 +267,9 @@ def _direction(
 ) -> Direction:
     size = vector.abs()
     # Components below a fifth of the largest are left out of its name.
-    named = [k for k in size.argsort(descending=True).tolist() if size[k] > size.max() / 5]
+    # Of equal ones the first comes first, whatever their rounding.
+    order = sorted(range(len(names)), key=lambda k: -round(float(size[k]), 9))
+    named = [k for k in order if size[k] > size.max() / 5]
     shares = {names[k]: float(vector[k]) for k in named}
     both = float(correlation[named[0], named[1]]) if len(named) > 1 else None
     return Direction(float(variance) ** 0.5, shares, both)
