@@ -13,8 +13,9 @@ from tofcorr.estimation.moments import MomentObjective
 from tofcorr.estimation.planes import joint_image_equations, marginal_hessian
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.walls import name_walls, recorded_walls
+from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.report import hand_eye_intervals
+from tofcorr.training.report import hand_eye_summary
 
 BRIGHT = SENSOR | QUIET
 
@@ -44,8 +45,8 @@ def test_a_wall_recorded_30_cm_and_17_degrees_wrong_is_found(wall: Dataset, foun
     assert float(normals[:, 2].min()) > np.cos(2e-3)
     assert float(offsets.abs().max()) < 6e-3
     apart = found.solution.parameters.tool_from_camera - true_hand_eye(wall)
-    half, _ = hand_eye_intervals(found)
-    assert bool((apart[:3, 3].abs() < 1.5 * half).all())
+    half_mm = hand_eye_summary(found, FrameNames())["translation_ci95_mm"]
+    assert bool((1e3 * apart[:3, 3].abs() < 1.5 * torch.tensor(half_mm)).all())
 
 
 def test_where_the_wrong_start_was_does_not_matter(wall: Dataset, found: Fit) -> None:

@@ -36,16 +36,6 @@ def hand_eye_errors(fit: Fit) -> Tensor:
     return matrix.diagonal().clamp(min=0).sqrt().view(2, 3)
 
 
-def hand_eye_intervals(fit: Fit, level: float = 0.95) -> Tensor:
-    """Return the half-widths of the intervals of translation and rotation, shape (2, 3).
-
-    The standard errors of `hand_eye_errors` times the t distribution's quantile. Its degrees of
-    freedom are the poses less one.
-    """
-    quantile = student_quantile((1 + level) / 2, fit.covariance.degrees_of_freedom)
-    return quantile * hand_eye_errors(fit)
-
-
 def _in_units(values: Tensor, kind: str) -> dict[str, Any]:
     """Return values of translation and rotation (2, 3) in millimetres and degrees, by name."""
     return {
@@ -77,16 +67,17 @@ def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
     transform, shift, known = fit.solution.parameters.tool_from_camera, None, hand_eye_accuracy(fit)
     if fit.noise_shift is not None:
         shift = fit.noise_shift.to_mapping(transform[:3, :3]) | {"removed": fit.noise_shift.removed}
-    errors = _in_units(torch.zeros(2, 3), "se") | {"undetermined": []}
-    if known is not None:
-        errors = known.model_dump(mode="json")
+    # Student's t, with the poses less one as degrees of freedom: a fortieth lies beyond each end.
+    half_width = student_quantile(39 / 40, fit.covariance.degrees_of_freedom)
+    none = 0.0, 0.0, 0.0
+    exact = HandEyeAccuracy(translation_se_mm=none, rotation_se_deg=none)
     return {
         "tool_from_camera": transform.tolist(),
         "estimated": known is not None,
-        **errors,
+        **(known or exact).model_dump(mode="json"),
         "noise_shift": shift,
         "frames": frames.to_mapping(),
-        **({} if known is None else _in_units(hand_eye_intervals(fit), "ci95")),
+        **({} if known is None else _in_units(half_width * hand_eye_errors(fit), "ci95")),
     }
 
 
