@@ -67,14 +67,17 @@ from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import train
 
 SECONDS, MEMORY, LONGEST_MESSAGE = 20.0, 2 * 2**30, 5000
-HOSTILE: list[Any] = [  # values that a file may hold anywhere and that a program may not expect
-    *(None, True, False, 0, 1, -1, 2, 7, 10**6, 2**31, -(2**63), 10**30, 10**400),
-    *(0.0, -0.0, 0.5, 1.5, -1e-3, 1e-9, 1e-320, 1e6, 1e12, 1.1e12, 1e30, 1e200, -1e308),
-    *(math.inf, -math.inf, math.nan),
+WORDS = [  # text that a program may take for something else
     *("", " ", "nan", "1e999", "1_0", "0x1p4", "null", "\u0663", "a\nb", "\x1b[31m", "x" * 3000),
     *("amplitude", "radial", "z", "auto", "none", "white", "../..", "\ud7ff\U0001f600"),
-    *([], {}, [[]], [0], [1.0, 2.0], [None], {"a": 1}, {1: 2}, [[1.0, 0.0], [0.0]], ["a", "b"]),
 ]
+NUMBERS = st.floats() | st.integers() | st.sampled_from([10**6, 10**30, 10**400, 1e12, 1.1e12])
+HOSTILE = st.recursive(
+    st.none() | st.booleans() | NUMBERS | st.sampled_from(WORDS) | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=4,
+)
+"""Values that a file may hold anywhere and that a program may not expect."""
 TOKENS = [  # bytes that mean something in one of the formats of text
     *(b"\x00", b"\xff\xfe", b"\n", b"\r", b",", b";", b":", b"-", b"#", b'"', b"'", b"[", b"}"),
     *(b"nan", b"inf", b"-inf", b"1e309", b"1e-320", b"0x10", b"1_0", b"9" * 400, b"-0", b"1e30"),
@@ -201,7 +204,7 @@ def _others(value: Any) -> st.SearchStrategy[Any]:  # noqa: ANN401 - any value
         others += [value * factor for factor in FACTORS] + [*map(value.to, KINDS)]
     elif isinstance(value, int | float):
         others += [value * factor for factor in FACTORS]
-    return st.sampled_from(others) | st.sampled_from(HOSTILE)
+    return st.sampled_from(others) | HOSTILE
 
 
 @st.composite

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 import tofcorr
-from tofcorr.data.recording import Recording
-from tofcorr.data.writing import write_recording
+from benchmarks.wrong_recordings.parts import Parts
 from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
@@ -48,7 +47,8 @@ def make(folder: Path, seed: int) -> Path:
     if (folder / "sensor.yaml").exists():
         return folder
     options = SimulatorOptions.from_mapping(simulator(seed), "tiny")
-    _write_full(simulate(options, folder / "recording"), folder / "full", seed)
+    simulate(options, folder / "recording")
+    _write_full(folder / "recording", folder / "full", seed)
     training = resolve_options(TrainingOptions, "ea", ("figures=false", "advice=0"))
     train(folder / "recording", training, out=folder / "run", force=True)
     module = tofcorr.DepthCorrection.load(folder / "run")
@@ -58,19 +58,12 @@ def make(folder: Path, seed: int) -> Path:
     return folder
 
 
-def _write_full(recording: Recording, path: Path, seed: int) -> None:
-    generator = np.random.default_rng(seed)
-    depth = np.array(recording.depth[:6])
-    write_recording(
-        path,
-        camera=recording.camera,
-        depth_kind=recording.depth_kind,
-        rows=list(recording.frames.rows())[:6],
-        depth=depth,
-        amplitude=None if recording.amplitude is None else np.array(recording.amplitude[:6]),
-        mask=(generator.uniform(size=depth.shape) > 0.2).astype(np.uint8),
-        raw=generator.normal(size=(6, 4, *depth.shape[1:])).astype(np.float32),
-        modulation_frequency=20e6,
-        saturation_amplitude=60_000.0,
-        tool_from_camera=recording.tool_from_camera,
-    )
+def _write_full(recording: Path, path: Path, seed: int) -> None:
+    few, generator = Parts.read(recording).frames(slice(0, 6)), np.random.default_rng(seed)
+    mask, limits = generator.uniform(size=few.depth.shape) > 0.2, {"saturation_amplitude": 60_000.0}
+    few.changed(mask=mask, **limits).write(path)
+    raw = generator.normal(size=(6, 4, *few.depth.shape[1:]))
+    np.save(path / "raw.npy", raw.astype(np.float32))
+    # With pose ids and conditions.
+    lines = (recording / "frames.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    (path / "frames.csv").write_text("".join(lines[:7]), encoding="utf-8")

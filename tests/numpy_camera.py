@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import convolve1d
+from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
@@ -122,11 +124,9 @@ def record(
 
 
 def _looking_at_wall(random: np.random.Generator) -> np.ndarray:
-    (a, b), distance = random.uniform(-0.5, 0.5, 2), random.uniform(0.6, 1.8)
-    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    angles, distance = random.uniform(-0.5, 0.5, 2), random.uniform(0.6, 1.8)
     pose = np.eye(4)
-    pose[:3, :3] = about_x @ about_y @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, :3] = Rotation.from_euler("XY", angles).as_matrix() @ np.diag([1.0, -1.0, -1.0])
     pose[:3, 3] = -distance * pose[:3, 2]
     return pose
 
@@ -137,8 +137,6 @@ def _white(random: np.random.Generator, width: float) -> np.ndarray:
     if width > 0:
         weights = np.exp(-0.5 * (np.arange(-8, 9) / width) ** 2)
         for axis in (0, 1):
-            drawn = np.apply_along_axis(
-                lambda line: np.convolve(line, weights, "same"), axis, drawn
-            )
+            drawn = convolve1d(drawn, weights, axis, mode="constant")
         drawn /= weights @ weights
     return drawn[10:-10, 10:-10]

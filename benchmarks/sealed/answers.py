@@ -103,7 +103,6 @@ class Said:
     sets: tuple[frozenset[str], ...] = ()
     unknown: bool = False
     failure: str = ""
-    seconds: float = 0.0
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -172,8 +171,7 @@ def read_said(out: Path, name: str) -> Said:
         return Said(failure="not run")
     record = json.loads(record_file.read_text())
     if record["code"] != 0:
-        failure = record["message"] or f"exit code {record['code']}"
-        return Said(failure=failure, seconds=record["seconds"])
+        return Said(failure=record["message"] or f"exit code {record['code']}")
     content = (out / "diagnoses" / name / "diagnosis.json").read_bytes()
     if digest(content) != record["report_sha256"]:
         raise BrokenSealError(f"the diagnosis of {name} was changed after its run")
@@ -182,7 +180,6 @@ def read_said(out: Path, name: str) -> Said:
         effects=tuple(report["effects"]),
         sets=tuple(frozenset(members) for members in report["cause_sets"]),
         unknown=bool(report["unknown"]),
-        seconds=record["seconds"],
         report=report,
     )
 

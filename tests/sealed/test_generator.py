@@ -10,7 +10,7 @@ from import_graph import imported
 from scipy.spatial.transform import Rotation
 
 from benchmarks import sealed
-from benchmarks.renewed import cases, ranges
+from benchmarks.renewed import cases
 from benchmarks.renewed.cases import in_world, make_case, seeded, turn, write_case
 from benchmarks.renewed.forms import EFFECTS, INSIDE, OUTSIDE
 from benchmarks.renewed.geometry import Camera, inverse, rotations, small_motions
@@ -195,10 +195,3 @@ def test_recorded_again_the_effect_is_as_strong_but_the_session_another() -> Non
     means = [np.where(field == 0, np.nan, field) for field in fields]
     first, again = (np.nanmean(field, axis=0) for field in means)
     np.testing.assert_allclose(first, again, atol=1e-12)
-
-
-def test_ranges_are_drawn_from_others_only_for_a_while() -> None:
-    before = ranges.RANGES["noise_mm"]
-    with ranges.drawn_from(noise_mm=ranges.Range(1.0, 1.0)):
-        assert ranges.RANGES["noise_mm"].low == 1.0
-    assert ranges.RANGES["noise_mm"] is before
