@@ -1,6 +1,7 @@
 """The commands that use a calibration: correct whole recordings, export it for robots."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -105,10 +106,8 @@ def _refuse_another_camera(
 
 def _last_line(error: Exception) -> str:
     """Return the message that TorchScript puts behind its traceback."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    kind, colon, message = (lines[-1] if lines else type(error).__name__).partition(": ")
-    named = colon and kind.replace(".", "_").isidentifier()  # Such as builtins.ValueError.
-    return message if named else kind + colon + message
+    last = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
+    return re.sub(r"^[A-Za-z_][\w.]*: ", "", last)  # Such as builtins.ValueError.
 
 
 @click.command()

@@ -1,6 +1,5 @@
 """The `.npy` files of a recording: which there are, read in chunks, checked, and written."""
 
-import io
 import tokenize
 import warnings
 from collections.abc import Iterator, Sequence
@@ -172,10 +171,13 @@ def read_frames(array: np.ndarray, indices: np.ndarray) -> np.ndarray:
     starts = np.flatnonzero(np.diff(indices, prepend=-2) != 1)
     stops = np.append(starts[1:], len(indices))
     try:
-        with path.open("rb", buffering=0) as file:
-            for start, stop in zip(starts, stops, strict=True):
-                file.seek(array.offset + int(indices[start]) * frame_bytes)
-                _fill(file, frames[start:stop].reshape(-1).view(np.uint8).data)
+        for start, stop in zip(starts, stops, strict=True):
+            part, place = frames[start:stop], array.offset + int(indices[start]) * frame_bytes
+            part[:] = np.fromfile(path, array.dtype, part.size, offset=place).reshape(part.shape)
+    except ValueError:
+        raise CalibrationDataError(
+            f"{path}: cannot be read (it has become shorter since it was opened)."
+        ) from None
     except OSError as error:
         raise CalibrationDataError(f"{path}: cannot be read ({error.strerror or error}).") from None
     return frames
@@ -251,12 +253,3 @@ class ArrayStream:
             "shape": (num_frames, *self._frame_shape),
         }
         np.lib.format.write_array_header_1_0(self._file, content)
-
-
-def _fill(file: io.FileIO, view: memoryview) -> None:
-    """Read until `view` is full."""
-    while view.nbytes:
-        count = file.readinto(view)
-        if not count:
-            raise OSError(0, "the file has become shorter since it was opened")
-        view = view[count:]

@@ -359,7 +359,11 @@ def iterate_frames(
         CalibrationDataError: A frame holds a value that the format does not allow.
         IndexError: There is no such frame.
     """
-    chosen = _checked_indices(indices, recording.num_frames)
+    chosen = np.arange(recording.num_frames)
+    if indices is not None:
+        chosen = np.asarray(indices, dtype=np.int64).reshape(-1)
+    for wrong in chosen[(chosen < 0) | (chosen >= recording.num_frames)][:1]:
+        raise IndexError(f"there is no frame {wrong}: the recording has {recording.num_frames}.")
     camera = recording.camera
     normals, offsets = planes_in_tool(recording)
     conditions = frame_conditions(recording.frames)
@@ -439,12 +443,3 @@ def planes_in_tool(recording: Recording) -> tuple[Tensor, Tensor]:
         torch.from_numpy(table.offset),
         torch.from_numpy(table.world_from_tool),
     )
-
-
-def _checked_indices(indices: Sequence[int] | np.ndarray | None, num_frames: int) -> np.ndarray:
-    if indices is None:
-        return np.arange(num_frames)
-    chosen = np.asarray(indices, dtype=np.int64).reshape(-1)
-    for wrong in chosen[(chosen < 0) | (chosen >= num_frames)][:1]:
-        raise IndexError(f"there is no frame {wrong}: the recording has {num_frames}.")
-    return chosen

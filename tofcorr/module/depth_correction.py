@@ -327,23 +327,12 @@ class DepthCorrection(FrameCorrection):
     def set_extra_state(self, state: Tensor) -> None:
         """Take over the labels of a state; refuse that of another model."""
         super().set_extra_state(state)
+        self.extras = CalibrationExtras(frames=self.extras.frames)
         self._set_labels(Labels.from_mapping(decode(state)["labels"], "the state"))
 
     def _description_in(self, state: Tensor) -> dict[str, Any]:
         """Return the description that stands beside the labels."""
         return decode(state)["description"]
-
-    def load_state_dict(
-        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
-    ) -> Any:  # noqa: ANN401 - torch's own named tuple
-        """Load a state, with its ranges and camera; refuse that of another model untouched.
-
-        Raises:
-            StateError: The state is of other terms, another image size or another dtype.
-        """
-        loaded = super().load_state_dict(state_dict, strict=strict, assign=assign)
-        self.extras = CalibrationExtras(frames=self.extras.frames)
-        return loaded
 
     def extra_repr(self) -> str:
         """Return the model's name, image size, depth kind and range, for printing."""

@@ -1,22 +1,39 @@
-"""The corrector as C99 source, for robots and controllers without any library."""
+"""The corrector as C99 source, for robots and controllers without any library.
+
+Its text stands in the templates of `c_code`. A term is written as cubic pieces over equal segments,
+which C evaluates without knowing the term.
+"""
 
 import ctypes
 import os
+import re
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
-from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.c_code.source import c_name, c_sources
-from tofcorr.correction.export.parity import Correct, require_parity
+from tofcorr.correction.corrector import (
+    DepthCorrector,
+    RuntimeErrorModel,
+    separated,
+    summed_polynomials,
+)
+from tofcorr.correction.export.parity import Correct, probe_frames, require_parity
+from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.base import EVERYTHING, Axis, Domain, SignalTerm
 from tofcorr.errors import ConfigError, ExportError
 from tofcorr.files import scratch_folder, staged_file
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.version import __version__
 
 
 def export_c(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -108,3 +125,223 @@ def load_c(path: Path | str, flags: Sequence[str] = ("-O2",), compiler: str = ""
         return corrected, valid
 
     return correct
+
+
+def c_name(stem: str) -> str:
+    """Return the name that begins every public name in C, from the stem of the file's name."""
+    name = re.sub(r"\W", "_", stem, flags=re.ASCII)
+    return f"_{name}" if name[:1].isdigit() else name
+
+
+def c_sources(state: CalibrationState, metadata: str, name: str) -> dict[str, str]:
+    """Return the text of every file by the file's name.
+
+    Args:
+        state: The calibration.
+        metadata: As `corrector.metadata()`.
+        name: As `c_name` gives it.
+
+    Raises:
+        ConfigError: C cannot hold one of the terms.
+    """
+    environment = Environment(
+        loader=PackageLoader("tofcorr.correction.export.c_code", ""),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    environment.filters.update(
+        f=lambda one: number(float(one)), d=long_number, lines=lines, exp=np.exp
+    )
+    values = _filled_in(state, metadata, name)
+    return {
+        f"{name}{end}": environment.get_template(f"corrector{end}.j2").render(values)
+        for end in (".h", ".c", "_test.c")
+    }
+
+
+@torch.no_grad()
+def _filled_in(state: CalibrationState, metadata: str, name: str) -> dict[str, Any]:
+    """Return what the templates fill in, for frames of the mean conditions.
+
+    Raises:
+        ConfigError: A term cannot be held.
+    """
+    model, camera, is_z = state.model().error, state.camera, state.depth_kind == "z"
+    limits, network = model.limits(state.domain), model.requires_grad_(requires_grad=False).residual
+    amplitudes = limits.amplitude or EVERYTHING
+    runtime = RuntimeErrorModel(model, limits, 1.0)
+    row_error, column_error, rest = separated(model.pixel_error() + runtime.left_over)
+    pieces = [pieces_of(term, limits) for term in summed_polynomials(model)[1]]
+    variables = {axis.variable for one in pieces for axis in one.axes}
+    needs_amplitude = model.needs_amplitude()
+    most = state.saturation_amplitude
+    saturation = most is not None and not (needs_amplitude and amplitudes.high < np.float32(most))
+    return {
+        "title": comment(f"Depth correction {state.name}."),
+        "version": __version__,
+        "name": name,
+        # Pixels that are corrected together: five arrays of them take a fifth of a first-level
+        # cache of 32 KiB; fewer spend more on the ends of the loops. Set on benchmarks/runtime.py.
+        "block": min(320, camera.width),
+        "width": camera.width,
+        "height": camera.height,
+        "row_error": row_error,
+        "column_error": column_error,
+        "error_image": rest,
+        "z_of_radial": ray_directions(camera)[..., 2] if is_z else None,
+        "limits": limits,
+        "saturation_amplitude": most,
+        "is_z": is_z,
+        # The clamped distance is read in float32; depth along the axis is tested in double.
+        "uses_distance": not is_z or "distance" in variables or runtime.distance.degree > 0,
+        "saturation": saturation,
+        "needs_amplitude": needs_amplitude,
+        "reads_amplitude": needs_amplitude or saturation,
+        "has_log": "log_amplitude" in variables or (network is not None and network.uses_amplitude),
+        "runtime": runtime,
+        "normalised": runtime.has_normalised,
+        "pieces": pieces,
+        "network": network,
+        "tolerance": AGREEMENT,
+        "probes": _probes(state),
+        "metadata": [*metadata.encode(), 0],
+    }
+
+
+def _probes(state: CalibrationState) -> list[tuple[int, float, float, float, bool]]:
+    """Return pixels, their depth and amplitude, the depth as corrected and whether it is valid."""
+    depth, amplitude = probe_frames(state)
+    expected, valid = state.corrected(depth, amplitude)
+    # 1 % of the pixels is of each kind of missing value: each kind is there five times.
+    generator = torch.Generator().manual_seed(0)
+    chosen = torch.randperm(depth[0].numel(), generator=generator)[:512].tolist()
+    columns = (one[0].flatten()[chosen].tolist() for one in (depth, amplitude, expected, valid))
+    return list(zip(chosen, *columns, strict=True))
+
+
+def comment(text: str) -> str:
+    """Return a text that neither ends a comment nor begins one."""
+    return " ".join(text.split()).replace("*/", "* /").replace("/*", "/ *")
+
+
+def number(value: float) -> str:
+    """Return a constant of type float, with all its digits."""
+    return _special(value) or f"{np.float32(value):.8e}f"
+
+
+def long_number(value: float) -> str:
+    """Return a constant of type double, with all its digits."""
+    return _special(value) or f"{value:.16e}"
+
+
+def lines(words: Iterable[object], in_a_line: int = 6) -> str:
+    """Return words behind commas, so many in a line."""
+    every = list(map(str, words))
+    parts = (every[k : k + in_a_line] for k in range(0, len(every), in_a_line))
+    return "\n".join("  " + ", ".join(part) + "," for part in parts)
+
+
+def _special(value: float) -> str | None:
+    if np.isnan(value):
+        return "NAN"
+    return f"{'-' if value < 0 else ''}INFINITY" if np.isinf(value) else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pieces:
+    """A function of one or two variables as cubics of the place within a segment.
+
+    Attributes:
+        axes: The variables, with the number of segments of these pieces.
+        coefficients: Of 1, t, t^2, t^3, float32, shape (S, 4) for one axis; for two (S, R, 4, 4),
+            the powers of the first variable first.
+    """
+
+    axes: tuple[Axis, ...]
+    coefficients: np.ndarray
+
+
+def pieces_of(term: SignalTerm, limits: Domain, most_pieces: int = 4096) -> Pieces:
+    """Return the pieces of a term over the calibrated ranges, to a fifth of `AGREEMENT`.
+
+    Each segment is halved until they follow the term, at most seven times: 2^7 pieces of a smooth
+    function over the whole range resolve more than any calibration does.
+
+    Args:
+        term: The term.
+        limits: Its ranges.
+        most_pieces: With two variables, 4096 times 64 numbers of 4 bytes fill a quarter of a
+            megabyte, which still stays in a second-level cache.
+
+    Raises:
+        ConfigError: So many pieces as there may be do not follow the term.
+    """
+    axes = term.axes() or _smooth(term, limits)
+    for halvings in range(8):
+        finer = tuple(axis._replace(segments=axis.segments * 2**halvings) for axis in axes)
+        if np.prod([axis.segments for axis in finer]) > most_pieces and halvings:
+            break
+        found = _interpolated(term, finer)
+        if _error(term, found) < AGREEMENT / 5:
+            return found
+    name = term.options.kind
+    raise ConfigError(
+        f"The term {name} changes too quickly for the c export: export torchscript, pt2 or onnx."
+    )
+
+
+def _smooth(term: SignalTerm, limits: Domain) -> tuple[Axis, ...]:
+    distance = Axis("distance", *limits.radial_distance)
+    return (
+        (distance, Axis("amplitude", *(limits.amplitude or EVERYTHING)))
+        if term.needs_amplitude
+        else (distance,)
+    )
+
+
+def _interpolated(term: SignalTerm, axes: tuple[Axis, ...]) -> Pieces:
+    """Return the cubics through the term's values at the Chebyshev points of every segment."""
+    # A cubic through the Chebyshev points is within a factor of two of the best.
+    points = 0.5 - 0.5 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)
+    to_powers = np.linalg.inv(np.vander(points, 4, increasing=True))
+    values = _values(term, axes, points)
+    if len(axes) == 1:
+        coefficients = np.einsum("pi,si->sp", to_powers, values)
+    else:
+        coefficients = np.einsum("pi,qj,srij->srpq", to_powers, to_powers, values)
+    return Pieces(axes=axes, coefficients=coefficients.astype(np.float32))
+
+
+def _error(term: SignalTerm, pieces: Pieces) -> float:
+    """Return the largest error of the pieces at probes of every segment, metres."""
+    places = np.linspace(0.0, 1.0, 13)  # More than three times the points that fix a cubic.
+    powers = np.vander(places, 4, increasing=True)
+    if len(pieces.axes) == 1:
+        found = np.einsum("sp,ip->si", pieces.coefficients, powers)
+    else:
+        found = np.einsum("srpq,ip,jq->srij", pieces.coefficients, powers, powers)
+    return float(np.abs(found - _values(term, pieces.axes, places)).max())
+
+
+def _values(term: SignalTerm, axes: tuple[Axis, ...], places: np.ndarray) -> np.ndarray:
+    """Return the term at places (P,) of each segment: shape (S, P), or (S, R, P, P)."""
+    grids = []
+    for axis in axes:
+        step = (axis.high - axis.low) / axis.segments
+        grids.append(axis.low + step * (np.arange(axis.segments)[:, None] + places))
+    flat = [grid.ravel() for grid in grids]
+    mesh = np.meshgrid(*flat, indexing="ij")
+    given = {axis.variable: values for axis, values in zip(axes, mesh, strict=True)}
+    if "log_amplitude" in given:
+        given["amplitude"] = np.exp(given["log_amplitude"])
+    distance = given.get("distance", np.ones_like(mesh[0]))
+    amplitude = given.get("amplitude", np.ones_like(mesh[0]))
+    with torch.no_grad():
+        found = term(torch.from_numpy(distance), torch.from_numpy(amplitude)).numpy()
+    if len(axes) == 1:
+        return found.reshape(grids[0].shape)
+    shape = (*grids[0].shape, *grids[1].shape)
+    return found.reshape(shape).transpose(0, 2, 1, 3)
