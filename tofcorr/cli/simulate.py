@@ -64,17 +64,11 @@ def degrade_command(sensor: str, recording_path: Path, out: Path, **given: Any) 
     """
     import warnings
 
-    from tofcorr.data.recording import Recording
-    from tofcorr.progress import bar
     from tofcorr.sensor.degrade import degrade
 
-    recording = Recording.open(recording_path, check_contents=False)
-    with (
-        warnings.catch_warnings(record=True) as caught,
-        bar(recording.num_frames, "degrading") as advance,
-    ):
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        done = degrade(sensor, recording, out, progress=advance, **given)
+        done = degrade(sensor, recording_path, out, **given)
     for sentence in dict.fromkeys(str(warning.message) for warning in caught):
         click.echo(f"Warning: {sentence}", err=True)
     click.echo(

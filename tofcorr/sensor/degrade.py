@@ -1,7 +1,6 @@
 """A recording of an ideal camera, as the real camera would have given it."""
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,6 +15,7 @@ from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.progress import through
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile, read_sensor
 
@@ -56,7 +56,6 @@ def degrade(
     *,
     seed: int = 0,
     amplitude_is: AmplitudeMeaning = "amplitude",
-    progress: Callable[[int], object] = lambda frames: None,
 ) -> Degraded:
     """Write what a camera would have measured where an ideal one recorded.
 
@@ -70,7 +69,6 @@ def degrade(
         out: The folder to write; it must not exist yet.
         seed: Of all draws; each frame has its own.
         amplitude_is: What the amplitude of the recording holds.
-        progress: Called with the number of frames written since the last call.
 
     Raises:
         ConfigError: There is no such sensor, or its file breaks the format.
@@ -98,7 +96,7 @@ def degrade(
     counts = np.zeros(3, dtype=np.int64)
     with RecordingWriter.like(out, header) as writer, torch.inference_mode():
         shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
-        for number in range(recording.num_frames):
+        for number in through(range(recording.num_frames), "degrading"):
             depth, light, mask = (
                 recording.read(name, np.array([number])) for name in (source, "amplitude", "mask")
             )
@@ -125,7 +123,6 @@ def degrade(
             there = torch.isfinite(true_depth) & (true_depth > 0)
             covered = model.covers(true_depth) & there
             counts += [int(each.sum()) for each in (there, measured.valid, covered)]
-            progress(1)
     valid_share, covered_share = (counts[1:] / max(counts[0], 1)).tolist()
     # Then most of the result rests on errors at the edge of a range, or the unit is wrong.
     if counts[0] and covered_share < 0.5:

@@ -82,7 +82,6 @@ class ImageEffects(nn.Module):
         self._kept_as_given: list[Mapping[str, Any]] = []
         self.effects = nn.ModuleList()
         for entry, effect in zip(entries, build_effects(entries), strict=True):
-            assert isinstance(effect, CatalogueEffect)
             reasons = [need.beyond_image for need in effect.needs if need.beyond_image]
             if modulation_frequency is None and FREQUENCY in effect.needs:
                 reasons.append("the sensor states no modulation_frequency_hz")

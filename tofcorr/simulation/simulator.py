@@ -23,7 +23,7 @@ from tofcorr.geometry.rays import (
     z_depth_from_radial_distance,
 )
 from tofcorr.options import resolve_options
-from tofcorr.progress import bar
+from tofcorr.progress import through
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
 from tofcorr.simulation.hooks import STAGES, Effect, FrameFacts, FrameState
@@ -209,11 +209,10 @@ def simulate(
         modulation_frequency=options.sensor.modulation_frequency_hz,
         tool_from_camera=guess.numpy(),
     )
-    with writing as writer, bar(len(plan), "simulating") as advance:
-        for state in states:
+    with writing as writer:
+        for state in through(states, "simulating", total=len(plan)):
             row = row_of(state, recorded)
             append_measurement(writer, state, options.depth_kind, options.write_raw, row)
-            advance(1)
         truth = {"tool_from_camera": mount.tool_from_camera().tolist(), "seed": seed}
         writer.add_truth("truth", truth)
         writer.add_truth("options", options.to_mapping())

@@ -491,7 +491,6 @@ def given_error(found: Evidence) -> tuple[Tensor, float]:
     columns = fit.model.error_columns(distance)
     known = observations.measured - fit.residual - distance - columns @ fit.coefficients
     for effect in build_effects(_given_effects(found)):
-        assert isinstance(effect, CatalogueEffect)
         known = known - effect.shift(study.inputs, effect.coefficients)
     root = fit.share.sqrt()[:, None]
     solved = torch.linalg.lstsq(root * columns, root * known[:, None], driver="gelsd").solution

@@ -10,7 +10,6 @@ from typing import Any
 
 from tofcorr.errors import ConfigError
 from tofcorr.simulation.effects.base import CatalogueEffect
-from tofcorr.simulation.hooks import Effect
 
 _EFFECTS = (
     "distance:DistanceEffect",
@@ -48,21 +47,18 @@ CATALOGUE: dict[str, type[CatalogueEffect]] = {effect.name: effect for effect in
 """Every effect class by its name in `diagnosis.json` and in a simulator's YAML."""
 
 
-def build_effects(
-    entries: Sequence[Mapping[str, Any]], where: str = "effects"
-) -> tuple[Effect, ...]:
+def build_effects(entries: Sequence[Mapping[str, Any]]) -> tuple[CatalogueEffect, ...]:
     """Build the effects that options list.
 
     Args:
         entries: One mapping per effect: `name`, and its parameters.
-        where: What to call the list in an error message.
 
     Raises:
         ConfigError: An entry lacks its name, its name is unknown, or a parameter is wrong.
     """
     effects, known = [], ", ".join(sorted(CATALOGUE))
     for place, entry in enumerate(entries):
-        at, name = f"{where}[{place}]", entry.get("name")
+        at, name = f"effects[{place}]", entry.get("name")
         if name is None:
             raise ConfigError(f"{at}: 'name' is missing; known effects: {known}.")
         if name not in CATALOGUE:
