@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -36,7 +37,7 @@ def write_page(found: Inspection, path: Path) -> None:
     template = files("tofcorr.plausibility").joinpath("inspection.html.j2")
     text = environment.from_string(template.read_text(encoding="utf-8")).render(
         inspection=found,
-        figures={name: Markup(_svg(figure)) for name, figure in all_figures(found).items()},
+        figures={name: Markup(svg_of(figure)) for name, figure in all_figures(found).items()},
         version=__version__,
     )
     with staged_file(path, CalibrationDataError) as part:
@@ -52,9 +53,12 @@ def refuse_page(path: Path) -> None:
     refuse_existing(path)
 
 
-def _svg(figure: Figure) -> str:
+def svg_of(figure: Figure) -> str:
+    """Return a figure as an SVG element, to be put into a page."""
     buffer = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    # Words as text: they can be found and read aloud, and are drawn in half the time of outlines.
+    with rc_context({"svg.fonttype": "none"}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]
 

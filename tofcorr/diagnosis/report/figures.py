@@ -1,14 +1,11 @@
 """Figures of a diagnosis: the gap, the residual, the effects and the poses."""
 
-import io
 import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from tofcorr.diagnosis.findings.where import Estimated, Interval, Stage
@@ -47,16 +44,6 @@ def all_figures(result: "DiagnosisResult") -> dict[str, Figure]:
     left_out = ("where_as_given",) if result.stages[0].gap is None else ()
     own = {name: draw(result) for name, draw in FIGURES.items() if name not in left_out}
     return own | {name: draw() for name, draw in observable_drawings(result.observables).items()}
-
-
-def svg_of(figure: Figure) -> str:
-    """Return a figure as an SVG element, to be put into a page."""
-    buffer = io.StringIO()
-    # Words as text: they can be found and read aloud, and are drawn in half the time of outlines.
-    with rc_context({"svg.fonttype": "none"}):
-        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
 
 
 Bar = tuple[str, Estimated, str]

@@ -370,7 +370,7 @@ def render(result: DiagnosisResult) -> str:
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
-    from tofcorr.diagnosis.report.figures import svg_of
+    from tofcorr.plausibility.page import svg_of
 
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
