@@ -16,7 +16,6 @@ from simulated_walls import CAMERA, simulated_wall
 import tofcorr
 from tofcorr.cli.main import group as cli
 from tofcorr.correction.state import CalibrationState, save_calibration
-from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift
 from tofcorr.drift.offset import Wall
 from tofcorr.drift.result import DriftResult
@@ -87,13 +86,11 @@ def test_where_the_recorded_wall_stands_does_not_matter_if_it_is_not_believed(
     assert displaced.offset == pytest.approx(believed.offset, abs=1e-9)
 
 
-def test_a_wall_that_bends_is_not_flat_any_more(state: CalibrationState, tmp_path: Path) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+def test_a_wall_that_bends_is_not_flat_any_more(state: CalibrationState, walls: Walls) -> None:
+    few = walls(11).first
     rows = np.linspace(-1, 1, CAMERA["height"])[:, None]
     bowl = (0.03 * (rows**2 + np.linspace(-1, 1, CAMERA["width"]) ** 2)).astype(np.float32)
-    depth = np.load(few.first.path / "depth.npy")
-    np.save(few.first.path / "depth.npy", depth + bowl)
-    found = check_drift(state, Dataset((Recording.open(few.first.path),)), "per_image")
+    found = check_drift(state, Dataset((replace(few, depth=few.depth + bowl),)), "per_image")
     assert found.verdict == "drifted"
     assert found.flatness > found.threshold
 

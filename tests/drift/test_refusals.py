@@ -5,12 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drift.few_walls import FEW, Walls, sensor
-from simulated_walls import CAMERA, simulated_wall
+from drift.few_walls import Walls
 
 import tofcorr
 from tofcorr.correction.state import CalibrationState, save_calibration
-from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift
 from tofcorr.drift.offset import Wall
 from tofcorr.errors import CalibrationDataError, ConfigError
@@ -18,11 +16,11 @@ from tofcorr.fit.reference import REFERENCE_FILE, Reference, save_reference
 from tofcorr.pixels.dataset import Dataset
 
 
-def test_another_camera_is_refused(state: CalibrationState, tmp_path: Path) -> None:
-    camera = CAMERA | {"K": [[50.0, 0.0, 15.9], [0.0, 45.0, 11.8], [0.0, 0.0, 1.0]]}
-    other = simulated_wall(tmp_path / "other", 1, FEW, sensor=sensor(), camera=camera)
+def test_another_camera_is_refused(state: CalibrationState, walls: Walls) -> None:
+    few = walls(11).first
+    other = replace(few, camera=replace(few.camera, distortion=(0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(CalibrationDataError, match="not the camera that was calibrated"):
-        check_drift(state, other)
+        check_drift(state, Dataset((other,)))
 
 
 def test_a_wall_outside_the_calibrated_range_is_refused(
@@ -66,13 +64,12 @@ def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
 
 
 def test_frames_of_two_cameras_are_headed_by_it(
-    state: CalibrationState, reference: Reference, tmp_path: Path
+    state: CalibrationState, reference: Reference, walls: Walls
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
-    depth = np.load(few.first.path / "depth.npy")
+    few = walls(11).first
+    depth = np.array(few.depth)
     depth[::2] += 0.03
-    np.save(few.first.path / "depth.npy", depth)
-    mixed = Dataset((Recording.open(few.first.path),))
+    mixed = Dataset((replace(few, depth=depth),))
     found = check_drift(state, mixed, "recorded", reference=reference)
     assert found.headline is not None
     assert "two cameras" in found.headline
