@@ -1,6 +1,5 @@
 """What the noise of the distances does to an estimate, and the estimate without it."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,8 +25,8 @@ CHANGES = {
 }
 
 
-def _fitted(folder: Path, **changes: object) -> Fit:
-    dataset = Dataset((Recording.open(folder),))
+def _fitted(recording: Recording, **changes: object) -> Fit:
+    dataset = Dataset((recording,))
     frames = np.arange(dataset.num_frames)
     options = resolve_options(TrainingOptions, "ea").model_copy(update=changes)
     return fit(dataset, frames, options, covered_domain(dataset, frames))
@@ -36,16 +35,14 @@ def _fitted(folder: Path, **changes: object) -> Fit:
 @pytest.fixture(scope="module")
 def fits(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fit, list[Fit]]:
     """Fits to a recording without noise, and to the same with other noise each time."""
-    clean = recorded(tmp_path_factory.mktemp("shift") / "clean", 61, [], CHANGES, noise=False).path
-    depth, random = np.load(clean / "depth.npy"), np.random.default_rng(61)
-    noisy = []
-    for draw in range(6):
-        folder = clean.parent / f"noisy_{draw}"
-        shutil.copytree(clean, folder)
-        noise = SIGMA * random.standard_normal(depth.shape)
-        np.save(folder / "depth.npy", (depth + noise).astype(np.float32))
-        noisy.append(_fitted(folder))
-    return _fitted(clean), noisy
+    clean = recorded(tmp_path_factory.mktemp("shift") / "clean", 61, [], CHANGES, noise=False)
+    random = np.random.default_rng(61)
+    return _fitted(clean), [_fitted(_noisy(clean, SIGMA, random)) for _ in range(6)]
+
+
+def _noisy(clean: Recording, sigma: float, random: np.random.Generator) -> Recording:
+    depth = clean.depth + sigma * random.standard_normal(clean.depth.shape)
+    return replace(clean, depth=depth.astype(np.float32))
 
 
 def _moved(there: Parameters, found: list[Parameters]) -> torch.Tensor:
@@ -84,8 +81,8 @@ def test_model_and_hand_eye_transform_are_those_of_the_estimate(
 
 
 def test_an_estimate_may_stay_at_the_least_loss(tmp_path: Path) -> None:
-    folder = recorded(tmp_path / "one", 61, [], CHANGES).path
-    left, moved = _fitted(folder, remove_noise_shift=False), _fitted(folder)
+    one = recorded(tmp_path / "one", 61, [], CHANGES)
+    left, moved = _fitted(one, remove_noise_shift=False), _fitted(one)
     assert left.solution.parameters is left.optimum
     torch.testing.assert_close(_shift(left).twist, _shift(moved).twist)
     assert (_shift(left).removed, _shift(moved).removed) == (False, True)
@@ -93,13 +90,11 @@ def test_an_estimate_may_stay_at_the_least_loss(tmp_path: Path) -> None:
 
 def test_estimated_walls_move_along(tmp_path: Path) -> None:
     """On the walls of the least loss the points would be off by as much as the hand-eye moved."""
-    folder = recorded(tmp_path / "clean", 61, [], CHANGES, noise=False).path
-    depth, random = np.load(folder / "depth.npy"), np.random.default_rng(62)
-    noise = SIGMA / 4 * random.standard_normal(depth.shape)
-    np.save(folder / "depth.npy", (depth + noise).astype(np.float32))
-    one = _fitted(folder, planes="unknown")
+    clean = recorded(tmp_path / "clean", 61, [], CHANGES, noise=False)
+    noisy = _noisy(clean, SIGMA / 4, np.random.default_rng(62))
+    one = _fitted(noisy, planes="unknown")
     assert one.walls is not None
-    there = _fitted(folder, planes="unknown", remove_noise_shift=False)
+    there = _fitted(noisy, planes="unknown", remove_noise_shift=False)
     assert there.walls is not None
     seen = MomentObjective(one.moments).loss(one.solution.parameters)
     without = MomentObjective(there.moments).loss(one.solution.parameters)
