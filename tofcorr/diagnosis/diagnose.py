@@ -156,7 +156,7 @@ def conclude(
     return DiagnosisResult(
         verdict=write_verdict(named, gap, remainder, shares),
         causes=list_causes(found, shares),
-        remarks=list_remarks(study, named, gap, remainder, detectable),
+        remarks=list_remarks(found, gap, remainder, detectable),
         simulator_kind="fitted" if simulator is None else simulator.kind,
         stages=stages,
         shares=shares,

@@ -18,11 +18,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 def _paper_model() -> ErrorModelOptions:
     return ErrorModelOptions(
-        terms=(
-            DistancePolynomialOptions(),
-            PixelPolynomialOptions(),
-            AmplitudePolynomialOptions(),
-        )
+        terms=(DistancePolynomialOptions(), PixelPolynomialOptions(), AmplitudePolynomialOptions())
     )
 
 

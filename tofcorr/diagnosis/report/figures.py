@@ -17,6 +17,7 @@ from tofcorr.diagnosis.report.words import (
     cause_words,
     effect_words,
     least_p,
+    mm,
     most_biased,
     p_words,
     pose_errors,
@@ -66,7 +67,9 @@ def stage_bars(result: "DiagnosisResult") -> Figure:
         bars[-1] = (f"{steps[-1][0].split(' (')[0]}:\n{bars[-1][0]}", *bars[-1][1:])
     if result.degraded is not None:
         bars.append(("degraded frames", result.degraded.gap, _LIGHT_BLUE))
-    figure, axes = _bars(bars, 1e3, "gap, mm (root mean square, noise taken off)", _in_mm)
+    figure, axes = _bars(
+        bars, 1e3, "gap, mm (root mean square, noise taken off)", lambda size: f"{mm(size)} mm"
+    )
     floor, end = 1e3 * result.gap.floor, axes.get_xlim()[1]
     if floor < end:  # Beyond, its label would be cut; a card tells it.
         axes.axvline(floor, color="black", linestyle=":", linewidth=1, zorder=0)
@@ -90,10 +93,6 @@ def attribution_bars(result: "DiagnosisResult") -> Figure:
     figure, axes = _bars(bars, 100, "share of the squared gap, %", share_words, SHARE_ENDS)
     line_across(axes, vertical=True)
     return figure
-
-
-def _in_mm(size: float) -> str:
-    return f"{1e3 * size:.1f} mm"
 
 
 def _bars(

@@ -281,21 +281,17 @@ def effect_line(named: NamedEffects, name: str) -> str:
 
 
 def list_remarks(
-    study: Study,
-    named: NamedEffects,
-    gap: Gap,
-    remainder: OpenSet,
-    detectable: Mapping[str, float | None],
+    found: Evidence, gap: Gap, remainder: OpenSet, detectable: Mapping[str, float | None]
 ) -> tuple[str, ...]:
     """Return what else must be said, a sentence or two each.
 
     Args:
-        study: The recording, before any effect was named.
-        named: The effects named.
-        gap: Before and after them.
+        found: The final model.
+        gap: Before and after the effects.
         remainder: What they leave.
         detectable: The smallest size of each effect that would have been found, metres.
     """
+    study, named = found.study, found.named
     options, terms = study.options, named.refined_terms
     remarks = [lone_poses(study, gap.floor), _largest_component(gap, named)]
     if not named.tested:

@@ -25,7 +25,6 @@ from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.pixels.dataset import Dataset, HandEyeOptions, covered_domain
 from tofcorr.sensor.degrade import conditions_of_frames
 from tofcorr.sensor.model import SensorModel, SensorWarning
-from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.saturation import light_of
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import twin_frames
@@ -279,52 +278,50 @@ def _tested(
     return excess_gaps(observations, left, weights, study.fit.sigma, resamples)
 
 
-def expected_images(
-    model: SensorModel,
-    recording: Recording,
-    frames: Tensor,
-    distance: Tensor,
-    amplitude: Tensor | None,
+def _expected_images(
+    model: SensorModel, found: Evidence, frames: Tensor, light: Tensor | None
 ) -> Tensor:
-    """Return the expected radial distances of F frames, shape (F, H, W), metres.
+    """Return the distances that a sensor is expected to measure of the plane, (F, H, W), metres.
+
+    Off the target it sees what was measured.
 
     Args:
         model: The sensor.
-        recording: Conditions of all frames: effects of whole frames depend on those before.
+        found: Poses and planes; and conditions of all frames, for effects of whole frames depend on
+            those before.
         frames: Numbers of the F frames, int64.
-        distance: True distances along the rays, shape (F, H, W), metres.
-        amplitude: Light that returns, shape (F, H, W), counts; None: unknown.
+        light: Light that returns in all frames, shape (N, H, W), counts; None: unknown.
     """
+    recording = found.observations.recording
     shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
     slant = ray_directions(recording.camera)[..., 2]
     scale = slant if model.sensor.depth_kind == "z" else torch.ones_like(slant)
-    measured = torch.empty_like(distance, dtype=torch.float64)
+    distance = distance_images(found.observations, found.tool_from_camera, frames)
+    measured = torch.empty_like(distance)
     with torch.inference_mode():
         for place, number in enumerate(frames.tolist()):
-            found = model(
-                distance[place].double() * scale,
-                None if amplitude is None else amplitude[place].double(),
+            seen = model(
+                distance[place] * scale,
+                None if light is None else light[number].double(),
                 noise=False,
                 frame_shift=shift[number],
                 **conditions_of_frames(recording, number),
             )
-            measured[place] = found.depth / scale
+            measured[place] = seen.depth / scale
     return measured
 
 
-def light_images(
-    model: SensorModel, observations: Observations, inputs: EffectInputs
-) -> Tensor | None:
+def _light_images(model: SensorModel, study: Study) -> Tensor | None:
     """Return the light that reached the camera, shape (F, H, W), counts; None: not recorded.
 
     It is the recorded amplitude. Where a sensor clips bright pixels, that of the chosen pixels is
     what it would have been without clipping, as in the fit.
     """
-    images = observations.amplitude_images
+    observations, images = study.observations, study.observations.amplitude_images
     if images is None or not model.effects.reads_light:
         return images
     lit = images.double().flatten(1)
-    lit[observations.frame, observations.pixel] = light_of(inputs)
+    lit[observations.frame, observations.pixel] = light_of(study.inputs)
     return lit.reshape(images.shape)
 
 
@@ -377,11 +374,8 @@ def degraded_stage(found: Evidence, floor: float, resamples: Tensor) -> Degraded
             model = SensorModel(sensor_of(own, None), torch.float64)
             left_out = model.left_out
             frames_held = torch.nonzero(held[observations.unit]).reshape(-1)
-            light = light_images(model, observations, study.inputs)
-            ideal = distance_images(own.observations, own.tool_from_camera, frames_held)
-            lit = None if light is None else light[frames_held]
-            seen = own.observations.recording
-            images = expected_images(model, seen, frames_held, ideal, lit).flatten(1)
+            light = _light_images(model, study)
+            images = _expected_images(model, own, frames_held, light).flatten(1)
         pixels = held[study.unit_of_pixel].nonzero().reshape(-1)
         place = torch.searchsorted(frames_held, observations.frame[pixels])
         expected[pixels] = images[place, observations.pixel[pixels]]

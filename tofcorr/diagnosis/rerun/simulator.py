@@ -317,9 +317,7 @@ def _plain(study: Study) -> SimulatorOptions:
             modulation_frequency_hz=frequency,
             light=light.model_copy(update={"electrons_at_1m": electrons_at_1m}),
             readout=ReadoutOptions(
-                electrons_per_count=electrons_per_count,
-                read_noise_electrons=0.0,
-                converter_bits=32,
+                electrons_per_count=electrons_per_count, read_noise_electrons=0.0, converter_bits=32
             ),
         ),
     )
