@@ -170,7 +170,7 @@ def planes_through(
 
     Args:
         points: Sums of (x, 1)(x, 1)^T over the points, shape (..., 4, 4), metres.
-        viewpoint: Points that the normals shall face, shape (..., 3).
+        viewpoint: Points that the normals shall face, metres: one for each plane, or for all.
 
     Returns:
         Unit normals (..., 3) and offsets (...), metres.
