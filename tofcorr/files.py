@@ -328,7 +328,7 @@ def refuse_damaged(path: Path, what: str) -> None:
             found = _digest(archive)
             stored = json.loads(archive.read(sealed[0]))["sha256"] if sealed else found
     except FileNotFoundError:
-        raise CalibrationDataError(f"{path}: there is no such file.") from None
+        raise CalibrationDataError(f"{path}: there is no such file; expected {what}.") from None
     except IsADirectoryError:
         raise CalibrationDataError(f"{path}: is a folder; expected {what}, a file.") from None
     except _UNREADABLE:

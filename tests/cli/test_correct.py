@@ -160,7 +160,7 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
     pickled = tmp_path / "weights.pt"
     torch.save({"weight": torch.ones(2)}, pickled)
     cases = [
-        (tmp_path / "none.ts", source, "none.ts: there is no such file."),
+        (tmp_path / "none.ts", source, "none.ts: there is no such file"),
         (tmp_path, source, "is a folder; expected the corrector.ts of a run"),
         (corrector, tmp_path / "nowhere", "nowhere: there is no such folder."),
         (corrector, garbage, "garbage.ts: is a file; a recording is a folder"),

@@ -66,15 +66,11 @@ def check(
         raise ConfigError(f"threshold_mm: expected a positive number, got {threshold_mm:g}.")
     if out is not None:
         file_to_replace(Path(out), CalibrationDataError)
-    path = Path(run) / STATE_FILE
-    if not path.is_file():
-        raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
-    dataset = Dataset(opened(recordings))
-    state = load_calibration(path)
+    state, dataset = load_calibration(Path(run) / STATE_FILE), Dataset(opened(recordings))
     _refuse_unfit(state, dataset, "per_image")
     planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
     headline = vet(dataset, planes, fits=False, force=force).headline
-    reference = load_reference(path.with_name(REFERENCE_FILE), state)
+    reference = load_reference(Path(run) / REFERENCE_FILE, state)
     with solvable(dataset.first.path, "check", _NO_SOLUTION):
         result = check_drift(state, dataset, wall, threshold_mm / 1e3, reference)
     low, high = result.interval

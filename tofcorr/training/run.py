@@ -20,7 +20,7 @@ from tofcorr.correction.state import (
     load_calibration,
     save_calibration,
 )
-from tofcorr.errors import CalibrationDataError, ConfigError, ExportError
+from tofcorr.errors import ConfigError, ExportError
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Solution
 from tofcorr.files import refuse_existing, staged_file, staged_folder
@@ -82,10 +82,7 @@ def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
         CalibrationDataError: The folder holds no run.
         ConfigError: The run was of another model.
     """
-    path = Path(run) / STATE_FILE
-    if not path.is_file():
-        raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
-    state = load_calibration(path)
+    state = load_calibration(Path(run) / STATE_FILE)
     if not state.error_model.same_coefficients(options.model):
         raise ConfigError(
             f"{run}: its model has other terms than the configuration asks for; resume with the "
