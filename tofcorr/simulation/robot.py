@@ -119,7 +119,7 @@ def draw_slip(robot: RobotOptions, generator: torch.Generator) -> Tensor:
     return scale * torch.randn(6, generator=generator, dtype=torch.float64)
 
 
-def tool_twists(timestamp: Tensor, world_from_tool: Tensor, *, longest_gap: float = 1.0) -> Tensor:
+def tool_twists(timestamp: Tensor, world_from_tool: Tensor) -> Tensor:
     """Return the tool's velocity in every frame, from a parabola through it and two near it.
 
     At the ends of a stroke both neighbours lie on one side.
@@ -127,8 +127,6 @@ def tool_twists(timestamp: Tensor, world_from_tool: Tensor, *, longest_gap: floa
     Args:
         timestamp: Of the frames, shape (F,), seconds.
         world_from_tool: Poses of the tool, shape (F, 4, 4).
-        longest_gap: Poses farther apart in time, seconds, do not determine the velocity between
-            them. Chosen: a robot starts and stops within a second.
 
     Returns:
         Twists in the tool's own frame, translation first, shape (F, 6), m/s and rad/s; NaN where a
@@ -136,7 +134,8 @@ def tool_twists(timestamp: Tensor, world_from_tool: Tensor, *, longest_gap: floa
     """
     count, gaps = len(timestamp), timestamp.diff()
     twists = timestamp.new_full((count, 6), torch.nan)
-    stroke = torch.cat([gaps.new_zeros(1), (gaps > longest_gap).cumsum(0)])
+    # A robot starts and stops within a second (chosen): poses farther apart say nothing.
+    stroke = torch.cat([gaps.new_zeros(1), (gaps > 1.0).cumsum(0)])
     for frame in range(count) if bool((gaps > 0).all()) else ():
         around = (frame - 1, frame + 1, frame - 2, frame + 2)
         near = [k for k in around if 0 <= k < count and stroke[k] == stroke[frame]][:2]
