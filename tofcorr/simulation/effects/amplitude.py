@@ -9,7 +9,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import AMPLITUDE, EffectInputs
-from tofcorr.simulation.effects.numerics import inner_range, legendre, side_by_side
+from tofcorr.simulation.effects.numerics import legendre, side_by_side
 
 
 class AmplitudeShape(Options):
@@ -44,13 +44,15 @@ class AmplitudeEffect(LinearDelay):
         Raises:
             CalibrationDataError: No amplitude is above zero.
         """
-        positive = inputs.known_amplitude[inputs.known_amplitude > 0]
-        if not len(positive):
+        known = inputs.known_amplitude
+        ordered = known[known > 0].sort().values
+        if not len(ordered):
             raise CalibrationDataError(
                 "amplitude.npy holds 0 in every pixel used, so it was not measured: remove the "
                 "file; what is missing is unknown, never zero."
             )
-        low, high = inner_range(positive, 0.002)
+        beyond = int(0.002 * len(ordered))
+        low, high = ordered[[beyond, min(len(ordered) - 1, int(0.998 * len(ordered)))]].tolist()
         return cls(AmplitudeShape(low_counts=low, high_counts=high))
 
     @classmethod
