@@ -1,6 +1,7 @@
 """What is written is what is read, and what other tools write is read as well."""
 
 import filecmp
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,15 +80,7 @@ def test_a_frame_without_a_name_keeps_the_usual_one(folder: Path) -> None:
 
 
 def test_what_is_optional_may_be_left_out_and_is_none(tmp_path: Path) -> None:
-    rows = [
-        FrameRow(
-            timestamp=0.0,
-            world_from_tool=np.eye(4),
-            normal_world=np.array([0.0, 0.0, -1.0]),
-            offset=1.0,
-            target="white",
-        )
-    ]
+    rows = [replace(_without_optionals()[0], world_from_tool=np.eye(4))]
     depth = np.ones((1, CAMERA.height, CAMERA.width))
     write_recording(tmp_path / "bare", camera=CAMERA, depth_kind="z", rows=rows, depth=depth)
     recording = Recording.open(tmp_path / "bare")

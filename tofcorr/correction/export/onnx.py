@@ -35,7 +35,6 @@ def export_onnx(corrector: DepthCorrector, path: Path | str, reference: Calibrat
         ConfigError: The optional packages are not installed.
         ExportError: onnxruntime's result differs from the float64 model; nothing is written.
     """
-    format_named("onnx").require_packages()
     with staged_file(path) as part:
         _write(corrector, part)
         require_parity(load_onnx(part), reference)
