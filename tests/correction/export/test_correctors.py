@@ -137,6 +137,15 @@ def test_points_in_the_tool_frame_are_those_of_the_camera_moved(frames: Frames) 
     torch.testing.assert_close(points[..., 2], corrector(*frames)[0], equal_nan=True)
 
 
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+def test_a_batch_corrected_in_strips_is_the_same(depth_kind: str, frames: Frames) -> None:
+    corrector = DepthCorrector.from_state(calibration(depth_kind=depth_kind))
+    whole = corrector(*frames)
+    corrector.strip_pixels = 30
+    in_strips = torch.jit.script(corrector)(*frames)
+    torch.testing.assert_close(in_strips, whole, rtol=0, atol=0, equal_nan=True)
+
+
 def test_metadata_names_camera_model_and_range() -> None:
     metadata = json.loads(DepthCorrector.from_state(calibration(np.eye(4))).metadata())
     assert metadata["camera"]["width"] == 7
