@@ -197,44 +197,44 @@ def read_mapping(path: Path, kind: type[TofcorrError] = ConfigError) -> Mapping[
     Raises:
         TofcorrError: Of kind `kind`: the file cannot be read, or holds something else.
     """
-    try:
-        values = read_yaml(path)
-    except ConfigError as error:
-        raise kind(str(error)) from None
+    values = parse_yaml(read_text(path, kind), str(path), kind)
     if not isinstance(values, Mapping):
         raise kind(f"{path}: expected keys and values, got {type(values).__name__}.")
     return values
 
 
-def read_text(path: Path) -> str:
+def read_text(
+    path: Path, kind: type[TofcorrError] = ConfigError, most_bytes: int = _MOST_BYTES
+) -> str:
     """Return the text of a file of bounded size.
 
     Raises:
-        ConfigError: The file is missing, unreadable, too large or not UTF-8.
+        TofcorrError: Of kind `kind`: the file is missing, unreadable, too large or not UTF-8.
     """
     try:
         with path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:
-            raise ConfigError(
-                f"{path}: larger than {_MOST_BYTES // 10**6} MB, the limit of such a file here."
+            content = file.read(most_bytes + 1)
+        if len(content) > most_bytes:
+            raise kind(
+                f"{path}: larger than {most_bytes // 10**6} MB, the limit of such a file here."
             )
         return content.decode("utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: there is no such file.") from None
+        raise kind(f"{path}: there is no such file.") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text ({error}).") from None
+        raise kind(f"{path}: cannot be read as text ({error}).") from None
 
 
-def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold anything
+def parse_yaml(text: str, where: str, kind: type[TofcorrError] = ConfigError) -> Any:  # noqa: ANN401
     """Return the value of YAML text.
 
     Args:
         text: One document.
         where: What to call the source in an error message.
+        kind: The error to raise.
 
     Raises:
-        ConfigError: The text is not YAML, or its aliases expand to too much.
+        TofcorrError: Of kind `kind`: the text is not YAML, or its aliases expand to too much.
     """
     try:
         events = yaml.parse(text, Loader=_LOADER)  # Refuses control characters already.
@@ -242,11 +242,11 @@ def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold an
             if isinstance(event, yaml.NodeEvent):
                 _size(event, events, {}, where, 0)
         return _LOADER(text).get_single_data()
-    except ConfigError:
-        raise
+    except ConfigError as error:
+        raise kind(str(error)) from None
     except _NOT_YAML as error:
         in_one_line = one_line(" ".join(str(error).split()))
-        raise ConfigError(f"{where}: not valid YAML: {in_one_line}") from None
+        raise kind(f"{where}: not valid YAML: {in_one_line}") from None
 
 
 def dump_yaml(values: Mapping[str, Any], last: str = "") -> str:

@@ -6,15 +6,15 @@ second time.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 # Planes n . x + d = 0 around the robot, normals inwards, z up.
-FLOOR = (np.array([0.0, 0.0, 1.0]), 0.0)
-FRONT = (np.array([-1.0, 0.0, 0.0]), 2.0)
-LEFT = (np.array([0.0, -1.0, 0.0]), 2.2)
+Plane = tuple[tuple[float, float, float], float]
+FLOOR: Plane = ((0.0, 0.0, 1.0), 0.0)
+FRONT: Plane = ((-1.0, 0.0, 0.0), 2.0)
+LEFT: Plane = ((0.0, -1.0, 0.0), 2.2)
 ROOM = (FLOOR, FRONT, LEFT)
 
 FARTHEST = 6.5
@@ -77,11 +77,10 @@ class Recorded:
         What was `world` is then the robot's tool, and what was `tool` its base; the poses become
         base_from_tool.
         """
-        return replace(
-            self,
-            world_from_tool=np.linalg.inv(self.world_from_tool),
-            exact=np.linalg.inv(self.exact),
-        )
+        inverse = {
+            name: np.linalg.inv(getattr(self, name)) for name in ("world_from_tool", "exact")
+        }
+        return replace(self, **inverse)
 
     def stamped_late(self, seconds: float) -> "Recorded":
         """Return the same with the image clock late by this much."""
@@ -112,7 +111,7 @@ class Drive:
     height: int = 50
     error: float = 1.0
     noise: float = 0.003
-    planes: tuple[tuple[np.ndarray, float], ...] = ROOM
+    planes: tuple[Plane, ...] = ROOM
     seed: int = 0
     rate: float = 7.0
     dwell: float = 0.8
@@ -166,35 +165,14 @@ class Drive:
 
     def _matrix(self) -> np.ndarray:
         focal = 0.95 * self.width
-        return np.array(
-            [
-                [focal, 0.0, self.width / 2 - 0.8],
-                [0.0, focal, self.height / 2 + 0.3],
-                [0.0, 0.0, 1.0],
-            ]
-        )
-
-    def _rays(self) -> np.ndarray:
-        """Return unit rays, the lens's distortion undone by iteration."""
-        v, u = np.mgrid[: self.height, : self.width].astype(float)
-        matrix = self._matrix()
-        seen = np.stack([(u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]])
-        k1, k2, p1, p2, k3 = (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-        x, y = seen
-        for _ in range(50):
-            square = x * x + y * y
-            radial = 1 + square * (k1 + square * (k2 + square * k3))
-            x, y = (
-                (seen[0] - 2 * p1 * x * y - p2 * (square + 2 * x * x)) / radial,
-                (seen[1] - p1 * (square + 2 * y * y) - 2 * p2 * x * y) / radial,
-            )
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
-        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        matrix = np.diag([focal, focal, 1.0])
+        matrix[:2, 2] = self.width / 2 - 0.8, self.height / 2 + 0.3
+        return matrix
 
     def _image(
         self, world_from_camera: np.ndarray, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        rays = self._rays()
+        rays = unit_rays(self._matrix(), self.width, self.height, self.distortion)
         world, place = rays @ world_from_camera[:3, :3].T, world_from_camera[:3, 3]
         nearest, cosine, _ = met(self.planes, world, place)
         returned = nearest < FARTHEST
@@ -203,21 +181,45 @@ class Drive:
         met_at = place + depth[..., None] * world
         reflectivity = 0.7 + 0.3 * np.sign(np.sin(9 * met_at).prod(axis=-1) + 0.02)
         amplitude = 3000 * reflectivity * cosine / depth**2 * rays[..., 2] ** 2
-        measured = depth + self.error * self._error(depth, amplitude)
+        measured = depth + self.error * systematic_error(
+            depth, amplitude, 0.02, (6e-3, -4e-3), -1.5e-6
+        )
         measured = measured + self.noise * generator.normal(size=depth.shape)
         z_mm = np.round(1e3 * measured * rays[..., 2])
-        return (
-            np.where(returned, z_mm, 0).astype(np.uint16),
-            np.where(returned, np.round(amplitude), 0).astype(np.uint16),
-        )
+        depth, counts = (np.where(returned, one, 0) for one in (z_mm, np.round(amplitude)))
+        return depth.astype(np.uint16), counts.astype(np.uint16)
 
-    def _error(self, depth: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return D + P + I: a quadratic in distance, a bowl and a tilt, a slope in amplitude."""
-        v, u = np.mgrid[: self.height, : self.width]
-        row, column = v / self.height - 0.5, u / self.width - 0.5
-        of_pixel = 0.02 * (row**2 + column**2) + 0.006 * row - 0.004 * column
-        apart = depth - 1.5
-        return 0.006 + 0.005 * apart - 0.003 * apart**2 + of_pixel - 1.5e-6 * amplitude
+
+def unit_rays(
+    matrix: np.ndarray, width: int, height: int, distortion: tuple[float, ...] = ()
+) -> np.ndarray:
+    """Return unit rays, shape (H, W, 3), the lens's distortion undone by iteration."""
+    v, u = np.mgrid[:height, :width].astype(float)
+    seen = np.stack([(u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]])
+    k1, k2, p1, p2, k3 = (*distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    x, y = seen
+    for _ in range(50 if distortion else 0):
+        square = x * x + y * y
+        radial = 1 + square * (k1 + square * (k2 + square * k3))
+        x, y = (
+            (seen[0] - 2 * p1 * x * y - p2 * (square + 2 * x * x)) / radial,
+            (seen[1] - p1 * (square + 2 * y * y) - 2 * p2 * x * y) / radial,
+        )
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def systematic_error(
+    depth: np.ndarray, amplitude: np.ndarray, bowl: float, tilt: tuple[float, float], slope: float
+) -> np.ndarray:
+    """Return D + P + I: a quadratic in distance, a bowl and a tilt, a slope in amplitude."""
+    row, column = (
+        k / size - 0.5 for k, size in zip(np.indices(depth.shape), depth.shape, strict=True)
+    )
+    apart = depth - 1.5
+    of_distance = 0.006 + 0.005 * apart - 0.003 * apart**2
+    of_pixel = bowl * (row**2 + column**2) + tilt[0] * row + tilt[1] * column
+    return of_distance + of_pixel + slope * amplitude
 
 
 def _looking_at_walls(generator: np.random.Generator) -> np.ndarray:
@@ -240,7 +242,7 @@ def looking(place: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
 
 
 def met(
-    planes: Iterable[tuple[Any, float]],
+    planes: Iterable[Plane],
     world: np.ndarray,
     place: np.ndarray,
     shown: Callable[[int, np.ndarray], np.ndarray | bool] = lambda number, points: True,

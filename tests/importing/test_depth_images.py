@@ -22,20 +22,13 @@ CAMERA = CameraIntrinsics(
 FITS, TURNED = np.ones((3, 4), np.float32), np.ones((4, 3), np.float32)
 
 
-def test_an_image_of_the_size_of_the_intrinsics_is_taken_as_it_is() -> None:
+def test_an_image_of_another_size_than_the_intrinsics_is_refused_with_both_sizes() -> None:
     for image in (DepthImage(FITS), DepthImage(FITS, FITS)):
         assert of_size(image, CAMERA) is image
-
-
-@pytest.mark.parametrize(
-    ("image", "what"),
-    [(DepthImage(TURNED), "depth"), (DepthImage(FITS, TURNED), "amplitude")],
-    ids=["depth", "amplitude"],
-)
-def test_an_image_of_another_size_is_refused_with_both_sizes(image: DepthImage, what: str) -> None:
-    message = f"its {what} has 3x4 pixels, the intrinsics hold for 4x3"
-    with pytest.raises(RefusedViewError, match=f"^{re.escape(message)}$"):
-        of_size(image, CAMERA)
+    for what, image in (("depth", DepthImage(TURNED)), ("amplitude", DepthImage(FITS, TURNED))):
+        message = f"its {what} has 3x4 pixels, the intrinsics hold for 4x3"
+        with pytest.raises(RefusedViewError, match=f"^{re.escape(message)}$"):
+            of_size(image, CAMERA)
 
 
 def test_amplitudes_turn_with_the_images_and_keep_their_counts() -> None:
@@ -45,7 +38,7 @@ def test_amplitudes_turn_with_the_images_and_keep_their_counts() -> None:
     assert found is not None
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, np.rot90(counts, -1))
-    with pytest.raises(RefusedViewError, match=r"^a.png has 8 bits a pixel; .* as amplitude$"):
+    with pytest.raises(RefusedViewError, match=r"^a.png has 8 bits a pixel; .* as amplitude "):
         coded_image(DepthCoding(), depth, (counts.astype(np.uint8), "a.png"))
 
 

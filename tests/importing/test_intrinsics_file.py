@@ -1,5 +1,6 @@
 """Intrinsics are read from the files that other programs write."""
 
+import json
 from contextlib import suppress
 from pathlib import Path
 
@@ -8,36 +9,62 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from importing.intrinsics_texts import DISTORTION, JSON, NUMBERS, OPENCV, OURS, RECORDING, ROS, K
 
 from tofcorr.errors import CalibrationDataError, TofcorrError
 from tofcorr.importing.intrinsics import read_intrinsics, read_named_intrinsics
 
+K = [[365.5, 0.0, 255.5], [0.0, 366.5, 205.0], [0.0, 0.0, 1.0]]
+DISTORTION = [0.09, -0.27, 0.001, 0.002]
+EIGHT = [0.1, 0.2, 0.001, 0.002, 0.3, 0.4, 0.5, 0.6]
+OURS = f"width: 512\nheight: 424\nK: {K}\ndistortion: {DISTORTION}\n"
+RECORDING = f"camera: {{width: 512, height: 424, K: {K}, distortion: {DISTORTION}}}\n"
+ROS = f"""
+image_width: 512
+image_height: 424
+camera_matrix: {{rows: 3, cols: 3, data: {np.ravel(K).tolist()}}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: {DISTORTION}}}
+"""
+JSON = json.dumps({"width": 512, "height": 424, "camera_matrix": K, "dist_coeffs": [DISTORTION]})
+OPENCV = (
+    f"%YAML:1.0\n---\nK: !!opencv-matrix\n   rows: 3\n   cols: 3\n   data: {np.ravel(K).tolist()}"
+)
+NUMBERS = f"{{fx: 365.5, fy: 366.5, cx: 255.5, cy: 205, distortion: {DISTORTION}}}"
+KALIBR = f"""
+cam0:
+  camera_model: pinhole
+  intrinsics: [365.5, 366.5, 255.5, 205.0]
+  distortion_model: radtan
+  distortion_coeffs: {DISTORTION}
+  resolution: [512, 424]
+  rostopic: /tof/ir
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "camera.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
 
 @pytest.mark.parametrize(
-    ("text", "size"),
-    [(OURS, (512, 424)), (RECORDING, (512, 424)), (ROS, (512, 424)), (JSON, (512, 424)),
-     (NUMBERS, None)],
-    ids=["own", "recording", "ros", "json", "numbers"],
+    ("text", "distortion", "size"),
+    [
+        *((text, DISTORTION, (512, 424)) for text in (OURS, RECORDING, ROS, JSON, KALIBR)),
+        (NUMBERS, DISTORTION, None),
+        (ROS.replace("plumb_bob", "rational_polynomial").replace(str(DISTORTION), str(EIGHT)),
+         EIGHT, (512, 424)),
+        # The K.txt beside the frames of many simulators and data sets.
+        *((between.join(map(str, np.ravel(K))), [], None) for between in (" ", ",")),
+    ],
 )  # fmt: skip
 def test_every_way_to_write_a_camera_is_understood(
-    tmp_path: Path, text: str, size: tuple[int, int] | None
+    tmp_path: Path, text: str, distortion: list[float], size: tuple[int, int] | None
 ) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    lens = read_intrinsics(path)
+    lens = read_intrinsics(written(tmp_path, text))
     assert lens.matrix == tuple(map(tuple, K))
-    assert lens.distortion == tuple(DISTORTION)
+    assert lens.distortion == tuple(distortion)
     assert lens.size == size
-
-
-@pytest.mark.parametrize("delimiter", [" ", ","])
-def test_a_matrix_alone_is_understood(tmp_path: Path, delimiter: str) -> None:
-    # The K.txt beside the frames of many simulators and data sets.
-    np.savetxt(tmp_path / "K.txt", np.array(K), delimiter=delimiter)
-    lens = read_intrinsics(tmp_path / "K.txt")
-    assert lens.matrix == tuple(map(tuple, K))
-    assert lens.distortion == ()
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
@@ -55,24 +82,42 @@ def test_files_of_opencv_are_understood(tmp_path: Path, suffix: str) -> None:
     assert lens.size == (512, 424)
 
 
+# cv2.FileStorage once ended the process on a mutated file: the texts of OpenCV are read without it.
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("distortion: [0, 0, 0, 0]", r"no camera matrix.*got 'distortion'"),
-        ("K: [1, 2, 3]", "must have 9 numbers, got 3"),
-        ("K: [[a, 0, 0], [0, 1, 0], [0, 0, 1]]", "camera matrix must be numbers"),
-        ("K: [[.nan, 0, 0], [0, 1, 0], [0, 0, 1]]", "camera matrix must be finite"),
-        (ROS.replace("plumb_bob", "equidistant"), "'equidistant' is not supported"),
+        ("K: [1, 2, 3]", "camera matrix: expected 9 finite numbers"),
+        ("K: [[a, 0, 0], [0, 1, 0], [0, 0, 1]]", "expected 9 finite numbers, got .*'a'"),
+        ("K: [[.nan, 0, 0], [0, 1, 0], [0, 0, 1]]", "expected 9 finite numbers, got .*nan"),
+        *((ROS.replace("plumb_bob", model), f"'{model}' is not supported")
+          for model in ("equidistant", "fisheye", "thin_prism")),
+        (KALIBR.replace(": radtan", ": equidistant"), "'equidistant' is not supported"),
+        (KALIBR.replace(": pinhole", ": omni"), "'omni'"),
         ("just text", "expected keys and values, got str"),
         ("K: [[1, 0", "not valid YAML"),
         ("%YAML:1.0\n---\nK: !!opencv-matrix\n   rows: 3\n   cols: [", "not a readable OpenCV"),
+        ("%YAML:1.0\n---\n- 1\n", "expected keys and values, got list"),
+        ("%YAML:1.0\n---\nK: !!opencv-matrix\n   rows: 3\n   cols: 3\n   data: [1, 2]\n",
+         "'K' must have rows x cols numbers, got 2 for 3 x 3"),
+        ("%YAML:1.0\n---\nK: !!opencv-matrix\n   data: [1, 2]\n", "got 2 for None x None"),
+        ("<opencv_storage><K><data>1", "not a readable OpenCV file"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "entities"),
+        ("<opencv_storage><size>3</size></opencv_storage>", "no camera matrix.*got 'size'"),
+        pytest.param("%YAML:1.0\n---\n" + 17_000_000 * " ", "larger than 16 MB", id="large"),
+        (OURS, "hold for 512x424 pixels, the images have 320x240"),
+        ("K: [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]", "focal lengths of K must be positive"),
+        ("K: [[9, 1, 0], [0, 9, 0], [0, 0, 1]]", "skew of 1"),
+        ("K: [[1, 0, 0], [2, 1, 0], [0, 0, 1]]", "upper triangular"),
+        ("{fx: 9, fy: 9, cx: 1, cy: 1, D: [1, 2, 3]}", "0, 4, 5, 8, 12 or 14 coefficients"),
     ],
-)
-def test_broken_files_are_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text(text)
+)  # fmt: skip
+def test_broken_files_and_lenses_that_do_not_fit_are_refused_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, message: str
+) -> None:
+    monkeypatch.delattr(cv2, "FileStorage")
     with pytest.raises(CalibrationDataError, match=message) as refusal:
-        read_intrinsics(path)
+        read_intrinsics(written(tmp_path, text)).camera((320, 240))
     assert "camera.yaml" in str(refusal.value)
 
 
@@ -81,56 +126,12 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
         read_intrinsics(tmp_path / "none.yaml")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("%YAML:1.0\n---\n- 1\n", "expected keys and values, got list"),
-        ("%YAML:1.0\n---\nK: !!opencv-matrix\n   rows: 3\n   cols: 3\n   data: [1, 2]\n",
-         "'K' must have rows x cols numbers, got 2 for 3 x 3"),
-        ("%YAML:1.0\n---\nK: !!opencv-matrix\n   data: [1, 2]\n", "got 2 for None x None"),
-        ("<opencv_storage><K><data>1", "not a readable OpenCV file"),
-        ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "entities"),
-        ("<opencv_storage><size>3</size></opencv_storage>", "no camera matrix.*got 'size'"),
-    ],
-)  # fmt: skip
-def test_broken_files_of_opencv_are_refused_without_opencv(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, message: str
-) -> None:
-    # cv2.FileStorage once ended the process on a mutated file.
-    monkeypatch.delattr(cv2, "FileStorage")
-    path = tmp_path / "camera.xml"
-    path.write_text(text)
-    with pytest.raises(CalibrationDataError, match=message):
-        read_intrinsics(path)
-
-
-def test_a_file_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text("%YAML:1.0\n---\n")
-    with path.open("r+b") as file:
-        file.truncate(17_000_000)
-    with pytest.raises(CalibrationDataError, match="larger than 16 MB"):
-        read_intrinsics(path)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (OURS, "hold for 512x424 pixels, the images have 320x240"),
-        ("K: [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]", "focal lengths of K must be positive"),
-        ("K: [[9, 1, 0], [0, 9, 0], [0, 0, 1]]", "skew of 1"),
-        ("K: [[1, 0, 0], [2, 1, 0], [0, 0, 1]]", "upper triangular"),
-        ("{fx: 9, fy: 9, cx: 1, cy: 1, D: [1, 2, 3]}", "0, 4, 5, 8, 12 or 14 coefficients"),
-    ],
-)
-def test_a_lens_that_does_not_fit_the_images_is_refused(
-    tmp_path: Path, text: str, message: str
-) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text(text)
-    with pytest.raises(CalibrationDataError, match=message) as refusal:
-        read_intrinsics(path).camera((320, 240))
-    assert "camera.yaml" in str(refusal.value)
+def test_of_several_cameras_one_is_named_behind_the_file(tmp_path: Path) -> None:
+    second = KALIBR.replace("cam0", "cam1").replace("365.5", "400.0")
+    path = written(tmp_path, KALIBR + second)
+    with pytest.raises(CalibrationDataError, match=r"cam0 .*cam1 .*FILE#cam0"):
+        read_named_intrinsics(str(path))
+    assert read_named_intrinsics(f"{path}#cam1").matrix[0][0] == 400.0
 
 
 @settings(
@@ -145,8 +146,7 @@ def test_a_lens_that_does_not_fit_the_images_is_refused(
 def test_a_damaged_file_is_read_or_refused_but_never_crashes(
     tmp_path: Path, original: str, start: int, length: int, junk: str
 ) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text(original[:start] + junk + original[start + length :])
+    path = written(tmp_path, original[:start] + junk + original[start + length :])
     with suppress(TofcorrError):
         read_intrinsics(path).camera((512, 424))
 

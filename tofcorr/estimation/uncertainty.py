@@ -222,7 +222,7 @@ def observability(
     # Rounding may leave a variance below zero where the images fit exactly.
     variances, vectors = variances[order].clamp(min=0.0), vectors[:, order]
     undetermined = int((variances > PRIOR_SIGMA**2 / 2).sum())
-    vectors[:, :undetermined] = _sparse_basis(vectors[:, :undetermined])
+    vectors[:, :undetermined] = sparse_basis(vectors[:, :undetermined])
     left, right = torch.triu_indices(len(names), len(names), offset=1)
     order = correlation[left, right].abs().argsort(descending=True)
     pairs = {
@@ -241,7 +241,7 @@ def observability(
     )
 
 
-def _sparse_basis(basis: Float[Tensor, "P k"]) -> Float[Tensor, "P k"]:
+def sparse_basis(basis: Float[Tensor, "P k"]) -> Float[Tensor, "P k"]:
     """Turn an orthonormal basis (P, k) into one of the same space whose vectors are sparse.
 
     Undetermined directions are equally weak, so that any mixture of them is an eigenvector as
@@ -265,14 +265,22 @@ def _direction(
     correlation: Float[Tensor, "P P"],
     names: list[str],
 ) -> Direction:
+    shares = named_components(vector, names)
+    first = [names.index(name) for name in list(shares)[:2]]
+    both = float(correlation[first[0], first[1]]) if len(first) > 1 else None
+    return Direction(float(variance) ** 0.5, shares, both)
+
+
+def named_components(vector: Float[Tensor, "P"], names: list[str]) -> dict[str, float]:
+    """Return the unknowns of the largest components, largest first, with their components.
+
+    Components below a fifth of the largest are left out.
+    """
     size = vector.abs()
-    # Components below a fifth of the largest are left out of its name.
     # Of equal ones the first comes first, whatever their rounding.
     order = sorted(range(len(names)), key=lambda k: -round(float(size[k]), 9))
-    named = [k for k in order if size[k] > size.max() / 5]
-    shares = {names[k]: float(vector[k]) for k in named}
-    both = float(correlation[named[0], named[1]]) if len(named) > 1 else None
-    return Direction(float(variance) ** 0.5, shares, both)
+    named = [k for k in order if 5 * size[k] > size.max()]
+    return {names[k]: float(vector[k]) for k in named}
 
 
 def prior_on_undetermined(found: Observability, guess: Parameters) -> Prior | None:

@@ -72,17 +72,12 @@ pose_format_option = option(
     type=click.Choice(["tum", "csv", "matrix", "matrices", "moveit"]),
 )  # fmt: skip
 
-_FILES = (
-    "YAML or JSON with K and distortion, ROS camera_info, OpenCV file, text of a 3x3 matrix, or a "
-    "shipped name."
-)
-_LENS = "With --focal: K1,K2,P1,P2[,K3...]."
 intrinsics_options = _adding(
-    option("--intrinsics", _FILES),
+    option("--intrinsics", "YAML, JSON, ROS camera_info, OpenCV, text of 3x3, or a shipped name."),
     option("--calibrate", "Calibrate the intrinsics from the boards.", is_flag=True),
     option("--focal", "Focal length F or FX,FY, pixels.", type=NumberList(1, 2)),
     option("--centre", "Principal point CX,CY, pixels.", type=NumberList(2)),
-    option("--distortion", _LENS, type=NumberList(4, 5, 8, 12, 14)),
+    option("--distortion", "With --focal: K1,K2,P1,P2[,K3...].", type=NumberList(4, 5, 8, 12, 14)),
 )
 """Adds the options that say where the camera intrinsics come from."""
 
@@ -97,26 +92,19 @@ coding_options = _adding(
 )
 """Adds the options that say how the numbers of depth images are to be read."""
 
-_MOVED = "The camera stands still; the robot moves the target in front of it."
-_CLOCKS = "Added to the images' time stamps, if the clocks differ by a known amount."
-_LATE = "How much later images are stamped than poses; left out: estimated."
-_TOLERANCE = "How far a pixel of a wall may be from its plane: the error before calibration."
-_CAMERA = "Of the camera; left out: as images call it, else 'camera'."
 _FULL = "Pixels at or above this amplitude are saturated and not used."
 posed_options = _adding(
-    option("--eye-to-hand", _MOVED, is_flag=True),
+    option("--eye-to-hand", "The camera stands still; the robot moves the target.", is_flag=True),
     depth_kind_option,
-    option("--time-offset-s", _CLOCKS, default=0.0),
-    option("--lag-s", _LATE, type=float),
-    option(
-        "--pose-tolerance-s", "Largest time between an image and the nearest pose.", default=0.2
-    ),
+    option("--time-offset-s", "Added to the images' time stamps.", default=0.0),
+    option("--lag-s", "How much later images are stamped than poses; left out: found.", type=float),
+    option("--pose-tolerance-s", "Largest time from an image to the nearest pose.", default=0.2),
     option("--keep-moving", "Also use images taken while the robot moved.", is_flag=True),
     option("--images-per-stop", "At most so many images of one stop of the robot.", default=3),
-    option("--tolerance-mm", _TOLERANCE, default=30.0),
+    option("--tolerance-mm", "How far a pixel of a wall may be from its plane.", default=30.0),
     option("--base-frame", "Name of the base.", default="base"),
     option("--tool-frame", "Name of the tool.", default="tool"),
-    option("--camera-frame", _CAMERA),
+    option("--camera-frame", "Of the camera; left out: as images call it, else 'camera'."),
     option("--saturation", _FULL, "saturation_amplitude", type=float),
     option("--modulation-frequency-hz", "If known.", type=float),
 )
@@ -135,10 +123,8 @@ def take_intrinsics(given: dict[str, Any]) -> "GivenIntrinsics | None":
     path, calibrate = given.pop("intrinsics"), given.pop("calibrate")
     focal, centre, distortion = (given.pop(key) for key in ("focal", "centre", "distortion"))
     if sum([path is not None, calibrate, focal is not None]) != 1:
-        raise ConfigError(
-            "say where the intrinsics come from, in one way: --intrinsics FILE, "
-            "--calibrate, or --focal and --centre."
-        )
+        ways = "--intrinsics FILE, --calibrate, or --focal and --centre"
+        raise ConfigError(f"say where the intrinsics come from, in one way: {ways}.")
     if (focal is None) != (centre is None) or (distortion and focal is None):
         raise ConfigError("--focal and --centre go together, and --distortion with them.")
     if calibrate:

@@ -2,9 +2,10 @@
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -12,14 +13,10 @@ from pydantic import PositiveFloat
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.intrinsics import GivenIntrinsics
 from tofcorr.importing.numbers import load_numbers
 from tofcorr.importing.pose_track import LEAST_SECONDS, in_seconds
 from tofcorr.importing.run import Refused, RefusedViewError
 from tofcorr.options import Options, one_line
-
-_LARGEST_GB = 1
-"""Largest image file read, GB: a hundred times a 4-megapixel depth image in float64."""
 
 
 class DepthImage(NamedTuple):
@@ -70,8 +67,7 @@ def matching_files(folder: Path, pattern: str, what: str) -> dict[str, Path]:
     parts = re.split(r"(\{view\}|\*|\?)", pattern)
     if len(parts) == 1:
         raise CalibrationDataError(
-            f"the {what} pattern '{pattern}' names one file; put {{view}} or * where the images "
-            "differ."
+            f"the {what} pattern '{pattern}' names one file; put {{view}} or * where names differ."
         )
     wildcards = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
     regex = re.compile("".join(wildcards.get(part, re.escape(part)) for part in parts))
@@ -81,9 +77,8 @@ def matching_files(folder: Path, pattern: str, what: str) -> dict[str, Path]:
         if match and path.is_file():
             found["-".join(match.groups())] = path
     if not found:
-        names = sorted((path.name for path in folder.iterdir()), key=_natural_order) or [""]
-        held = f"it holds {len(names)} entries such as '{names[0]}' and '{names[-1]}'"
-        held = held if names[0] else "the folder is empty"
+        names = sorted((path.name for path in folder.iterdir()), key=_natural_order)
+        held = f"it holds '{names[0]}', ..., '{names[-1]}'" if names else "the folder is empty"
         raise CalibrationDataError(
             f"{folder}: no file matches the {what} pattern '{pattern}'; {held}."
         )
@@ -121,11 +116,8 @@ def files_of_views(
     if not views:
         (one, files), (other, beside) = list(found.items())[:2]
         first, second = (next(iter(paths.values())).name for paths in (files, beside))
-        raise CalibrationDataError(
-            f"{folder}: no {one} image has an {other} image of the same name: '{patterns[one]}' "
-            f"matches '{first}', '{patterns[other]}' matches '{second}'. The text that {{view}} "
-            "(or *) matches must be the same in both."
-        )
+        said = f"no {one} image has an {other} image of the same {{view}} (or *)"
+        raise CalibrationDataError(f"{folder}: {said}: '{first}', '{second}'.")
     return views, refused
 
 
@@ -149,25 +141,13 @@ def times_in_names(views: list[str]) -> np.ndarray | None:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Read a grey image (PNG, TIFF, PGM), an NPY array or an EXR channel, shape (H, W).
+    """Read a grey image (PNG, TIFF, PGM), an NPY array, or an EXR or HDF5 image, shape (H, W).
 
     Raises:
         RefusedViewError: The file cannot be read, is no image, or has several channels.
     """
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise RefusedViewError(f"{path.name} cannot be read ({error.strerror})") from None
-    if size > _LARGEST_GB * 10**9:
-        raise RefusedViewError(f"{path.name} is larger than {_LARGEST_GB} GB")
-    array = {".npy": _npy, ".exr": _exr}.get(path.suffix.lower(), read_image)(path)
-    if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
-        array = array.squeeze()
-    if array.ndim != 2 or not array.size:
-        raise RefusedViewError(
-            f"{path.name} has shape {array.shape}; one channel of shape (rows, columns) is needed"
-        )
-    return array
+    reader = {".npy": _npy, ".exr": _exr, ".hdf5": _hdf5}.get(path.suffix.lower(), read_image)
+    return _one_channel(reader(path), path)
 
 
 def read_grey(path: Path) -> np.ndarray:
@@ -179,12 +159,20 @@ def read_grey(path: Path) -> np.ndarray:
     if path.suffix.lower() in (".npy", ".exr"):
         return read_array(path)
     image = read_image(path)
-    if image.ndim == 2:
-        return image
-    if image.ndim != 3 or image.shape[2] not in (3, 4):
-        raise RefusedViewError(f"{path.name} has shape {image.shape}; grey or colour is needed")
-    code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
-    return np.asarray(cv2.cvtColor(image, code))
+    if image.ndim == 3 and image.shape[2] in (3, 4):
+        code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
+        return np.asarray(cv2.cvtColor(image, code))
+    return _one_channel(image, path)
+
+
+def _one_channel(array: np.ndarray, path: Path) -> np.ndarray:
+    if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
+        array = array.squeeze()
+    if array.ndim != 2 or not array.size:
+        raise RefusedViewError(
+            f"{path.name} has shape {array.shape}; one channel of shape (rows, columns) is needed"
+        )
+    return array
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -223,9 +211,7 @@ def _exr(path: Path) -> np.ndarray:
     try:
         import OpenEXR
     except ImportError:
-        raise RefusedViewError(
-            f"{path.name} needs the package OpenEXR: pip install 'tofcorr[exr]'"
-        ) from None
+        raise RefusedViewError(f"{path} needs OpenEXR: pip install 'tofcorr[exr]'") from None
     try:
         with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
             channels = file.channels()
@@ -237,111 +223,99 @@ def _exr(path: Path) -> np.ndarray:
                     return np.array(channels[name].pixels)
     except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise RefusedViewError(f"{path.name} is not a readable EXR file ({error})") from None
+    listed = one_line(", ".join(names))
     raise RefusedViewError(
-        f"{path.name} holds the channels {one_line(', '.join(names))}; expected one that is called "
-        "Z, depth.Z or depth.V"
+        f"{path.name} holds the channels {listed}; expected Z, depth.Z or depth.V"
     )
+
+
+@contextmanager
+def opened_hdf5(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file; what the library raises on damaged bytes becomes one sentence."""
+    try:
+        import h5py
+    except ImportError:
+        raise RefusedViewError(f"{path} needs h5py: pip install 'tofcorr[hdf5]'") from None
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, KeyError, TypeError) as error:
+        raise RefusedViewError(f"{path}: not a readable HDF5 file ({error})") from None
+
+
+def _hdf5(path: Path) -> np.ndarray:
+    """Read `depth`, or else `distance`, as BlenderProc writes them."""
+    with opened_hdf5(path) as file:
+        depth = np.asarray(file["depth" if "depth" in file else "distance"])
+    if depth.dtype.kind not in "fiu":
+        raise RefusedViewError(f"{path.name}: its depth is not an array of numbers")
+    return depth
 
 
 Counts = tuple[np.ndarray, str]
 """An image as a file or a message holds it, and what it is called there."""
 
 
-def coded_image(
-    coding: DepthCoding, depth: Counts, amplitude: Counts | None = None, advice: str = ""
-) -> DepthImage:
+def read_depth(files: Mapping[str, Path], coding: DepthCoding) -> DepthImage:
+    """Read the `depth` of a view, and its `amplitude` if there is one.
+
+    Raises:
+        RefusedViewError: A file cannot be read, or as in `coded_image`.
+    """
+    given = (files[what] for what in ("depth", "amplitude") if what in files)
+    return coded_image(coding, *((read_array(path), path.name) for path in given))
+
+
+def coded_image(coding: DepthCoding, depth: Counts, amplitude: Counts | None = None) -> DepthImage:
     """Return an image in metres, turned as the coding says.
 
     Args:
         coding: How the numbers are to be read.
         depth: The depth.
         amplitude: The amplitude; None: there is none.
-        advice: What else to do with an amplitude of 8 bits, a sentence without a full stop.
 
     Raises:
         RefusedViewError: An image has 8 bits a pixel, or the depth's bytes stand in the wrong
             order.
     """
     counts, name = depth
-    _refuse_preview(depth, "(an 8-bit image is a preview, its depth is lost)")
+    _refuse_preview(depth, "depth (an 8-bit image is a preview)")
     if counts.dtype.kind in "iu" and counts.dtype.itemsize == 2:
         if coding.big_endian:
             counts = counts.byteswap()
         else:
             _refuse_swapped(counts, name)
     values = counts.astype(np.float64)
-    usable = np.isfinite(values) & (values > 0) & ~np.isin(values, coding.invalid)
-    unit_mm = coding.unit_mm or (1000.0 if counts.dtype.kind == "f" else 1.0)
-    metres = np.where(usable, values * unit_mm / 1000, np.nan)
-    image = DepthImage(turned(metres.astype(np.float32), coding.rotate))
+    metres = values * (coding.unit_mm or (1000.0 if counts.dtype.kind == "f" else 1.0)) / 1000
+    # Renderers write 1e10 m where nothing was hit.
+    usable = (metres > 0) & (metres < 10**5) & ~np.isin(values, coding.invalid)
+    metres = np.where(usable, metres, np.nan).astype(np.float32)
+    image = DepthImage(turned(metres, coding.rotate))
     if amplitude is None:
         return image
-    _refuse_preview(amplitude, f"as amplitude. {advice}" if advice else "as amplitude")
+    _refuse_preview(amplitude, "amplitude (a preview serves to find a board alone: --grey)")
     return image._replace(amplitude=turned(amplitude[0].astype(np.float32), coding.rotate))
 
 
-def _refuse_preview(image: Counts, why: str) -> None:
+def _refuse_preview(image: Counts, kind: str) -> None:
     if image[0].dtype.itemsize == 1:
-        raise RefusedViewError(f"{image[1]} has 8 bits a pixel; expected 16 bits or floats {why}")
+        raise RefusedViewError(
+            f"{image[1]} has 8 bits a pixel; expected 16 bits or floats as {kind}"
+        )
 
 
-def of_size(
-    image: DepthImage,
-    camera: CameraIntrinsics,
-    names: tuple[str, str] = ("its depth", "its amplitude"),
-    others: str = "the intrinsics hold for",
-) -> DepthImage:
+def of_size(image: DepthImage, camera: CameraIntrinsics) -> DepthImage:
     """Return the image, unless a camera of other intrinsics took it.
-
-    Args:
-        image: Depth and amplitude.
-        camera: The camera.
-        names: What depth and amplitude are called.
-        others: What has the camera's size, to begin "... 640x480".
 
     Raises:
         RefusedViewError: Depth or amplitude is of another size.
     """
-    for name, part in zip(names, image, strict=True):
+    for name, part in image._asdict().items():
         if part is not None and part.shape != (camera.height, camera.width):
-            raise RefusedViewError(
-                f"{name} has {part.shape[1]}x{part.shape[0]} pixels, {others} "
-                f"{camera.width}x{camera.height}"
-            )
+            size = f"{part.shape[1]}x{part.shape[0]}"
+            expected = f"the intrinsics hold for {camera.width}x{camera.height}"
+            raise RefusedViewError(f"its {name} has {size} pixels, {expected}")
     return image
-
-
-def camera_of(
-    intrinsics: GivenIntrinsics, read: Callable[[int], np.ndarray], count: int, origin: str
-) -> CameraIntrinsics:
-    """Return the intrinsics for images of the first readable size.
-
-    Args:
-        intrinsics: Of images as they are used.
-        read: Reads one of the images by its number.
-        count: How many there are.
-        origin: Where they come from, for messages.
-
-    Raises:
-        CalibrationDataError: No image can be read, or the intrinsics hold for another size.
-    """
-    reasons = []
-    for number in range(count):
-        try:
-            height, width = read(number).shape
-        except RefusedViewError as refusal:
-            reasons.append(str(refusal))
-            continue
-        if intrinsics.size == (height, width) and height != width:
-            raise CalibrationDataError(
-                f"{intrinsics.source}: the intrinsics hold for {height}x{width} pixels, the images "
-                f"have {width}x{height}: they seem to be turned. Add --rotate 90 or --rotate 270."
-            )
-        return intrinsics.camera((width, height))
-    raise CalibrationDataError(
-        f"{origin}: none of {count} depth images can be used; the first: "
-        f"{next(iter(reasons), 'there are none')}."
-    )
 
 
 def turned(image: np.ndarray, degrees: int) -> np.ndarray:
@@ -358,10 +332,8 @@ def _refuse_swapped(counts: np.ndarray, name: str, smoother: int = 4) -> None:
     few = counts[::4]  # Thousands of pixels, quickly.
     here, swapped = _roughness(few), _roughness(few.byteswap())
     if here > smoother * swapped > 0:
-        raise RefusedViewError(
-            f"{name}: neighbours differ by {here:.0f} counts as read and by {swapped:.0f} with the "
-            "bytes swapped; the image seems to be big-endian. Add --big-endian"
-        )
+        said = f"neighbours differ by {here:.0f} counts, with bytes swapped by {swapped:.0f}"
+        raise RefusedViewError(f"{name}: {said}. Add --big-endian")
 
 
 def _roughness(counts: np.ndarray) -> float:

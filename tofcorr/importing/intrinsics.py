@@ -1,23 +1,20 @@
 """Camera intrinsics as files and users give them, before the size of the images is known.
 
-Files of many programs are read into the keys of `recording.yaml`: `_understood` finds the camera
-where another program has put it, `_file_storage` reads OpenCV's own format.
+Files of many programs are read into the keys of `recording.yaml`: `_kalibr` finds the camera where
+Kalibr has put it, `_file_storage` reads OpenCV's own format.
 """
 
 import re
-import reprlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
-
 from tofcorr.data.recording import Header
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics, Matrix3
-from tofcorr.importing.numbers import any_numbers
+from tofcorr.importing.numbers import any_numbers, finite_numbers
 from tofcorr.options import is_shipped_name, one_line, parse_yaml, read_text, shipped_file
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
@@ -39,15 +36,12 @@ class GivenIntrinsics:
         distortion: OpenCV's coefficients k1 k2 p1 p2 [k3 ...]; empty for none.
         size: Width and height of the images that they are valid for; None if unknown.
         source: Where they come from (a file, options), for messages.
-        matrix_by_size: For a camera with several image sizes the matrix of each; `matrix` is then
-            that of the first.
     """
 
     matrix: Matrix3
     distortion: tuple[float, ...]
     source: str
     size: tuple[int, int] | None = None
-    matrix_by_size: Mapping[tuple[int, int], Matrix3] = field(default_factory=dict)
 
     def camera(self, size: tuple[int, int]) -> CameraIntrinsics:
         """Return the intrinsics for images of `size`, width and height.
@@ -55,26 +49,20 @@ class GivenIntrinsics:
         Raises:
             CalibrationDataError: They are valid for another size, or no camera has them.
         """
-        sizes = [*self.matrix_by_size] if self.size is None else [self.size]
-        if sizes and size not in sizes:
-            listed = ", ".join(f"{width}x{height}" for width, height in sizes)
+        own, (width, height) = self.size or size, size
+        if own != size:
+            advice = " Are they turned? Add --rotate 90 or --rotate 270 (import frames, rosbag)."
             raise CalibrationDataError(
-                f"{self.source}: the intrinsics hold for {listed} pixels, the images have "
-                f"{size[0]}x{size[1]}."
+                f"{self.source}: the intrinsics hold for {own[0]}x{own[1]} pixels, the images have "
+                f"{width}x{height}.{advice * (own == (height, width))}"
             )
         camera = CameraIntrinsics(
-            width=size[0],
-            height=size[1],
-            matrix=self.matrix_by_size.get(size, self.matrix),
-            distortion=self.distortion,
+            width=width, height=height, matrix=self.matrix, distortion=self.distortion
         )
         described = {"camera": camera.section(), "depth_kind": "z"}
         Header.from_mapping(described, self.source, CalibrationDataError)
         if self.matrix[0][1] != 0:
-            raise CalibrationDataError(
-                f"{self.source}: the pinhole matrix has a skew of {self.matrix[0][1]:g}; OpenCV's "
-                "board pose does not support it."
-            )
+            raise CalibrationDataError(f"{self.source}: K has a skew of {self.matrix[0][1]:g}.")
         return camera
 
 
@@ -112,9 +100,8 @@ def read_intrinsics(path: Path) -> GivenIntrinsics:
 
     It reads YAML and JSON with `K` (or `camera_matrix`, or fx, fy, cx, cy) and `distortion`
     (or `distortion_coefficients`), at the top or under `camera`, ROS's camera_info files, OpenCV's
-    FileStorage in YAML, XML and JSON, Kalibr's camchain (radtan), an Azure Kinect's raw
-    calibration, BOP's scene_camera.json, and text with the nine numbers of a matrix, which states
-    no distortion.
+    FileStorage in YAML, XML and JSON, Kalibr's camchain (radtan), and text with the nine numbers of
+    a matrix, which states no distortion.
 
     Raises:
         CalibrationDataError: The file cannot be read, has no matrix, or has another distortion
@@ -136,48 +123,40 @@ def intrinsics_from_mapping(
     Raises:
         CalibrationDataError: There is no matrix, or another distortion model.
     """
-    values = _understood(values, source, camera)
+    found = _kalibr(values, source, camera)
+    below = values.get("camera")
+    values = found or (below if isinstance(below, Mapping) else values)
     model = values.get("distortion_model")
     if isinstance(model, str) and model.lower() not in _MODELS:
-        raise CalibrationDataError(
-            f"{source}: distortion model '{one_line(model)}' is not supported; OpenCV's "
-            "(plumb_bob, rational_polynomial) is needed. Undistort the images, or calibrate again."
-        )
-    distortion = _numbers(_first(values, _DISTORTION_KEYS, []), source, "the distortion")
+        known = "expected OpenCV's plumb_bob or rational_polynomial"
+        raise CalibrationDataError(f"{source}: '{one_line(model)}' is not supported; {known}.")
     sides = [
-        _numbers(values[key], source, "the image size")
+        float(_numbers(values[key], f"{source}: '{key}'", (1,))[0])
         for keys in _SIZE_KEYS
         for key in keys
         if set(keys) <= values.keys()
     ]
     return GivenIntrinsics(
         matrix=_matrix(values, source),
-        distortion=tuple(distortion),
-        size=(int(sides[0][0]), int(sides[1][0])) if sides else None,
+        distortion=tuple(
+            _numbers(_first(values, _DISTORTION_KEYS, []), f"{source}: the distortion")
+        ),
+        size=(int(sides[0]), int(sides[1])) if sides else None,
         source=source,
-        matrix_by_size=values.get("matrix_by_size", {}),
     )
 
 
 def _matrix(values: Mapping[str, Any], source: str) -> Matrix3:
     given = _first(values, _MATRIX_KEYS, None)
     if given is not None:
-        numbers = _numbers(given, source, "the camera matrix")
-    elif all(key in values for key in ("fx", "fy", "cx", "cy")):
-        fx, fy, cx, cy = (_numbers([values[k]], source, k)[0] for k in ("fx", "fy", "cx", "cy"))
-        numbers = [number for row in _pinhole(fx, fy, cx, cy) for number in row]
-    else:
-        keys = one_line(", ".join(f"'{key}'" for key in list(values)[:8]))
+        a, b, c, d, e, f, g, h, i = _numbers(given, f"{source}: the camera matrix", (9,))
+        return (a, b, c), (d, e, f), (g, h, i)
+    if not {"fx", "fy", "cx", "cy"} <= values.keys():
+        keys = one_line(", ".join(f"'{key}'" for key in list(values)[:8])) or "none"
         raise CalibrationDataError(
-            f"{source}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got "
-            f"{keys or 'none'}."
+            f"{source}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got {keys}."
         )
-    if len(numbers) != 9:
-        raise CalibrationDataError(
-            f"{source}: the camera matrix must have 9 numbers, got {len(numbers)}."
-        )
-    a, b, c, d, e, f, g, h, i = numbers
-    return (a, b, c), (d, e, f), (g, h, i)
+    return _pinhole(*_numbers([values[k] for k in ("fx", "fy", "cx", "cy")], source, (4,)))
 
 
 def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Matrix3:
@@ -188,32 +167,21 @@ def _first(values: Mapping[str, Any], keys: Sequence[str], default: Any) -> Any:
     return next((values[key] for key in keys if values.get(key) is not None), default)
 
 
-def _numbers(value: Any, source: str, what: str) -> list[float]:  # noqa: ANN401 - from a file
+def _numbers(value: Any, where: str, counts: tuple[int, ...] = ()) -> list[float]:  # noqa: ANN401
     """Flatten a list, a list of lists or a ROS matrix (rows, cols, data) of finite numbers."""
-    if isinstance(value, Mapping):
-        value = value.get("data", [])
-    shown = one_line(reprlib.repr(value))
-    try:
-        array = np.asarray(value, dtype=np.float64).ravel()
-    except (TypeError, ValueError, OverflowError):
-        raise CalibrationDataError(f"{source}: {what} must be numbers, got {shown}.") from None
-    if not np.isfinite(array).all() or np.asarray(value).dtype == bool:
-        raise CalibrationDataError(f"{source}: {what} must be finite numbers, got {shown}.")
-    return array.tolist()
+    value = value.get("data", []) if isinstance(value, Mapping) else value
+    return finite_numbers(value, where, counts).tolist()
 
 
 def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        text = read_text(path)
-        words = text.replace(",", " ").split()
-        if "opencv-matrix" in text or text.startswith("%YAML:") or text.lstrip().startswith("<"):
-            values = _file_storage(text, str(path))
-        elif len(words) == any_numbers(words).size == 9:
-            values = {"K": words}
-        else:
-            values = parse_yaml(text, str(path))
-    except ConfigError as error:
-        raise CalibrationDataError(str(error)) from None
+    text = read_text(path, CalibrationDataError)
+    words = text.replace(",", " ").split()
+    if "opencv-matrix" in text or text.startswith("%YAML:") or text.lstrip().startswith("<"):
+        values = _file_storage(text, str(path))
+    elif len(words) == any_numbers(words).size == 9:
+        values = {"K": words}
+    else:
+        values = parse_yaml(text, str(path), CalibrationDataError)
     if not isinstance(values, Mapping):
         raise CalibrationDataError(
             f"{path}: expected keys and values, got {type(values).__name__}."
@@ -237,7 +205,7 @@ def _file_storage(text: str, source: str) -> Any:  # noqa: ANN401 - as YAML has 
         else:  # JSON is YAML too; OpenCV's first line and its tags are not.
             plain = re.sub(r"\A%YAML[: ][^\n]*|!!opencv-[a-z-]+", "", text)
             values = parse_yaml(plain, source)
-    except (ConfigError, ElementTree.ParseError, ValueError) as error:
+    except (ElementTree.ParseError, ValueError) as error:
         reason = one_line(str(error).removeprefix(f"{source}: "))
         raise CalibrationDataError(f"{source}: not a readable OpenCV file ({reason}).") from None
     for key, value in values.items() if isinstance(values, Mapping) else ():
@@ -247,10 +215,8 @@ def _file_storage(text: str, source: str) -> Any:  # noqa: ANN401 - as YAML has 
         rows, columns = (one_line(str(value.get(name))) for name in ("rows", "cols"))
         sides = any_numbers([rows, columns])
         if not sides.size or count != sides.prod():
-            raise CalibrationDataError(
-                f"{source}: '{key}' must have rows x cols numbers, got {count} for "
-                f"{rows} x {columns}."
-            )
+            got = f"got {count} for {rows} x {columns}"
+            raise CalibrationDataError(f"{source}: '{key}' must have rows x cols numbers, {got}.")
     return values
 
 
@@ -267,22 +233,6 @@ def _xml(text: str) -> dict[str, Any]:
     return found
 
 
-def _understood(values: Mapping[str, Any], source: str, camera: str | None) -> Mapping[str, Any]:
-    """Return the keys and values of one camera in the names of `recording.yaml`.
-
-    Raises:
-        CalibrationDataError: There are several cameras, or the lens model is not supported.
-    """
-    for read in (_kalibr, _azure_kinect):
-        found = read(values, source, camera)
-        if found is not None:
-            return found
-    first = next(iter(values.values()), None)
-    if isinstance(first, Mapping) and "cam_K" in first:
-        return {"K": first["cam_K"]}  # The first image of BOP's scene_camera.json.
-    return values["camera"] if isinstance(values.get("camera"), Mapping) else values
-
-
 def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[str, Any] | None:
     """Read one camera of Kalibr's camchain: pinhole with radtan, which is OpenCV's model."""
     cameras = {
@@ -294,65 +244,21 @@ def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[
         return None
     if camera not in cameras and not (camera is None and len(cameras) == 1):
         listed = ", ".join(f"{name} ({one.get('rostopic', '?')})" for name, one in cameras.items())
+        first = one_line(str(next(iter(cameras))))
         raise CalibrationDataError(
-            f"{source}: it holds the cameras {one_line(listed)}. Name one: --intrinsics "
-            f"'FILE#{one_line(str(next(iter(cameras))))}'."
+            f"{source}: it holds the cameras {one_line(listed)}. Name one: 'FILE#{first}'."
         )
     entry = cameras[camera] if camera in cameras else next(iter(cameras.values()))
     models = str(entry["camera_model"]), str(entry.get("distortion_model", "none"))
     if models not in (("pinhole", "radtan"), ("pinhole", "none")):
+        said = one_line("', '".join(models))
         raise CalibrationDataError(
-            f"{source}: Kalibr's model '{one_line(models[0])}', '{one_line(models[1])}' is not "
-            "supported; calibrate with pinhole-radtan."
+            f"{source}: Kalibr's '{said}' is not supported; calibrate with pinhole-radtan."
         )
-    numbers = _numbers(entry["intrinsics"], source, "Kalibr's 'intrinsics'")
-    if len(numbers) != 4:
-        raise CalibrationDataError(
-            f"{source}: Kalibr's 'intrinsics' must be fx, fy, cx, cy, got {len(numbers)} numbers."
+    fx, fy, cx, cy = _numbers(entry["intrinsics"], f"{source}: 'intrinsics'", (4,))
+    found = {"K": _pinhole(fx, fy, cx, cy), "distortion": entry.get("distortion_coeffs", [])}
+    if "resolution" in entry:
+        found["width"], found["height"] = _numbers(
+            entry["resolution"], f"{source}: 'resolution'", (2,)
         )
-    found: dict[str, Any] = {}
-    size = entry.get("resolution")
-    if isinstance(size, list) and len(size) == 2:
-        found = {"width": size[0], "height": size[1]}
-    return found | {"K": _pinhole(*numbers), "distortion": entry.get("distortion_coeffs", [])}
-
-
-def _azure_kinect(
-    values: Mapping[str, Any], source: str, camera: str | None
-) -> dict[str, Any] | None:
-    """Read the depth camera of an Azure Kinect's calibration (`k4a_device_get_raw_calibration`).
-
-    Its numbers are shares of the sensor of 1024 x 1024 pixels, counted from the pixel's corner.
-    """
-    information = values.get("CalibrationInformation")
-    if not isinstance(information, Mapping):
-        return None
-    wanted = camera or "CALIBRATION_CameraPurposeDepth"
-    cameras = information.get("Cameras")
-    listed = cameras if isinstance(cameras, list) else []
-    entry = next((c for c in listed if isinstance(c, Mapping) and c.get("Purpose") == wanted), {})
-    lens = entry.get("Intrinsics")
-    lens = lens if isinstance(lens, Mapping) else {}
-    parameters = _numbers(lens.get("ModelParameters", []), source, "'ModelParameters'")
-    if len(parameters) < 14:
-        raise CalibrationDataError(
-            f"{source}: no camera of purpose '{wanted}' with 14 'ModelParameters'."
-        )
-    model = str(lens.get("ModelType", "")).rpartition("_")[2]
-    if model not in ("LensDistortionModelBrownConrady", "LensDistortionModelRational6KT"):
-        raise CalibrationDataError(f"{source}: lens model '{one_line(model)}' is not supported.")
-    cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = parameters[:14]
-    # Of each size of images the pixels that the sensor is binned to, and what is cut off left and
-    # above. From the Azure-Kinect-Sensor-SDK, mode_specific_calibration.c.
-    modes = {
-        (640, 576): (1024, 192, 180),
-        (320, 288): (512, 96, 90),
-        (1024, 1024): (1024, 0, 0),
-        (512, 512): (512, 0, 0),
-    }
-    by_size = {
-        size: _pinhole(fx * side, fy * side, cx * side - left - 0.5, cy * side - top - 0.5)
-        for size, (side, left, top) in modes.items()
-    }
-    distortion = [k1, k2, p1, p2, k3, k4, k5, k6]
-    return {"K": by_size[640, 576], "distortion": distortion, "matrix_by_size": by_size}
+    return found

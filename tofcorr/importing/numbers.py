@@ -1,6 +1,7 @@
 """Numbers in files of unknown origin: text, NPY arrays, and values that a parser has read."""
 
 import re
+import reprlib
 from collections.abc import Callable
 from pathlib import Path
 from tokenize import TokenError
@@ -8,36 +9,24 @@ from typing import Any
 
 import numpy as np
 
+from tofcorr import options
 from tofcorr.errors import CalibrationDataError
+from tofcorr.options import one_line
 
-_LARGEST_MB = 256
-"""Largest text of numbers read, MB: a day of poses at 10 Hz takes 100 MB."""
+_LARGEST = 2**28
+"""Largest text of numbers read, bytes: a day of poses at 10 Hz takes 100 MB."""
 
 Line = tuple[int, list[str]]
 """The number of a line, counted from one, and its fields."""
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file of bounded size.
+    """Return the text of a file of bounded size, without the mark that some programs begin it with.
 
     Raises:
         CalibrationDataError: There is no such file, it is too large, or it is not text.
     """
-    try:
-        with path.open("rb") as file:
-            content = file.read(_LARGEST_MB * 10**6 + 1)
-    except OSError as error:
-        raise CalibrationDataError(f"{path}: cannot be read ({error.strerror}).") from None
-    if len(content) > _LARGEST_MB * 10**6:
-        raise CalibrationDataError(
-            f"{path}: larger than {_LARGEST_MB} MB, the limit of a pose file here."
-        )
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise CalibrationDataError(
-            f"{path}: expected a text file of poses, found binary content."
-        ) from None
+    return options.read_text(path, CalibrationDataError, _LARGEST).removeprefix("\ufeff")
 
 
 def lines_of(text: str) -> list[Line]:
@@ -56,19 +45,21 @@ def numbers_in(line: Line, path: Path, counts: tuple[int, ...]) -> np.ndarray:
     Raises:
         CalibrationDataError: They are not; the message names file and line.
     """
-    number, fields = line
-    if len(fields) not in counts:
-        wanted = " or ".join(map(str, counts))
-        raise CalibrationDataError(
-            f"{path}, line {number}: expected {wanted} numbers, got {len(fields)}."
-        )
-    values = any_numbers(fields)
-    if not values.size:
-        shown = " ".join(fields)[:60]
-        raise CalibrationDataError(f"{path}, line {number}: expected numbers, got '{shown}'.")
-    if not np.isfinite(values).all():
-        raise CalibrationDataError(f"{path}, line {number}: expected finite numbers.")
-    return values
+    return finite_numbers(line[1], f"{path}, line {line[0]}", counts)
+
+
+def finite_numbers(value: Any, where: str, counts: tuple[int, ...] = ()) -> np.ndarray:  # noqa: ANN401
+    """Return a value from a file, nested lists too, as a row of float64.
+
+    Raises:
+        CalibrationDataError: It holds something else than finite numbers, or not as many as one of
+            `counts`, if there are any.
+    """
+    numbers = any_numbers(value)
+    if np.isfinite(numbers).all() and (numbers.size in counts if counts else numbers.ndim):
+        return numbers.ravel()
+    wanted, shown = " or ".join(map(str, counts)), one_line(reprlib.repr(value))
+    raise CalibrationDataError(f"{where}: expected {wanted or 'only'} finite numbers, got {shown}.")
 
 
 def any_numbers(value: Any) -> np.ndarray:  # noqa: ANN401 - from a file

@@ -11,10 +11,17 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.importing.numbers import any_numbers, lines_of, load_numbers, numbers_in, read_text
+from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.numbers import (
+    any_numbers,
+    finite_numbers,
+    lines_of,
+    load_numbers,
+    numbers_in,
+    read_text,
+)
 from tofcorr.importing.pose_track import PoseTrack
-from tofcorr.options import one_line, read_yaml
+from tofcorr.options import one_line, parse_yaml
 
 # Each quantity under the names that tables give it, and the factors to SI units. Names as pandas,
 # ROS (1 and 2) and the `frames.csv` of a recording write them.
@@ -47,15 +54,8 @@ def read_poses(path: Path, pose_format: str | None = None) -> PoseTrack:
 
     Raises:
         CalibrationDataError: The file is missing or not of that format.
-        ConfigError: There is no such format.
     """
-    if not path.exists():
-        raise CalibrationDataError(f"{path}: there is no such pose file.")
-    name = pose_format or _guessed_format(path)
-    if name not in POSE_FORMATS:
-        known = ", ".join(name for name in POSE_FORMATS if name != "matrix")
-        raise ConfigError(f"There is no pose format '{name}'. Known: {known}.")
-    return POSE_FORMATS[name](path)
+    return POSE_FORMATS[pose_format or _guessed_format(path)](path)
 
 
 def _guessed_format(path: Path) -> str:
@@ -65,11 +65,6 @@ def _guessed_format(path: Path) -> str:
     if path.suffix.lower() in (".yaml", ".yml"):
         return "moveit"
     text = read_text(path)
-    if text.lstrip()[:1] in ("{", "["):
-        raise CalibrationDataError(
-            f"{path}: poses are not read from JSON. Write them as CSV with a header row, as TUM's "
-            "lines, or as matrices, 16 numbers a line."
-        )
     if _header(text) is not None:
         return "csv"
     lines = lines_of(text)
@@ -78,9 +73,8 @@ def _guessed_format(path: Path) -> str:
     number, fields = lines[0]
     if len(fields) not in (4, 8, 12, 13, 16, 17):
         raise CalibrationDataError(
-            f"{path}: the format is not recognised: {len(fields)} numbers in line {number}. "
-            "Expected 8 (TUM: time, translation, quaternion x y z w), 12 or 16 (a matrix), or a "
-            "header row (CSV). Say which with --pose-format."
+            f"{path}: line {number} has {len(fields)} numbers; expected 8 (TUM: time, translation, "
+            "quaternion x y z w), 12 or 16 (a matrix), or a header row (CSV)."
         )
     return "tum" if len(fields) == 8 else "matrices"
 
@@ -104,13 +98,12 @@ def rigid_transforms(
     off = np.abs(length - 1) if of_quaternions else length - 2 * np.pi
     for place in np.flatnonzero(~(off <= 1 / 1000)).tolist():
         said = (
-            f"the quaternion (x, y, z, w) has length {length[place]:.4g}; expected 1"
+            "the quaternion x y z w has length {:.4g}; expected 1."
             if of_quaternions
-            else "rx, ry, rz are read as an axis times an angle in radians, and the angle is "
-            f"{length[place]:.4g}; degrees, or Euler angles, must be turned into quaternions qx, "
-            "qy, qz, qw"
+            else "rx, ry, rz are read as an axis times radians, and the angle is {:.4g}; degrees, "
+            "or Euler angles, must be turned into quaternions qx, qy, qz, qw."
         )
-        raise CalibrationDataError(f"{where(place)}: {said}.")
+        raise CalibrationDataError(f"{where(place)}: {said.format(length[place])}")
     transforms = np.tile(np.eye(4), (len(rotation), 1, 1))
     if len(rotation):
         turn = Rotation.from_quat if of_quaternions else Rotation.from_rotvec
@@ -132,23 +125,14 @@ def _read_moveit(path: Path) -> PoseTrack:
     A sample is written when it is taken: samples and images belong together in their order.
     `object_wrt_sensor` is not used: depth is what tofcorr measures.
     """
-    try:
-        values = read_yaml(path)
-    except ConfigError as error:
-        raise CalibrationDataError(str(error)) from None
+    values = parse_yaml(read_text(path), str(path), CalibrationDataError)
     if not isinstance(values, list):
-        raise CalibrationDataError(
-            f"{path}: expected a list of samples, got {type(values).__name__}."
-        )
+        raise CalibrationDataError(f"{path}: expected samples, got {type(values).__name__}.")
     poses = []
     for place, sample in enumerate(values):
         given = sample.get("effector_wrt_world") if isinstance(sample, dict) else None
-        poses.append(any_numbers(given).ravel())
-        if poses[-1].size != 16:
-            raise CalibrationDataError(
-                f"{path}: sample {place}: expected 'effector_wrt_world' with the 16 numbers of a "
-                f"4x4 matrix, got {poses[-1].size}."
-            )
+        where = f"{path}: 'effector_wrt_world' of sample {place}"
+        poses.append(finite_numbers(given, where, (16,)))
     return PoseTrack.checked(np.reshape(poses, (-1, 4, 4)), str(path))
 
 
@@ -162,20 +146,13 @@ def _read_matrices(path: Path) -> PoseTrack:
     """
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in (".txt", ".npy"))
-        every = [_rows(file, (3, 4, 12, 16)).reshape(1, -1) for file in files]
-        for file, values in zip(files, every, strict=True):
-            if values.size not in (12, 16):
-                raise CalibrationDataError(
-                    f"{file}: expected one pose of 12 or 16 numbers, got {values.size} numbers."
-                )
-        poses, names = [_square(values)[0] for values in every], [file.stem for file in files]
+        every = [finite_numbers(_rows(f, (3, 4, 12, 16)), str(f), (12, 16)) for f in files]
+        poses, names = [_square(one[None])[0] for one in every], [file.stem for file in files]
         return PoseTrack.checked(np.array(poses), str(path), names=names)
     values = _rows(path, (4, 12, 13, 16, 17))
     if values.shape[1] == 4:
         if len(values) % 4:
-            raise CalibrationDataError(
-                f"{path}: expected four lines of four numbers a pose, got {len(values)} lines."
-            )
+            raise CalibrationDataError(f"{path}: expected four lines a pose, got {len(values)}.")
         values = values.reshape(-1, 16)
     stamped = values.shape[1] in (13, 17)
     times = values[:, 0] if stamped else None
@@ -188,16 +165,13 @@ def _rows(path: Path, counts: tuple[int, ...]) -> np.ndarray:
         values = load_numbers(path, lambda why: CalibrationDataError(f"{path}: {why}."))
         if not values.size or values.size // len(np.atleast_1d(values)) not in counts:
             raise CalibrationDataError(
-                f"{path}: expected an array of shape (P, 4, 4), (P, 3, 4), (P, 16) or (P, 12), "
-                f"got {values.shape}."
+                f"{path}: expected (P, 4, 4) or (P, 16), got {values.shape}."
             )
         return values.astype(np.float64).reshape(len(values), -1)
     rows = [numbers_in(line, path, counts) for line in lines_of(read_text(path))]
     widths = {len(row) for row in rows} or {16}
     if len(widths) > 1:
-        raise CalibrationDataError(
-            f"{path}: expected as many numbers in every line, got {min(widths)} and {max(widths)}."
-        )
+        raise CalibrationDataError(f"{path}: its lines have {sorted(widths)} numbers each.")
     return np.reshape(rows, (-1, min(widths)))
 
 
@@ -218,6 +192,11 @@ def _read_table(path: Path) -> PoseTrack:
     separated by commas, or by semicolons or tabs, and then decimals may have commas.
     """
     delimiter, columns, rows = _table(path)
+    short = next((k for k, row in enumerate(rows, start=1) if len(row) < len(columns)), None)
+    if short is not None:
+        raise CalibrationDataError(f"{path}, row {short}: expected {len(columns)} cells.")
+    # The last of several columns of one name.
+    cells = {name: [row[k].strip() for row in rows] for k, name in enumerate(columns)}
 
     def first_of(choices: Iterable[tuple[str, ...]], wanted: str = "") -> tuple[str, ...]:
         """Return the first choice whose columns all exist; none if there is none and none wanted.
@@ -235,31 +214,18 @@ def _read_table(path: Path) -> PoseTrack:
             )
         return found
 
-    def cells(name: str) -> list[str]:
-        """Return the text of a column, the last of that name."""
-        column = len(columns) - 1 - columns[::-1].index(name)
-        for place, row in enumerate(rows, start=1):
-            if column >= len(row):
-                raise CalibrationDataError(
-                    f"{path}, row {place}: expected {len(columns)} cells, got {len(row)}."
-                )
-        return [row[column].strip() for row in rows]
-
-    def numbers(name: str) -> list[float]:
+    def numbers(name: str) -> np.ndarray:
         """Return the numbers of a column, shape (P,)."""
         if columns.count(name) > 1:
             raise CalibrationDataError(
                 f"{path}: two columns are '{one_line(name)}'; expected the poses of one frame."
             )
-        found = []
-        for place, cell in enumerate(cells(name)):
-            try:
-                found.append(float(cell if delimiter == "," else cell.replace(",", ".")))
-            except ValueError:
-                raise CalibrationDataError(
-                    f"{path}, row {place + 1}, column '{name}': expected a number, got "
-                    f"'{cell[:40]}'."
-                ) from None
+        texts = [cell if delimiter == "," else cell.replace(",", ".") for cell in cells[name]]
+        found = any_numbers(texts)
+        if len(found) < len(texts):
+            wrong = next(k for k, text in enumerate(texts) if any_numbers(text).shape != ())
+            where = f"{path}, row {wrong + 1}, column '{name}'"
+            raise CalibrationDataError(f"{where}: expected a number, got '{texts[wrong][:40]}'.")
         return found
 
     move = first_of(_TRANSLATION, "tx, ty, tz")
@@ -271,7 +237,7 @@ def _read_table(path: Path) -> PoseTrack:
         rigid_transforms(translation, rotation, lambda k: f"{path}, row {k + 1}"),
         str(path),
         np.array(_TIME[time]) @ [numbers(one) for one in time] if time else None,
-        cells(name[0]) if name else None,
+        cells[name[0]] if name else None,
     )
 
 

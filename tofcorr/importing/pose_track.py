@@ -1,12 +1,11 @@
 """Poses of the tool in the world, by time or by name."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from tofcorr.data.table import UNIT_LENGTH_TOLERANCE
@@ -88,11 +87,6 @@ class PoseTrack:
         own = None if names is None else tuple(names[int(k)] for k in kept)
         return cls(world_from_tool=poses[kept], timestamp=time, names=own, source=source)
 
-    def inverse(self) -> Self:
-        """Return the track of the inverse poses: the world in the tool."""
-        poses = se3.inverse(torch.from_numpy(self.world_from_tool)).numpy()
-        return replace(self, world_from_tool=poses)
-
     def at(self, times: np.ndarray) -> np.ndarray:
         """Return the poses at some times, shape (N, 4, 4); NaN outside the track.
 
@@ -127,11 +121,6 @@ class PoseTrack:
             return True
         return float(np.median(np.diff(self.timestamp))) > 2 * tolerance
 
-    def nearest(self, times: np.ndarray) -> np.ndarray:
-        """Return the number of the pose nearest in time to each of some times, shape (N,)."""
-        assert self.timestamp is not None
-        return nearest(self.timestamp, times)
-
 
 def nearest(stamps: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return which of increasing `stamps` is nearest to each of `times`, the earlier of two."""
@@ -143,19 +132,13 @@ def nearest(stamps: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 def _without_repeats(time: np.ndarray, poses: np.ndarray, source: str) -> np.ndarray:
     """Return which poses to keep; refuse times that decrease or contradict one another."""
-    if not np.isfinite(time).all():
-        place = int(np.flatnonzero(~np.isfinite(time))[0])
+    before = np.concatenate([[-np.inf], time[:-1]])
+    for place in np.flatnonzero(~(time >= before) | ~np.isfinite(time)):
+        stamps = f"{before[place]:.6f} s, then {time[place]:.6f} s"
         raise CalibrationDataError(
-            f"{source}: pose {place}: the time stamp is not a finite number."
+            f"{source}: pose {place}: expected times that increase, {stamps}."
         )
-    step = np.diff(time)
-    if (step < 0).any():
-        place = int(np.flatnonzero(step < 0)[0]) + 1
-        raise CalibrationDataError(
-            f"{source}: pose {place} is stamped {time[place]:.6f} s, the one before "
-            f"{time[place - 1]:.6f} s; expected times that increase. Sort the file by time."
-        )
-    same = np.flatnonzero(step == 0) + 1
+    same = np.flatnonzero(time == before)
     for place in same:
         if not np.allclose(poses[place], poses[place - 1], atol=1e-6):
             raise CalibrationDataError(

@@ -1,7 +1,14 @@
-"""Images from a moving robot as an import: pair, choose, find walls, write a frame a wall."""
+"""Images from a moving robot as an import: pair, choose, find walls, write a frame a wall.
+
+A hand-eye transform makes the planes of right images and poses coincide to within the camera's
+error. Wrong ones leave them decimetres apart; then the usual mistakes are undone one by one, to see
+whether one of them explains it.
+"""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,36 +20,72 @@ from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
-from tofcorr.importing.mistakes import (
-    explain_misfit,
-    refuse_impossible_depth,
-    refuse_impossible_poses,
-)
-from tofcorr.importing.robot_images import (
-    Chosen,
-    ImagesOfPlanes,
-    PosedOptions,
-    RobotImages,
-    choose,
-    look,
-)
+from tofcorr.importing.images import DepthImage
+from tofcorr.importing.pose_track import nearest
+from tofcorr.importing.robot_images import ImagesOfPlanes, PosedOptions, RobotImages
 from tofcorr.importing.run import (
     Frame,
     PreparedImport,
     Progress,
+    Refused,
     Sieve,
     camera_mapping,
     no_progress,
     run_import,
 )
-from tofcorr.importing.timing import Lag, estimate_lag, far_lags, refine_lag
+from tofcorr.importing.timing import Lag, estimate_lag, far_lags, find_stops, pair, refine_lag
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
 from tofcorr.importing.walls.hand_eye import distances, exact
-from tofcorr.importing.walls.image_planes import plane_masks, seen_planes
+from tofcorr.importing.walls.image_planes import ImagePlane, plane_masks, seen_planes
+from tofcorr.plausibility.mistakes import FAR_BETTER, IN_IMAGES, IN_POSES
 
 _LAG_OF_STOPS = 0.02
 """A refined lag that differs by more than this from the first (seconds) changes which images are
 at rest: the margin that stops are given."""
+
+_NEAREST, _FARTHEST = 0.03, 50.0
+"""Metres: nearer even single-pixel sensors give no distance, but depth in kilometres, or a unit
+given twice, does; farther no time-of-flight camera on a robot sees, nor does an arm reach: 0.05 m
+read as millimetres is 50."""
+
+_SUSPICIOUS_MM = 20.0
+"""Misfit from which a mistake is suspected, millimetres: twice what an uncalibrated camera
+leaves."""
+
+_OF_POSES = {
+    "inverted": "their inverses: are the poses those of the base in the tool (--base-frame and "
+    "--tool-frame exchanged), or is --eye-to-hand missing or too much?",
+    "quaternions": "quaternions read as w x y z: write them as x y z w, or in a CSV whose header "
+    "names qw, qx, qy, qz.",
+    "rotations": "rotations inverted and translations as they are: are the matrices written column "
+    "by column, or the quaternions those of the inverse?",
+}
+"""What undoes usual mistakes in poses, and advice."""
+
+_SHIFTS = 1, -1, 2, -2, 3, -3
+"""By how many poses a list may be shifted, the likely ones first. Each costs a search for walls,
+and more than three images are rarely dropped in a row."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chosen:
+    """Images with poses.
+
+    Attributes:
+        images: Their numbers in the source, shape (N,), increasing.
+        world_from_tool: Shape (N, 4, 4), metres, as the poses' file has them.
+        stop: The stop that each belongs to, shape (N,); -1 while moving.
+        moving: Images with a pose that were taken while the tool moved, shape (K,).
+        refused: Images left out, and why.
+        paired_by: `time`, `name` or `order`.
+    """
+
+    images: np.ndarray
+    world_from_tool: np.ndarray
+    stop: np.ndarray
+    moving: np.ndarray
+    refused: Refused
+    paired_by: str
 
 
 def import_posed(
@@ -75,15 +118,18 @@ class PosedImport:
     def __init__(self, source: RobotImages, options: PosedOptions) -> None:
         self._source, self._options = source, options
         self._times = None if source.times is None else source.times + options.time_offset_s
-        self._track = source.track.inverse() if options.eye_to_hand else source.track
+        self._track = source.track
+        if options.eye_to_hand:
+            inverse = np.linalg.inv(source.track.world_from_tool)
+            self._track = replace(source.track, world_from_tool=inverse)
         self._images = ImagesOfPlanes(source, options)
 
     def prepare(self, sieve: Sieve) -> PreparedImport:
         """Read all images once or twice, and find out everything but the frames themselves."""
         source, options = self._source, self._options
         sieve.refused |= source.refused
-        self._readable, median, change = look(source, sieve)
-        refuse_impossible_depth(median, source.origin)
+        self._readable, median, change = self._images.look(sieve)
+        _refuse_impossible_depth(median, source.origin)
         # How much each readable image differs from the one before, where both have times.
         self._changes = None
         listed = self._track.lists_stops(options.pose_tolerance_s)
@@ -91,7 +137,7 @@ class PosedImport:
             self._changes = self._times[self._readable], change[self._readable][1:]
         lag = self._first_lag()
         chosen = self._choose(lag)
-        refuse_impossible_poses(chosen.world_from_tool, self._track.source)
+        _refuse_impossible_poses(chosen.world_from_tool, self._track.source)
         found, warnings = self._walls(chosen, sieve)
         if lag is not None and options.lag_s == "auto":
             refined = self._refined(lag, chosen.moving, found, sieve)
@@ -105,7 +151,7 @@ class PosedImport:
             views=self._reported(chosen, found),
             frames=self._frames(chosen, found),
             writer=self._writer(found),
-            camera=camera_mapping(source.camera, source.origin),
+            camera=camera_mapping(self._images.camera, source.origin),
             findings={
                 "paired_by": chosen.paired_by,
                 "stops": len(np.unique(chosen.stop[chosen.stop >= 0])),
@@ -127,39 +173,197 @@ class PosedImport:
         timed = self._times is not None and self._track.timestamp is not None
         return Lag(seconds=self._options.lag_s) if timed else None
 
-    def _choose(self, lag: Lag | None) -> Chosen:
-        names = self._source.names
-        return choose(names, self._times, self._readable, self._track, self._options, lag)
+    def _choose(self, lag: Lag | None, margin: float = 0.02) -> Chosen:
+        """Pair images with poses, and keep those of stops.
+
+        Args:
+            lag: Of the images' clock; None: none is known.
+            margin: Seconds before and after an image in which the tool must stand still besides the
+                uncertainty of the lag: an exposure and the jitter of a time stamp.
+
+        Raises:
+            CalibrationDataError: No image is left.
+        """
+        names, times, track, options = self._source.names, self._times, self._track, self._options
+        late, error = (lag.seconds, lag.standard_error) if lag else (0.0, 0.0)
+        tolerance = options.pose_tolerance_s
+        images, poses, refused, by = pair(names, times, track, tolerance=tolerance, lag=late)
+        images, poses = images[self._readable[images]], poses[self._readable[images]]
+        if times is None or track.timestamp is None:
+            stop = np.arange(len(images))
+        elif track.lists_stops(tolerance):
+            stop = nearest(track.timestamp, times[images] - late)
+        else:
+            stop = find_stops(track, times[images] - late, margin + 2 * error)
+        take, moving = stop < 0, images[stop < 0]
+        if options.moving == "leave_out":
+            refused |= {names[int(k)]: "the tool was moving" for k in moving}
+            take = np.zeros(len(stop), dtype=bool)
+        # At most so many images of a stop, evenly spread, the middle first.
+        for number in np.unique(stop[stop >= 0]):
+            own = np.flatnonzero(stop == number)
+            count = min(options.images_per_stop, len(own))
+            take[own[((np.arange(count) + 0.5) * len(own) / count).astype(int)]] = True
+        reason = f"its stop has {options.images_per_stop} images already"
+        refused |= {names[int(k)]: reason for k in images[(stop >= 0) & ~take]}
+        if not take.any():
+            raise CalibrationDataError(
+                f"{track.source}: the tool moves in all {len(images)} images. Add --keep-moving?"
+            )
+        return Chosen(
+            images=images[take],
+            world_from_tool=poses[take],
+            stop=stop[take],
+            moving=moving,
+            refused=refused,
+            paired_by=by,
+        )
 
     def _walls(self, chosen: Chosen, sieve: Sieve) -> tuple[FoundWalls, list[str]]:
-        """Find walls, and a sentence about a mistake that would explain why they do not fit."""
-        source, options = self._source, self._options.walls
+        """Find walls, and say where they do not fit; refuse what a mistake explains."""
         numbers = sieve.progress(chosen.images.tolist(), "finding walls")
         planes = [self._images.planes(k) for k in numbers]
-        names = [source.names[int(k)] for k in chosen.images]
-        targets = None if source.targets is None else source.targets[chosen.images]
-
-        def explain(given: FoundWalls | None) -> list[str]:
-            """Refuse what a mistake explains; where planes are named, there is none to undo."""
-            if targets is not None:
-                return []
-            return explain_misfit(
-                self._images,
-                chosen,
-                given,
-                options,
-                lists=self._changes is None,
-                far_lags=lambda: far_lags(self._track, *self._changes) if self._changes else [],
-                at_lag=lambda late: self._choose(Lag(seconds=late)),
-            )
-
         try:
-            pixels, poses = source.camera.width * source.camera.height, chosen.world_from_tool
-            found = walls_of_planes(planes, names, pixels, poses, options, source.origin, targets)
+            found = self._walls_of(planes, chosen.images, chosen.world_from_tool)
         except CalibrationDataError:
-            explain(None)
+            self._explained(chosen, None)
             raise
-        return found, explain(found)
+        return found, self._explained(chosen, found)
+
+    def _walls_of(
+        self, planes: list[list[ImagePlane]], images: np.ndarray, poses: np.ndarray
+    ) -> FoundWalls:
+        source, camera = self._source, self._images.camera
+        return walls_of_planes(
+            planes,
+            [source.names[int(k)] for k in images],
+            camera.width * camera.height,
+            poses,
+            self._options.walls,
+            origin=source.origin,
+            targets=None if source.targets is None else source.targets[images],
+        )
+
+    def _explained(self, chosen: Chosen, given: FoundWalls | None) -> list[str]:
+        """Name the mistake that explains why planes do not coincide.
+
+        Args:
+            chosen: The images used, with poses.
+            given: The walls of images and poses as given; None: none were found.
+
+        Returns:
+            A sentence that says that no mistake explains it; none if the walls are as good as can
+            be expected, there are none, or their names are given.
+
+        Raises:
+            CalibrationDataError: A mistake explains it; the message names it, and both misfits.
+        """
+        origin, farthest = self._source.origin, FoundWalls.OFF_WALL_MM
+        before = farthest if given is None else given.misfit_mm
+        if before <= _SUSPICIOUS_MM or self._source.targets is not None:
+            return []
+        if given is not None and self._changes is None:
+            self._refuse_shifted_part(chosen, given)
+        left = {}
+        for said, misfit in self._mistakes_undone(chosen):
+            left[said] = misfit
+            if misfit <= FAR_BETTER * _SUSPICIOUS_MM:
+                break
+        best = min(left, key=left.__getitem__)
+        if left[best] <= FAR_BETTER * before:
+            said = f"{origin}: Walls are off by {before:.0f} mm as given"
+            raise CalibrationDataError(f"{said} and by {left[best]:.0f} mm with {best}")
+        if given is None:
+            return []
+        return [
+            f"{len(np.unique(given.image))} of {len(chosen.images)} images show a wall, and planes "
+            f"are off by {before:.0f} mm (one on no wall counts {farthest:.0f}); up to "
+            f"{_SUSPICIOUS_MM:.0f} are expected. Do images and poses belong together, and are "
+            "there large walls in view?"
+        ]
+
+    def _mistakes_undone(self, chosen: Chosen) -> Iterator[tuple[str, float]]:
+        """Yield what undoes each usual mistake, with advice, and the misfit that it leaves."""
+        for name, said in _OF_POSES.items():
+            yield said, self._misfit(chosen, IN_POSES[name].undo)
+        for shift in _SHIFTS if self._changes is None else ():
+            said = f"the poses shifted by {shift:+d}: was an image or a pose dropped?"
+            yield said, self._misfit(chosen, partial(np.roll, shift=shift, axis=0))
+        said = "the columns mirrored: does the camera's driver flip its images? Turn that off."
+        mirrored = IN_IMAGES["mirrored"].undo
+        yield said, self._misfit(chosen, depth=lambda image: mirrored(image.depth))
+        for factor in (1 / 10, 10):
+            said = f"all distances multiplied by {factor:g}: is --depth-unit-mm right?"
+            yield said, self._misfit(chosen, depth=lambda image, k=factor: k * image.depth)
+        if self._images.read(int(chosen.images[0])).amplitude is not None:
+            said = "depth and amplitude exchanged: swap --depth and --amplitude."
+            yield said, self._misfit(chosen, depth=_amplitudes)
+        for late in far_lags(self._track, *self._changes) if self._changes else ():
+            said = f"images {abs(late):.1f} s {'late' if late > 0 else 'early'}"
+            with suppress(CalibrationDataError):
+                left = self._misfit(self._choose(Lag(seconds=late)))
+                yield f"{said}: add --time-offset-s {-late:.1f}.", left
+
+    def _misfit(
+        self,
+        used: Chosen,
+        poses: Callable[[np.ndarray], np.ndarray] = np.asarray,
+        depth: Callable[[DepthImage], np.ndarray] | None = None,
+    ) -> float:
+        """Return the misfit of 30 images with a mistake undone: enough for every wall of a room."""
+        few = np.unique(np.linspace(0, len(used.images) - 1, 30).round().astype(int))
+
+        def planes(k: int) -> list[ImagePlane]:
+            if depth is None:
+                return self._images.planes(k)
+            undone = depth(self._images.read(k)).astype(np.float32)
+            return self._images.planes_in(DepthImage(np.ascontiguousarray(undone)))
+
+        images, undone_poses = used.images[few], poses(used.world_from_tool)[few]
+        seen = [planes(k) for k in images.tolist()]
+        try:
+            return self._walls_of(seen, images, undone_poses).misfit_mm
+        except CalibrationDataError:
+            return FoundWalls.OFF_WALL_MM
+
+    def _refuse_shifted_part(self, chosen: Chosen, found: FoundWalls, near: float = 0.03) -> None:
+        """Refuse a part of the images whose poses are shifted.
+
+        Where one image or pose was dropped in the middle of a list, the first part is paired
+        rightly and shows the walls; the rest lies on them with the poses shifted.
+
+        Args:
+            chosen: The images used, with poses.
+            found: The walls, and the hand-eye transform that goes with them.
+            near: Metres within which a plane lies on a wall: three times a typical error, and far
+                below the way from stop to stop.
+
+        Raises:
+            CalibrationDataError: There is such a part.
+        """
+        planes = [self._images.planes(k) for k in chosen.images.tolist()]
+        hand_eye = exact(torch.from_numpy(found.tool_from_camera))
+        walls = torch.from_numpy(found.walls)
+
+        def on_walls(poses: np.ndarray) -> np.ndarray:
+            """Return which images have most of their planes on a wall, shape (N,)."""
+            seen = seen_planes(planes, torch.from_numpy(np.array(poses)), 1)
+            close = distances(*seen.in_world(hand_eye), walls).min(dim=1).values < near
+            return np.bincount(seen.image.numpy(), 2.0 * close.numpy() - 1, len(planes)) > 0
+
+        poses = chosen.world_from_tool
+        seeing = np.array([bool(own) for own in planes])
+        off = seeing & ~on_walls(poses)
+        for shift in _SHIFTS:
+            fits = off & on_walls(np.roll(poses, shift, axis=0))
+            # Fewer fit by chance; some show only walls that the rightly paired part did not.
+            if fits.sum() >= max(4, off.sum() / 2):
+                first, last = (self._source.names[k] for k in chosen.images[fits][[0, -1]])
+                which = f"{fits.sum()} of {seeing.sum()} images, '{first}' to '{last}'"
+                raise CalibrationDataError(
+                    f"{self._source.origin}: {which}, lie on the walls with the poses shifted by "
+                    f"{shift:+d}: was an image or a pose dropped before '{first}'?"
+                )
 
     def _refined(
         self, lag: Lag, moving: np.ndarray, found: FoundWalls, sieve: Sieve, most: int = 200
@@ -201,7 +405,7 @@ class PosedImport:
             names = names.model_copy(update=exchanged)
         return partial(
             RecordingWriter,
-            camera=self._source.camera,
+            camera=self._images.camera,
             depth_kind=options.depth_kind,
             modulation_frequency=options.modulation_frequency_hz,
             saturation_amplitude=options.saturation_amplitude,
@@ -249,6 +453,53 @@ class PosedImport:
                 yield row, image.depth, image.amplitude, mask
 
 
+def _refuse_impossible_depth(median_depth: np.ndarray, origin: str) -> None:
+    """Refuse depth that is not in metres.
+
+    Args:
+        median_depth: Median of each image, shape (I,), as metres; NaN without returns.
+        origin: For the message.
+
+    Raises:
+        CalibrationDataError: No image has a return, or the typical depth is impossible.
+    """
+    if not np.isfinite(median_depth).any():
+        raise CalibrationDataError(f"{origin}: no image has a pixel with a return.")
+    typical = float(np.nanmedian(median_depth))
+    if not _NEAREST <= typical <= _FARTHEST:
+        unit = "millimetres? Add --depth-unit-mm 1"
+        unit = unit if typical > _FARTHEST else "metres? Add --depth-unit-mm 1000"
+        raise CalibrationDataError(
+            f"{origin}: the median depth is {typical:.4g} m. Is it in {unit}."
+        )
+
+
+def _refuse_impossible_poses(world_from_tool: np.ndarray, origin: str) -> None:
+    """Refuse poses (N, 4, 4) that are not in metres, or the same to a millimetre and milliradian.
+
+    Raises:
+        CalibrationDataError: As said.
+    """
+    extent = float(np.linalg.norm(np.ptp(world_from_tool[:, :3, 3], axis=0)))
+    turned = float(np.abs(world_from_tool[:, :3, :3] - world_from_tool[0, :3, :3]).max())
+    if extent > _FARTHEST:
+        raise CalibrationDataError(
+            f"{origin}: the tool moves over {extent:.4g} m. Are the translations in millimetres? "
+            "Expected metres (in CSV, columns tx_mm, ty_mm, tz_mm are scaled)."
+        )
+    if 1000 * max(extent, turned) < 1:
+        raise CalibrationDataError(
+            f"{origin}: all poses are the same to {1000 * extent:.2g} mm; expected a moving robot."
+        )
+
+
+def _amplitudes(image: DepthImage) -> np.ndarray:
+    """Return the amplitudes of an image as if they were its depth, metres."""
+    assert image.amplitude is not None
+    counts = np.where(image.amplitude > 0, image.amplitude, np.nan)
+    return counts / (1000 if np.nanmedian(counts) > _FARTHEST else 1)
+
+
 def _lag_warnings(lag: Lag) -> list[str]:
     """Return a sentence about an estimated lag that is not zero.
 
@@ -264,22 +515,20 @@ def _lag_warnings(lag: Lag) -> list[str]:
     ]
 
 
-def _contradiction(
-    known: np.ndarray | None, found: np.ndarray, far_mm: float = 50.0, far_deg: float = 3.0
-) -> list[str]:
+def _contradiction(known: np.ndarray | None, found: np.ndarray) -> list[str]:
     """Return a sentence if the walls contradict a known hand-eye transform; else nothing.
+
+    It is doubted from 50 mm and 3 degrees on: a few times what an uncalibrated camera's error moves
+    the estimate.
 
     Args:
         known: tool_from_camera as the source states it, shape (4, 4); None: it does not.
         found: tool_from_camera under which the walls fit best, shape (4, 4).
-        far_mm: It is doubted from so many millimetres on: a few times what an uncalibrated
-            camera's error moves the estimate.
-        far_deg: The same for its rotation, degrees.
     """
     if known is None:
         return []
     shift, turn = se3.apart(torch.as_tensor(known), torch.as_tensor(found))
-    if 1000 * shift < far_mm and math.degrees(turn) < far_deg:
+    if 1000 * shift < 50 and math.degrees(turn) < 3:
         return []
     return [
         f"The walls fit best with the camera {1000 * shift:.0f} mm and {math.degrees(turn):.1f} "

@@ -77,9 +77,9 @@ class Sieve:
             except RefusedViewError as refusal:
                 self.refused[name(view)] = str(refusal)
         if not results:
+            first = next(iter(self.refused.values()), "there are none")
             raise CalibrationDataError(
-                f"{self._source}: none of {len(self.refused)} views can be imported; the first: "
-                f"{next(iter(self.refused.values()), 'there are none')}."
+                f"{self._source}: none of {len(self.refused)} views can be imported: {first}."
             )
         return results
 

@@ -25,7 +25,7 @@ from scipy.optimize import minimize_scalar
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
-from tofcorr.importing.pose_track import PoseTrack
+from tofcorr.importing.pose_track import PoseTrack, nearest
 from tofcorr.importing.run import Refused
 
 _STILL = 5e-4, 1e-3
@@ -98,9 +98,7 @@ def pair(
         return *_by_name(names, track, track.names), "name"
     if len(names) != len(track):
         raise CalibrationDataError(
-            f"{track.source}: {len(track)} poses and {len(names)} images, without time stamps or "
-            "names that tell which belong together. Expected as many of both; a dropped image "
-            "shifts every later pair. Add time stamps, or names."
+            f"{track.source}: {len(track)} poses and {len(names)} images, without times or names."
         )
     return np.arange(len(names)), track.world_from_tool, {}, "order"
 
@@ -109,15 +107,11 @@ def _by_time(
     names: Sequence[str], times: np.ndarray, track: PoseTrack, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, Refused]:
     assert track.timestamp is not None
-    first, last = float(times.min()), float(times.max())
-    start, end = float(track.timestamp[0]), float(track.timestamp[-1])
-    if last < start or first > end:
-        raise CalibrationDataError(
-            f"{track.source}: poses are stamped {start:.3f} to {end:.3f} s, images {first:.3f} to "
-            f"{last:.3f} s: they share no time. Are they on two clocks? State the difference with "
-            f"--time-offset-s (the starts differ by {first - start:.3f} s)."
-        )
-    near = track.nearest(times)
+    first, start = times.min(), track.timestamp[0]
+    if times.max() < start or first > track.timestamp[-1]:
+        said = f"poses begin at {start:.3f} s, images at {first:.3f} s: they share no time"
+        raise CalibrationDataError(f"{track.source}: {said}. State --time-offset-s.")
+    near = nearest(track.timestamp, times)
     poses = track.world_from_tool[near] if track.lists_stops(tolerance) else track.at(times)
     inside = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     gap = np.abs(times - track.timestamp[near])
@@ -129,9 +123,9 @@ def _by_time(
         for k in np.flatnonzero(~used).tolist()
     }
     if not used.any():
+        first = next(iter(refused.values()))
         raise CalibrationDataError(
-            f"{track.source}: none of {len(names)} images has a pose; the first: "
-            f"{next(iter(refused.values()))}."
+            f"{track.source}: none of {len(names)} images has a pose: {first}."
         )
     return np.flatnonzero(used), poses[used], refused
 
@@ -147,10 +141,8 @@ def _by_name(
     poses = np.array([place.get(PurePath(name).stem, -1) for name in names])
     images = np.flatnonzero(poses >= 0)
     if not len(images):
-        raise CalibrationDataError(
-            f"{track.source}: no pose is called as an image is: poses '{called[0]}', ..., "
-            f"images '{names[0]}', ...."
-        )
+        said = f"no pose is called as an image is: poses '{called[0]}', images '{names[0]}'"
+        raise CalibrationDataError(f"{track.source}: {said}.")
     reason = f"no pose of that name in {track.source}"
     refused = {names[k]: reason for k in np.flatnonzero(poses < 0).tolist()}
     return images, track.world_from_tool[poses[images]], refused

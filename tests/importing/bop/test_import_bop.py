@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from importing import scene_files
 from importing.frames.imported import assert_equal_recordings, import_png, run_import
-from importing.posed_scene import Drive, Recorded, apart
+from importing.posed_scene import Drive, Recorded, apart, unit_rays
 
 
 @pytest.fixture(scope="module")
@@ -58,16 +58,14 @@ def test_a_scene_without_poses_with_two_cameras_or_none_is_refused(
     path.write_text(json.dumps(cameras))
     assert "'cam_K' of image 1 differs" in run_import("bop", folder, out=out).text
     path.unlink()
-    assert "a BOP scene holds scene_camera.json" in run_import("bop", folder, out=out).text
+    assert "scene_camera.json: there is no such file" in run_import("bop", folder, out=out).text
 
 
 def write_hdf5(scene: Recorded, folder: Path, key: str, *, poses: bool = True) -> Path:
     """Write files as BlenderProc does: metres, Blender's camera axes."""
     folder.mkdir()
-    v, u = np.mgrid[: scene.size[1], : scene.size[0]]
     matrix = scene.matrix
-    x, y = (u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]
-    length = np.sqrt(1 + x**2 + y**2)
+    length = 1 / unit_rays(matrix, *scene.size)[..., 2]
     for number, (counts, pose) in enumerate(zip(scene.depth_mm, scene.exact, strict=True)):
         depth = np.where(counts > 0, counts / 1e3, 1e10)
         with h5py.File(folder / f"{number}.hdf5", "w") as file:

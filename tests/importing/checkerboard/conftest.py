@@ -1,15 +1,13 @@
 """Views of a board, rendered once, and the command that imports them."""
 
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from importing.checkerboard.imported_board import ERROR, LENS, PLACEMENTS, Run
 from importing.checkerboard.rendered_board import write_view
-
-from tofcorr.cli.main import main
+from running import Program, Said
 
 
 @pytest.fixture(scope="session")
@@ -27,21 +25,11 @@ def images(rendered: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+def run(program: Program, tmp_path: Path) -> Run:
     """Call the command line; return exit code, standard output and standard error."""
 
-    def call(
-        folder: Path, *options: str, board: str = "5x7", lens: Any = LENS
-    ) -> tuple[int, str, str]:
-        arguments = ["tofcorr", "import", "checkerboard", str(folder), "--board", board]
-        arguments += ["--square-mm", "30", "--out", str(tmp_path / "recording"), *lens, *options]
-        monkeypatch.setattr(sys, "argv", arguments)
-        code = 0
-        try:
-            main()
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        out, stderr = capsys.readouterr()
-        return code, out, stderr
+    def call(folder: Path, *options: str, board: str = "5x7", lens: Any = LENS) -> Said:
+        given = ("--board", board, "--square-mm", "30", "--out", tmp_path / "recording")
+        return program("import", "checkerboard", folder, *given, *lens, *options)
 
     return call

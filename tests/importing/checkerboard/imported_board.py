@@ -8,11 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 from importing.checkerboard.rendered_board import varied_placements
+from running import Said
 
 PLACEMENTS = varied_placements(6)
 ERROR = 0.012
 FOCAL = ("--focal", "290,288", "--centre", "158.3,121.6")
-Run = Callable[..., tuple[int, str, str]]
+Run = Callable[..., Said]
 LENS = (*FOCAL, "--distortion", "0.06,-0.12,0.0008,-0.0005,0.02")
 
 

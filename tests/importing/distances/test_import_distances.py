@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from importing.frames.imported import Imported, run_import
-from importing.posed_scene import Drive, Recorded
+from importing.posed_scene import FRONT, Drive, Recorded
 from importing.scene_files import write_matrices
 from importing.walls.wall_trials import WALLS, read_trial
 
@@ -33,8 +33,7 @@ def test_real_trials_become_distances_beside_their_poses(real_data: Path, tmp_pa
 @pytest.fixture(scope="module")
 def zones() -> Recorded:
     """A sensor of 8 x 8 zones before one wall."""
-    front = (np.array([-1.0, 0.0, 0.0]), 2.0)
-    drive = Drive(stops=24, width=8, height=8, planes=(front,), distortion=(), error=0.2, rate=4)
+    drive = Drive(stops=24, width=8, height=8, planes=(FRONT,), distortion=(), error=0.2, rate=4)
     recorded = drive.record().one_a_stop()
     return recorded.take(np.all(recorded.depth_mm > 0, axis=(1, 2)))
 
@@ -67,17 +66,14 @@ def test_rows_without_whole_readings_and_lists_of_other_lengths_are_refused(
     zones: Recorded, tmp_path: Path
 ) -> None:
     rows = write_rows(zones, tmp_path / "north.csv", factor=1.0, repeats=1)
-    poses = write_matrices(zones.exact[1:], tmp_path / "poses.txt")
-    out = tmp_path / "out"
-    sensor = ("--zones", "8x8", "--fov-deg", "45")
-    short = run_import("distances", rows, "--poses", poses, *sensor, out=out)
-    assert f"{len(zones.exact) - 1} poses beside {len(zones.exact)} rows" in short.text
-    odd = ("--zones", "5x3", "--fov-deg", "45")
-    other = run_import("distances", rows, "--poses", poses, *odd, out=out)
-    assert "64 numbers are not whole readings of 15 zones" in other.text
-    blind = run_import("distances", rows, "--poses", poses, "--zones", "8x8", out=out)
-    assert "--fov-deg" in blind.text
-    alone = run_import("distances", rows, *sensor, out=out)
-    assert "name its poses with --poses" in alone.text
-    empty = run_import("distances", tmp_path, *sensor, out=out)
-    assert "no file of distances" in empty.text
+    poses = ("--poses", write_matrices(zones.exact[1:], tmp_path / "poses.txt"))
+    sensor, odd = (("--zones", size, "--fov-deg", "45") for size in ("8x8", "5x3"))
+    count = len(zones.exact)
+    for arguments, said in (
+        ((rows, *poses, *sensor), f"{count - 1} poses beside {count} rows"),
+        ((rows, *poses, *odd), "64 numbers are not whole readings of 15 zones"),
+        ((rows, *poses, "--zones", "8x8"), "--fov-deg"),
+        ((rows, *sensor), "name its poses with --poses"),
+        ((tmp_path, *sensor), "no file of distances"),
+    ):
+        assert said in run_import("distances", *arguments, out=tmp_path / "out").text

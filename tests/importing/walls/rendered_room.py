@@ -7,13 +7,23 @@ from typing import Any
 
 import numpy as np
 import torch
-from importing.posed_scene import looking, met
+from importing.posed_scene import (
+    FLOOR,
+    FRONT,
+    LEFT,
+    Plane,
+    looking,
+    met,
+    systematic_error,
+    unit_rays,
+)
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.images import DepthImage
+from tofcorr.importing.intrinsics import GivenIntrinsics
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.posed import import_posed
 from tofcorr.importing.robot_images import PosedOptions, RobotImages
@@ -21,12 +31,9 @@ from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
 from tofcorr.importing.walls.image_planes import WallOptions, planes_of_image
 
 # Planes n . x + d = 0 of a room of 4 m by 5 m, z up, the robot near its middle: normals inwards.
-FLOOR = ((0.0, 0.0, 1.0), 0.0)
-FRONT = ((-1.0, 0.0, 0.0), 2.0)
-LEFT = ((0.0, -1.0, 0.0), 2.2)
-SLANTED = ((-0.5, 0.8660254037844386, 0.0), 1.9)
+SLANTED: Plane = ((-0.5, 0.8660254037844386, 0.0), 1.9)
 ROOM = (FLOOR, FRONT, LEFT, SLANTED)
-CUPBOARD = ((-1.0, 0.0, 0.0), 1.7)
+CUPBOARD: Plane = ((-1.0, 0.0, 0.0), 1.7)
 """A plane parallel to FRONT and 300 mm nearer; seen where |y| < 0.6 m."""
 
 
@@ -40,20 +47,13 @@ class Camera:
 
     @property
     def matrix(self) -> np.ndarray:
-        return np.array(
-            [
-                [self.focal, 0.0, (self.width - 1) / 2],
-                [0.0, self.focal, (self.height - 1) / 2],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        matrix = np.diag([self.focal, self.focal, 1.0])
+        matrix[:2, 2] = (self.width - 1) / 2, (self.height - 1) / 2
+        return matrix
 
     @property
     def rays(self) -> np.ndarray:
-        v, u = np.mgrid[: self.height, : self.width].astype(float)
-        pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
-        rays = pixels @ np.linalg.inv(self.matrix).T
-        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        return unit_rays(self.matrix, self.width, self.height)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Room:
     """
 
     camera: Camera = field(default_factory=Camera)
-    planes: tuple[tuple[tuple[float, float, float], float], ...] = ROOM
+    planes: tuple[Plane, ...] = ROOM
     tool_from_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     noise: float = 0.003
     error: float = 1.0
@@ -115,17 +115,11 @@ class Room:
             nearest[seen], cosine[seen], plane[seen] = box[seen], 0.7, -1
         depth = np.where(np.isfinite(nearest), nearest, np.nan)
         amplitude = 400 * cosine / depth**2 * rays[..., 2] ** 2
-        measured = depth + self.error * self._error(depth, amplitude)
+        error = 0.004 + 0.001 * (depth - 1.5)
+        error = error + systematic_error(depth, amplitude, 0.03, (8e-3, -5e-3), -1.5e-5)
+        measured = depth + self.error * error
         measured = measured + self.noise * generator.normal(size=depth.shape)
         return measured, np.nan_to_num(amplitude), plane
-
-    def _error(self, depth: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return D + P + I: a quadratic in distance, a bowl and a tilt, a slope in amplitude."""
-        v, u = np.mgrid[: self.camera.height, : self.camera.width]
-        row, column = v / self.camera.height - 0.5, u / self.camera.width - 0.5
-        of_pixel = 0.03 * (row**2 + column**2) + 0.008 * row - 0.005 * column
-        apart = depth - 1.5
-        return 0.010 + 0.006 * apart - 0.003 * apart**2 + of_pixel - 1.5e-5 * amplitude
 
 
 def _box(rays: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -184,15 +178,13 @@ def imported(
     names = [str(k) for k in range(len(depth))]
 
     def read(k: int) -> DepthImage:
-        return DepthImage(
-            depth[k].astype(np.float32),
-            None if amplitude is None else amplitude[k].astype(np.float32),
-        )
+        counts = None if amplitude is None else amplitude[k].astype(np.float32)
+        return DepthImage(depth[k].astype(np.float32), counts)
 
     images = RobotImages(
         origin="room",
         names=names,
-        camera=camera,
+        intrinsics=GivenIntrinsics(matrix=camera.matrix, distortion=(), source="room"),
         read=read,
         track=PoseTrack.checked(poses, "room"),
         targets=targets,

@@ -50,12 +50,7 @@ def planes_shown(room: Room, found: FoundWalls) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("seed", "clutter"),
-    [
-        pytest.param(0, 0.0, marks=pytest.mark.slow),
-        (1, 0.2),
-        pytest.param(2, 0.2, marks=pytest.mark.slow),
-    ],
+    ("seed", "clutter"), [(1, 0.2), pytest.param(0, 0.0, marks=pytest.mark.slow)]
 )
 def test_three_walls_and_a_floor_are_found_and_every_view_is_of_its_wall(
     seed: int, clutter: float
@@ -106,17 +101,11 @@ def test_one_wall_is_enough_if_it_is_seen_tilted_about_two_axes(
 def test_the_answer_does_not_depend_on_the_order_of_the_images() -> None:
     room, views = room_and_views(7, clutter=0.2)
     order = np.random.default_rng(0).permutation(len(views.depth))
-    shuffled = Views(
-        *(
-            getattr(views, name)[order]
-            for name in ("depth", "amplitude", "plane", "world_from_tool")
-        )
-    )
+    shuffled = Views(*(part[order] for part in vars(views).values()))
     first, second = found_in(room, views), found_in(room, shuffled)
     np.testing.assert_array_equal(first.tool_from_camera, second.tool_from_camera)
-    assert first.names == second.names
-    np.testing.assert_array_equal(first.walls, second.walls)
-    np.testing.assert_array_equal(first.images, second.images)
+    for name in ("names", "walls", "images"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     places = set(zip(order[second.image].tolist(), second.wall.tolist(), strict=True))
     assert places == set(zip(first.image.tolist(), first.wall.tolist(), strict=True))
 
@@ -128,8 +117,8 @@ def test_images_that_show_nothing_flat_are_left_out_with_the_reason() -> None:
     depth[11] = np.nan
     found = found_in(room, replace(views, depth=depth))
     assert {3, 11}.isdisjoint(found.image)
-    assert "nothing flat covers 5 %" in found.left_out["image 3"]
-    assert "nothing flat covers 5 %" in found.left_out["image 11"]
+    for image in ("image 3", "image 11"):
+        assert "nothing flat covers 5 %" in found.left_out[image]
     assert len(found.image) > 25
 
 
@@ -169,47 +158,26 @@ def test_few_zones_before_named_walls_need_no_search_in_the_image() -> None:
     generator = np.random.default_rng(11)
     hand_eye = hand_eye_anywhere(generator)
     camera = Camera(8, 8, 9.6)
-    parts, names = [], []
-    for name, plane, towards in (
-        ("left", FRONT, (2.0, 0.0, 0.5)),
-        ("right", SLANTED, (1.0, -1.0, 0.5)),
-    ):
+    parts = []
+    for plane, towards in ((FRONT, (2.0, 0.0, 0.5)), (SLANTED, (1.0, -1.0, 0.5))):
         room = Room(camera=camera, planes=(plane,), tool_from_camera=hand_eye)
         parts.append(room.views(poses_in_room(20, generator, towards), generator))
-        names += 20 * [name]
-    views = Views(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("depth", "amplitude", "plane", "world_from_tool")
-        )
-    )
+    views = Views(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
     whole = Room(camera=camera, planes=(FRONT, SLANTED), tool_from_camera=hand_eye)
-    found = found_in(whole, views, targets=np.array(names))
+    found = found_in(whole, views, targets=np.repeat(["left", "right"], 20))
     assert found.names == ["left", "right"]
     assert planes_shown(whole, found) == [0, 1]
     assert apart(found.tool_from_camera, hand_eye)[1] < NEAR_DEG
     assert found.gradient is None
 
 
-def test_poses_that_do_not_belong_to_the_images_are_refused_in_words() -> None:
+def test_poses_of_other_images_and_images_without_anything_flat_are_refused_in_words() -> None:
     room, views = room_and_views(12, number=12)
-    turned = np.random.default_rng(0)
-    poses = np.stack([hand_eye_anywhere(turned) for _ in views.depth])
-    poses[:, :3, 3] = turned.uniform(-2, 2, (len(poses), 3))
+    generator = np.random.default_rng(0)
+    poses = np.stack([hand_eye_anywhere(generator) for _ in views.depth])
+    poses[:, :3, 3] = generator.uniform(-2, 2, (len(poses), 3))
     with pytest.raises(CalibrationDataError, match="Do the poses belong to the images"):
         found_in(room, replace(views, world_from_tool=poses))
-
-
-def test_without_a_moving_robot_there_is_nothing_to_match() -> None:
-    room, views = room_and_views(13, number=6)
-    still = np.broadcast_to(np.eye(4), views.world_from_tool.shape)
-    with pytest.raises(CalibrationDataError, match="Give the robot's poses"):
-        found_in(room, replace(views, world_from_tool=still))
-
-
-def test_images_without_anything_flat_are_refused() -> None:
-    room, views = room_and_views(14, number=6)
-    generator = np.random.default_rng(0)
     depth = generator.uniform(0.5, 3.0, views.depth.shape)
-    with pytest.raises(CalibrationDataError, match="0 of 6 images show anything flat"):
+    with pytest.raises(CalibrationDataError, match="0 of 12 images show anything flat"):
         found_in(room, replace(views, depth=depth))

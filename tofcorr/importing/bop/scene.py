@@ -1,26 +1,26 @@
 """Scenes whose poses are the camera's own: BOP's layout, and BlenderProc's HDF5 files."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tofcorr.data.recording import DepthKind
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.importing.frames.source import open_folder
-from tofcorr.importing.images import DepthCoding, DepthImage, matching_files, of_size
+from tofcorr.importing.images import DepthCoding, matching_files, opened_hdf5
 from tofcorr.importing.intrinsics import (
     GivenIntrinsics,
     intrinsics_from_mapping,
     read_named_intrinsics,
 )
-from tofcorr.importing.numbers import any_numbers
+from tofcorr.importing.numbers import any_numbers, finite_numbers, read_text
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.posed import import_posed
 from tofcorr.importing.robot_images import PosedOptions, RobotImages
-from tofcorr.importing.run import Progress, RefusedViewError, no_progress
+from tofcorr.importing.run import Progress, no_progress
 
 _FILE_NAME = "scene_camera.json"
 _POSE_KEYS = ("cam2world_matrix", "cam2world", "cam_pose")
@@ -56,22 +56,15 @@ def import_scene(
         if amplitude is not None:
             raise ConfigError("--amplitude is for BOP's layout; HDF5 scenes have no amplitudes.")
         given = None if intrinsics is None else read_named_intrinsics(intrinsics)
-        source, key = _open_hdf5(scene, given)
-        kind = "z" if key == "depth" else "radial"
+        source, kind = _open_hdf5(scene, given)
         options = options.model_copy(update={"depth_kind": kind})
     else:
         if intrinsics is not None:
             raise ConfigError(f"--intrinsics is for HDF5; a BOP scene states them in {_FILE_NAME}.")
         lens, unit_mm, track = read_scene_camera(path)
-        source = open_folder(
-            scene,
-            "depth/*.png",
-            lens,
-            DepthCoding(unit_mm=unit_mm),
-            track,
-            amplitude_pattern=amplitude,
-            tool_from_camera=np.eye(4),
-        )
+        coding = DepthCoding(unit_mm=unit_mm)
+        source = open_folder(scene, "depth/*.png", lens, coding, track, amplitude_pattern=amplitude)
+    source = replace(source, tool_from_camera=np.eye(4))
     return import_posed(source, out, options, progress)
 
 
@@ -86,6 +79,10 @@ def read_scene_camera(path: Path) -> tuple[GivenIntrinsics, float, PoseTrack]:
         CalibrationDataError: It cannot be read, images have different intrinsics or units, or there
             are no poses.
     """
+
+    def numbers(name: str, image: dict[str, Any], key: str, count: int) -> np.ndarray:
+        return finite_numbers(image[key], f"{path}: '{key}' of image {name}", (count,))
+
     images = _read(path)
     first = next(iter(images))
     for key in ("cam_K", "depth_scale"):
@@ -95,59 +92,40 @@ def read_scene_camera(path: Path) -> tuple[GivenIntrinsics, float, PoseTrack]:
         other = next((n for n, i in images.items() if i[key] != images[first][key]), None)
         if other is not None:
             raise CalibrationDataError(
-                f"{path}: '{key}' of image {other} differs from that of image {first}; expected "
-                "one camera and one unit a scene."
+                f"{path}: '{key}' of image {other} differs from that of image {first}."
             )
     posed = {n: i for n, i in images.items() if "cam_R_w2c" in i and "cam_t_w2c" in i}
     if not posed:
         raise CalibrationDataError(
-            f"{path}: no image has a pose of the camera ('cam_R_w2c', 'cam_t_w2c'). BOP's poses of "
-            "objects do not tell where the camera is; without poses a hand-eye transform cannot be "
-            "estimated."
+            f"{path}: no image has a pose of the camera ('cam_R_w2c', 'cam_t_w2c')."
         )
     poses = np.tile(np.eye(4), (len(posed), 1, 1))
     for pose, (name, image) in zip(poses, posed.items(), strict=True):
         # The pose is inverted; its translation is in millimetres.
-        rotation = _numbers(image, "cam_R_w2c", 9, f"{path}: image {name}").reshape(3, 3).T
-        translation = _numbers(image, "cam_t_w2c", 3, f"{path}: image {name}") / 1000
+        rotation = numbers(name, image, "cam_R_w2c", 9).reshape(3, 3).T
+        translation = numbers(name, image, "cam_t_w2c", 3) / 1000
         pose[:3, :3], pose[:3, 3] = rotation, -rotation @ translation
-    where = f"{path}: image {first}"
-    (unit,) = _numbers(images[first], "depth_scale", 1, where)
+    (unit,) = numbers(first, images[first], "depth_scale", 1)
     if unit <= 0:
         raise CalibrationDataError(f"{path}: 'depth_scale' must be positive, got {unit:g}.")
-    matrix = _numbers(images[first], "cam_K", 9, where).tolist()
+    matrix = numbers(first, images[first], "cam_K", 9).tolist()
     track = PoseTrack.checked(poses, str(path), names=[f"{int(name):06d}" for name in posed])
     return intrinsics_from_mapping({"K": matrix}, str(path)), float(unit), track
 
 
-def _numbers(image: dict[str, Any], key: str, count: int, where: str) -> np.ndarray:
-    values = any_numbers(image[key]).ravel()
-    if values.size != count or not np.isfinite(values).all():
-        raise CalibrationDataError(
-            f"{where}: '{key}' must be {count} finite number{'s' if count > 1 else ''}, got "
-            f"{str(image[key])[:60]}."
-        )
-    return values
-
-
 def _read(path: Path) -> dict[str, dict[str, Any]]:
+    text = read_text(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationDataError(
-            f"{path}: cannot be read ({error.strerror}); a BOP scene holds {_FILE_NAME} and depth/."
-        ) from None
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise CalibrationDataError(f"{path}: not readable JSON ({error}).") from None
     whole = isinstance(content, dict) and bool(content)
     if not whole or not all(n.isdecimal() and isinstance(i, dict) for n, i in content.items()):
-        raise CalibrationDataError(
-            f"{path}: expected an object with one entry an image, by its number."
-        )
+        raise CalibrationDataError(f"{path}: expected an object with one entry an image number.")
     return content
 
 
-def _open_hdf5(folder: Path, intrinsics: GivenIntrinsics | None) -> tuple[RobotImages, str]:
+def _open_hdf5(folder: Path, intrinsics: GivenIntrinsics | None) -> tuple[RobotImages, DepthKind]:
     """Open a folder of BlenderProc's files `0.hdf5`, `1.hdf5`, ..., one an image.
 
     Args:
@@ -155,81 +133,31 @@ def _open_hdf5(folder: Path, intrinsics: GivenIntrinsics | None) -> tuple[RobotI
         intrinsics: The camera's; None: as in the files.
 
     Returns:
-        Images and poses, and the name of depth in the files: `depth` along the optical axis, or
-        `distance` along the ray.
+        Images and poses; and what depth means: `depth` along the optical axis, `distance` along the
+        ray.
 
     Raises:
         CalibrationDataError: A file is damaged, or has no depth, pose or intrinsics; or the package
             h5py is missing.
     """
-    found = matching_files(folder, "*.hdf5", "HDF5")
-    paths = list(found.values())
-    with _opened(paths[0]) as file:
-        key = next((key for key in ("depth", "distance") if key in file), None)
-        if key is None:
-            listed = ", ".join(file) or "nothing"
-            raise CalibrationDataError(
-                f"{paths[0]}: expected 'depth' or 'distance', found {listed}."
-            )
-        if intrinsics is None:
-            matrix = _value(file, ("cam_K", "K"))
-            if matrix is None:
-                raise CalibrationDataError(
-                    f"{paths[0]}: no intrinsics ('cam_K'); name a file: --intrinsics."
-                )
-            values = {"K": np.asarray(matrix).tolist()}
-            intrinsics = intrinsics_from_mapping(values, str(paths[0]))
-        height, width = _image(file, key, paths[0]).shape
-        camera = intrinsics.camera((width, height))
-    poses = np.stack([_world_from_camera(path) for path in paths])
-
-    def read(number: int) -> DepthImage:
-        try:
-            with _opened(paths[number]) as file:
-                depth = _image(file, key, paths[number])
-        except CalibrationDataError as error:
-            raise RefusedViewError(str(error).rstrip(".")) from None
-        # Blender writes 1e10 m where nothing was hit.
-        usable = np.isfinite(depth) & (depth > 0) & (depth < 10_000)
-        image = DepthImage(np.where(usable, depth, np.nan).astype(np.float32))
-        return of_size(image, camera)
-
-    images = RobotImages(
-        origin=str(folder),
-        names=list(found),
-        camera=camera,
-        read=read,
-        track=PoseTrack.checked(poses, str(folder)),
-        tool_from_camera=np.eye(4),
-    )
-    return images, key
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open a file; what the library raises on damaged bytes becomes one sentence."""
-    try:
-        import h5py
-    except ImportError:
+    paths = list(matching_files(folder, "*.hdf5", "HDF5").values())
+    with opened_hdf5(paths[0]) as file:
+        keys, matrix = list(file), _value(file, ("cam_K", "K"))
+    if not {"depth", "distance"} & {*keys}:
         raise CalibrationDataError(
-            f"{path}: HDF5 needs the package h5py: pip install 'tofcorr[hdf5]'"
-        ) from None
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (OSError, RuntimeError, KeyError, TypeError) as error:
-        raise CalibrationDataError(f"{path}: not a readable HDF5 file ({error}).") from None
-
-
-def _image(file: Any, key: str, path: Path) -> np.ndarray:  # noqa: ANN401 - of h5py
-    depth = np.asarray(file[key])
-    if depth.ndim == 3 and depth.shape[2] == 1:
-        depth = depth[:, :, 0]
-    if depth.ndim != 2 or not depth.size or depth.dtype.kind not in "fiu":
-        raise CalibrationDataError(
-            f"{path}: '{key}' must be one image of shape (rows, columns), got {depth.shape}."
+            f"{paths[0]}: expected 'depth' or 'distance', found {', '.join(keys) or 'nothing'}."
         )
-    return depth.astype(np.float64)
+    if intrinsics is None:
+        if matrix is None:
+            raise CalibrationDataError(
+                f"{paths[0]}: no 'cam_K'; name intrinsics: --intrinsics FILE."
+            )
+        values = {"K": np.asarray(matrix).tolist()}
+        intrinsics = intrinsics_from_mapping(values, str(paths[0]))
+    track = PoseTrack.checked(np.stack([_world_from_camera(p) for p in paths]), str(folder))
+    coding = DepthCoding(unit_mm=1000)
+    images = open_folder(folder, "*.hdf5", intrinsics, coding, track)
+    return images, "z" if "depth" in keys else "radial"
 
 
 def _value(file: Any, keys: tuple[str, ...]) -> Any:  # noqa: ANN401 - of h5py
@@ -246,13 +174,10 @@ def _value(file: Any, keys: tuple[str, ...]) -> Any:  # noqa: ANN401 - of h5py
 
 
 def _world_from_camera(path: Path) -> np.ndarray:
-    with _opened(path) as file:
+    with opened_hdf5(path) as file:
         pose = any_numbers(_value(file, _POSE_KEYS))
     if pose.shape != (4, 4):
-        raise CalibrationDataError(
-            f"{path}: no pose of the camera; expected one of {', '.join(_POSE_KEYS)} (4x4, "
-            f"Blender's axes) or '{_STATE}'. Write it with the images, as "
-            "bproc.camera.get_camera_pose(frame) gives it."
-        )
+        keys = ", ".join((*_POSE_KEYS, _STATE))
+        raise CalibrationDataError(f"{path}: no pose of the camera (4x4); expected one of {keys}.")
     # Blender's camera looks along -z with y up; OpenCV's along z with y down.
     return pose @ np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,8 +1,8 @@
 """From images of a board to a recording with known planes, by OpenCV.
 
 `boards` finds the board's points, `pose` estimates the camera intrinsics and the pose of the board.
-`checks` compares the depth with the pose, finds wrong units and mixed-up images, and reports which
-quantities a board cannot separate. `importer` does this for a folder.
+`importer` compares the depth with the pose, finds wrong units and mixed-up images, and reports
+which quantities a board cannot separate.
 """
 
 from pathlib import Path
@@ -39,30 +39,27 @@ class BoardType(click.ParamType):
             self.fail(str(error), param, ctx)
 
 
-_DEPTH = "Names of the depth images; {view} (or *) is what a pair of images shares."
 _BOARD = (
     "Inner corners (not squares), such as 5x7; or charuco:5x7:4X4_50:0.75 (squares, markers, their "
     "share of a square), or apriltag:6x6:APRILTAG_36H11:0.3 (tags, family, spacing)."
 )
-_COUNTS = "Millimetres per count of the depth images; 0 counts mean no return."
-_FULL = "Pixels at or above this many infrared counts are saturated and not used."
+_FULL = "Infrared counts from which a pixel is saturated and not used."
 _MARGIN = "How far the mask extends beyond the outermost inner corners; 1: edge of the squares."
-_ERROR = "Views with a larger reprojection error (root mean square) are refused."
 
 
 @click.command(name="checkerboard")
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=NewPath(), help="Recording to write.")
-@option("--depth", _DEPTH, "depth_pattern", default="{view}_depth.png")
+@option("--depth", "Names of the depth images.", "depth_pattern", default="{view}_depth.png")
 @option("--infrared", "Names of the infrared images.", "infrared_pattern", default="{view}_ir.png")
 @option("--board", _BOARD, required=True, type=BoardType())
 @option("--square-mm", "Side of a square or tag, mm.", required=True, type=float)
-@option("--depth-unit-mm", _COUNTS, default=1.0)
+@option("--depth-unit-mm", "Millimetres per count; 0 counts mean no return.", default=1.0)
 @depth_kind_option
 @intrinsics_options
 @option("--saturation", _FULL, "saturation_counts", default=65535.0)
 @option("--margin-squares", _MARGIN, default=0.0)
-@option("--max-reprojection-px", _ERROR, default=0.5)
+@option("--max-reprojection-px", "Largest root mean square error of a view used.", default=0.5)
 @option("--modulation-frequency-hz", "If known.", "modulation_frequency", type=float)
 def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
     """Import 16-bit PNG depth and infrared images of a checkerboard in FOLDER.

@@ -1,10 +1,18 @@
-"""Import of depth images of a board, with the image that shows its corners beside each."""
+"""Import of depth images of a board, with the image that shows its corners beside each.
+
+What the board says of measured depth is compared too: wrong units, mixed-up images, and what a
+board cannot tell apart. Only gross disagreement is refused (a tenth of the distance, tens of
+degrees). Errors of millimetres and centimetres are what the recording is made for; they are kept.
+All limits were set by hand, far beyond the errors of a working camera; on the 102 views of the
+Kinect v2 in `tests/importing/checkerboard/test_kinect2.py` they refuse at most 4.
+"""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -12,20 +20,26 @@ from pydantic import Field
 from tofcorr.data.recording import DepthKind
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
+from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.checkerboard.boards import BOARDS, FlatBoard
-from tofcorr.importing.checkerboard.checks import (
-    BoardView,
-    agreement_warnings,
-    compare_depth,
-    degeneracy_warning,
-    refuse_mixed_up,
-    study_degeneracy,
-    typical_ratio,
+from tofcorr.importing.checkerboard.pose import (
+    BoardPose,
+    calibrate,
+    calibration_warning,
+    estimate_pose,
+    poses_of,
 )
-from tofcorr.importing.checkerboard.pose import calibrate, calibration_warning, estimate_pose
-from tofcorr.importing.images import DepthImage, files_of_views, of_size, read_image
+from tofcorr.importing.images import (
+    DepthCoding,
+    DepthImage,
+    files_of_views,
+    of_size,
+    read_depth,
+    read_grey,
+    turned,
+)
 from tofcorr.importing.intrinsics import GivenIntrinsics
 from tofcorr.importing.run import (
     Frame,
@@ -40,10 +54,26 @@ from tofcorr.importing.run import (
 )
 from tofcorr.options import Options
 
+_FEWEST_PIXELS = 50
+"""Fewest board pixels with depth; a fifth of all board pixels must have it, too."""
+
+_LARGEST_TILT_DEG = 25.0
+"""Largest angle between the plane of the depth image and the board's pose, degrees: boards taken
+for one another, or mirrored, differ by more."""
+
+_TENTH = 0.1
+"""Share of the distance: 0.1 m at 1 m is beyond any camera's error, and mixed-up images exceed it.
+From half of it on all views together get a warning: 5 cm at 1 m is the largest error that an
+uncalibrated camera is known for."""
+
+_CHANGES = 0.02, 0.01
+"""Relative changes of focal length and square length that are tried: typical errors of factory
+intrinsics and of a printed board."""
+
+_SAME_VIEW = "are the two images of the same view?"
+
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 CornerCount = Annotated[int, Field(ge=3)]
-Files = dict[str, Path]
-"""The images of one view by their kind."""
 
 
 class CheckerboardOptions(Options):
@@ -94,46 +124,30 @@ class CheckerboardOptions(Options):
         )
 
 
-class BoardImages(NamedTuple):
-    """Depth images, each with an image that shows the board's corners.
+@dataclass(frozen=True, kw_only=True)
+class BoardView:
+    """A view whose board has a pose: measured depth against it.
 
     Attributes:
-        views: The files of each view, by their kind; `depth` and `infrared` are among them.
-        alone: Why other views lack some.
-        with_corners: Reads the image that shows the corners, shape (H, W), from the files of a
-            view; raises `RefusedViewError` if it cannot be used.
-        measured: Reads depth and amplitude from them in the same way.
+        name: What the view is called.
+        pose: The board in the camera frame.
+        board_pixels: Pixels that see the board.
+        usable_pixels: Those with depth and below saturation.
+        distance: Median true radial distance, metres.
+        error: Median of measured minus true depth, of the kind recorded, metres.
+        ratio: Median of measured over true distance.
+        kind_moments: Sum over pixels of v v', shape (4, 4), metres, with v = (1, D, D (1 - cos a),
+            measured minus true radial distance) and a the angle to the optical axis.
     """
 
-    views: dict[str, Files]
-    alone: Refused
-    with_corners: Callable[[Files], np.ndarray]
-    measured: Callable[[Files], DepthImage]
-
-
-def sixteen_bit_images(folder: Path, options: CheckerboardOptions) -> BoardImages:
-    """Return depth and infrared PNG images of 16 bits; infrared counts are the amplitudes."""
-
-    def counts(path: Path) -> np.ndarray:
-        image = read_image(path)
-        if image.ndim != 2:
-            raise RefusedViewError(
-                f"{path.name} has {image.shape[2]} channels; one grey channel of 16 bits is needed"
-            )
-        if image.dtype != np.uint16:
-            raise RefusedViewError(
-                f"{path.name} has {8 * image.itemsize} bits a pixel; 16 are needed "
-                "(an 8-bit image is only a preview of depth or amplitude)"
-            )
-        return image
-
-    def measured(files: Files) -> DepthImage:
-        depth, infrared = counts(files["depth"]), counts(files["infrared"])
-        return DepthImage(np.where(depth > 0, depth * options.depth_unit, np.nan), infrared)
-
-    patterns = {"depth": options.depth_pattern, "infrared": options.infrared_pattern}
-    found = files_of_views(folder, patterns)
-    return BoardImages(*found, lambda files: counts(files["infrared"]), measured)
+    name: str
+    pose: BoardPose
+    board_pixels: int
+    usable_pixels: int
+    distance: float
+    error: float
+    ratio: float
+    kind_moments: np.ndarray
 
 
 def import_checkerboard(
@@ -142,7 +156,9 @@ def import_checkerboard(
     options: CheckerboardOptions,
     intrinsics: GivenIntrinsics | None,
     progress: Progress = no_progress,
-    read: Callable[[Path, CheckerboardOptions], BoardImages] = sixteen_bit_images,
+    *,
+    coding: DepthCoding | None = None,
+    amplitude_pattern: str | None = None,
 ) -> dict[str, Any]:
     """Turn images of a board into a recording, with `import.json` beside the arrays.
 
@@ -155,62 +171,154 @@ def import_checkerboard(
         options: How to read the images.
         intrinsics: The camera intrinsics; None: calibrate them from the board.
         progress: Shows how far a step has come.
-        read: Finds the images.
+        coding: How depth is to be read, where the infrared images may be previews; None: as
+            `options` say, and infrared counts are the amplitudes.
+        amplitude_pattern: With `coding`, names of the amplitude images; None: there are none.
 
     Raises:
         CalibrationDataError: No view can be used, the intrinsics do not fit the images, a unit
             must be wrong, or `out` exists or cannot be written.
     """
-
-    def prepare(sieve: Sieve) -> PreparedImport:
-        return _prepared(folder, options, intrinsics, read(folder, options), sieve)
-
+    if coding is None:
+        coding = DepthCoding(unit_mm=1000 * options.depth_unit, invalid=())
+        amplitude_pattern = options.infrared_pattern
+    prepare = BoardImport(folder, options, intrinsics, coding, amplitude_pattern).prepare
     return run_import(str(folder), options, prepare, out, progress)
 
 
-def _prepared(
-    folder: Path,
-    options: CheckerboardOptions,
-    intrinsics: GivenIntrinsics | None,
-    images: BoardImages,
-    sieve: Sieve,
-) -> PreparedImport:
-    """Find the boards, calibrate the camera if asked to, and place the boards."""
-    board = options.board()
-    sieve.refused |= images.alone
-    detected: dict[str, tuple[np.ndarray, tuple[int, int]]] = {}
+class BoardImport:
+    """Images of a board on the way to a recording; arguments as of `import_checkerboard`."""
 
-    def detect(view: str) -> None:
-        image, files = images.with_corners(images.views[view]), images.views[view]
-        # One hint is enough, and looking for a second board takes time.
-        corners = _corners(image, board, files["infrared"].name, hint=not sieve.refused)
-        detected[view] = corners, (image.shape[1], image.shape[0])
+    _camera: CameraIntrinsics
+    _rays: np.ndarray
 
-    def read(view: str) -> DepthImage:
-        files = images.views[view]
-        names = files["depth"].name, files.get("amplitude", files["infrared"]).name
-        return of_size(images.measured(files), camera, names, "the other images have")
+    def __init__(
+        self,
+        folder: Path,
+        options: CheckerboardOptions,
+        intrinsics: GivenIntrinsics | None,
+        coding: DepthCoding,
+        amplitude_pattern: str | None,
+    ) -> None:
+        self._folder, self._options, self._coding = folder, options, coding
+        self._intrinsics, self._board = intrinsics, options.board()
+        patterns = {"depth": options.depth_pattern, "infrared": options.infrared_pattern}
+        patterns |= {"amplitude": amplitude_pattern} if amplitude_pattern else {}
+        self._files, self._alone = files_of_views(folder, patterns)
+        self._corners: dict[str, np.ndarray] = {}
+        self._sizes: dict[str, tuple[int, int]] = {}
 
-    def place(view: str) -> BoardView:
-        pose = estimate_pose(detected[view][0], board, camera, options.max_reprojection_px)
-        depth, amplitude = read(view)
-        area = pose.area(board, rays, options.margin_squares)
-        usable = np.isfinite(depth)
+    def prepare(self, sieve: Sieve) -> PreparedImport:
+        """Find the boards, calibrate the camera if asked to, and place the boards."""
+        options = self._options
+        sieve.refused |= self._alone
+        detect = partial(self._detect, refused=sieve.refused)
+        sieve.apply(detect, sieve.progress(list(self._files), "finding boards"), str)
+        about_camera, warnings = self._calibrate()
+        self._rays = ray_directions(self._camera).numpy()
+        views = sieve.apply(self._place, sieve.progress(list(self._corners), "placing boards"), str)
+        ratio = typical_ratio(views)
+        views = sieve.apply(partial(refuse_mixed_up, ratio=ratio), views, lambda view: view.name)
+        posed = [(self._corners[view.name], view.pose, view.error) for view in views]
+        degeneracy = study_degeneracy(posed, self._board, self._camera, options.depth_kind)
+        warnings += agreement_warnings(views, ratio, options.depth_kind)
+        return PreparedImport(
+            views=[self._reported(view) for view in views],
+            frames=self._frames(views),
+            writer=partial(
+                RecordingWriter,
+                camera=self._camera,
+                depth_kind=options.depth_kind,
+                modulation_frequency=options.modulation_frequency,
+                saturation_amplitude=options.saturation_counts,
+            ),
+            camera=about_camera,
+            findings={"degeneracy": degeneracy},
+            warnings=[*warnings, degeneracy_warning(degeneracy)],
+        )
+
+    def _detect(self, view: str, refused: Refused) -> None:
+        """Find the board's corners.
+
+        Where the first is not found, one with a row and a column fewer is looked for: a common
+        mistake is to count squares instead of inner corners. One hint is enough.
+        """
+        # A board is looked for longest where there is none: what is no depth is refused before.
+        read_depth(self._files[view], self._coding)
+        path, board = self._files[view]["infrared"], self._board
+        image = turned(read_grey(path), self._coding.rotate)
+        corners = board.find(image)
+        if corners is None:
+            fewer, said = board.fewer(), ""
+            if not refused and fewer is not None and fewer.find(image) is not None:
+                said = f", but one of {fewer}: count inner corners, not squares"
+            what = f"board of {board} inner corners" if fewer else f"board {board}"
+            raise RefusedViewError(f"no {what} found in {path.name}{said}")
+        self._corners[view], self._sizes[view] = corners, (image.shape[1], image.shape[0])
+
+    def _calibrate(self) -> tuple[dict[str, Any], list[str]]:
+        """Find the camera of the commonest size; return what to report of it, and warnings."""
+        size, given = Counter(self._sizes.values()).most_common(1)[0][0], self._intrinsics
+        if given is not None:
+            self._camera = given.camera(size)
+            return camera_mapping(self._camera, given.source), []
+        corners = [own for view, own in self._corners.items() if self._sizes[view] == size]
+        self._camera, found = calibrate(corners, self._board, size)
+        about = camera_mapping(self._camera, "calibrated from the boards") | found
+        return about, [calibration_warning(self._camera, found)]
+
+    def _read(self, view: str) -> DepthImage:
+        return of_size(read_depth(self._files[view], self._coding), self._camera)
+
+    def _area(self, pose: BoardPose) -> np.ndarray:
+        return pose.area(self._board, self._rays, self._options.margin_squares)
+
+    def _place(self, view: str) -> BoardView:
+        """Place the board of a view, and compare the depth with its pose.
+
+        Raises:
+            RefusedViewError: No pose fits the corners, too few pixels have depth, or the depth has
+                another tilt.
+        """
+        options, corners = self._options, self._corners[view]
+        pose = estimate_pose(corners, self._board, self._camera, options.max_reprojection_px)
+        depth, amplitude = self._read(view)
+        area, usable = self._area(pose), np.isfinite(depth)
         if options.saturation_counts is not None and amplitude is not None:
             usable &= amplitude < options.saturation_counts
-        return compare_depth(view, pose, depth, usable, area, rays, options.depth_kind)
+        seen = area & usable
+        if seen.sum() < max(_FEWEST_PIXELS, area.sum() / 5):
+            raise RefusedViewError(
+                f"only {seen.sum()} of {area.sum()} board pixels have depth below saturation"
+            )
+        rays = self._rays[seen]
+        cosine, true = rays[:, 2], pose.distance(rays)
+        along = cosine if options.depth_kind == "z" else 1.0
+        measured = depth[seen] / along
+        errors = measured - true
+        # Flying pixels would tilt the plane of the depth.
+        near = (measured[:, None] * rays)[np.abs(errors - np.median(errors)) < _TENTH / 2]
+        # Noisy depth has no tilt; `refuse_mixed_up` still checks the ratio.
+        if len(near) >= _FEWEST_PIXELS:
+            normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2]
+            tilt = float(np.degrees(np.arccos(min(abs(float(normal @ pose.plane()[0])), 1.0))))
+            if tilt > _LARGEST_TILT_DEG:
+                raise RefusedViewError(
+                    f"the depth shows a plane {tilt:.0f} degrees off the board; {_SAME_VIEW}"
+                )
+        columns = np.stack([np.ones_like(true), true, true * (1.0 - cosine), errors])
+        return BoardView(
+            name=view,
+            pose=pose,
+            board_pixels=int(area.sum()),
+            usable_pixels=int(seen.sum()),
+            distance=float(np.median(true)),
+            error=float(np.median(errors * along)),
+            ratio=float(np.median(measured / true)),
+            kind_moments=columns @ columns.T,
+        )
 
-    sieve.apply(detect, sieve.progress(list(images.views), "finding boards"), str)
-    camera, about_camera, warnings = _camera(list(detected.values()), board, intrinsics)
-    rays = ray_directions(camera).numpy()
-    views = sieve.apply(place, sieve.progress(list(detected), "placing boards"), str)
-    ratio = typical_ratio(views)
-    views = sieve.apply(partial(refuse_mixed_up, ratio=ratio), views, lambda view: view.name)
-    posed = [(detected[view.name][0], view.pose, view.error) for view in views]
-    degeneracy = study_degeneracy(posed, board, camera, options.depth_kind)
-    warnings += agreement_warnings(views, ratio, options.depth_kind)
-
-    def frames() -> Iterator[Frame]:
+    def _frames(self, views: Sequence[BoardView]) -> Iterator[Frame]:
         for index, view in enumerate(views):
             normal, offset = view.pose.plane()
             row = FrameRow(
@@ -218,78 +326,160 @@ def _prepared(
                 world_from_tool=np.eye(4),
                 normal_world=normal,
                 offset=offset,
-                target=board.kind,
+                target=self._board.kind,
             )
-            depth, amplitude = read(view.name)
-            yield row, depth, amplitude, view.pose.area(board, rays, options.margin_squares)
+            depth, amplitude = self._read(view.name)
+            yield row, depth, amplitude, self._area(view.pose)
 
-    return PreparedImport(
-        views=[_reported(view, board, images.views[view.name], folder) for view in views],
-        frames=frames(),
-        writer=partial(
-            RecordingWriter,
-            camera=camera,
-            depth_kind=options.depth_kind,
-            modulation_frequency=options.modulation_frequency,
-            saturation_amplitude=options.saturation_counts,
-        ),
-        camera=about_camera,
-        findings={"degeneracy": degeneracy},
-        warnings=[*warnings, degeneracy_warning(degeneracy)],
-    )
+    def _reported(self, view: BoardView) -> dict[str, Any]:
+        """Return what `import.json` says of a view.
+
+        `plane_sd_mm` is the standard deviation of the plane's position at the board's centre, along
+        its normal, propagated from the corners; errors that all views share (focal length, square
+        length) are not included. `depth_error_mm` is the median of measured minus true depth.
+        """
+        pose, centre = view.pose, view.pose.centre(self._board)
+        cosine = abs(float(pose.plane()[0] @ centre)) / float(np.linalg.norm(centre))
+        files = self._files[view.name]
+        return {
+            "view": view.name,
+            "depth_file": files["depth"].relative_to(self._folder).as_posix(),
+            "infrared_file": files["infrared"].relative_to(self._folder).as_posix(),
+            "reprojection_rms_px": pose.reprojection_rms,
+            "corners_used": int(pose.used.sum()),
+            "board_pixels": view.board_pixels,
+            "usable_pixels": view.usable_pixels,
+            "distance_m": view.distance,
+            "incidence_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))),
+            "plane_sd_mm": 1000 * pose.plane_deviation,
+            "depth_error_mm": 1000 * view.error,
+        }
 
 
-def _corners(image: np.ndarray, board: FlatBoard, name: str, *, hint: bool) -> np.ndarray:
-    """Find the board's corners in an image, shape (N, 2).
+def typical_ratio(views: Sequence[BoardView]) -> float:
+    """Return the median ratio of measured to true distance.
 
-    If no board is found, a hint may try one with a row and a column fewer: a common mistake is to
-    count squares instead of inner corners.
+    Raises:
+        CalibrationDataError: It is so far from 1 that a unit must be wrong: units differ by factors
+            of 10 and more, cameras by a tenth.
     """
-    corners = board.find(image)
-    if corners is not None:
-        return corners
-    fewer = board.fewer()
-    said = ""
-    if hint and fewer is not None and fewer.find(image) is not None:
-        said = f", but one of {fewer}: count inner corners, not squares"
-    what = f"board of {board} inner corners" if fewer else f"board {board}"
-    raise RefusedViewError(f"no {what} found in {name}{said}")
+    ratio = float(np.median([view.ratio for view in views]))
+    if not 0.5 < ratio < 2:
+        raise CalibrationDataError(
+            f"the depth images read {ratio:.3g} times the distance at which the corners place the "
+            "board; correct the unit of depth or the square length."
+        )
+    return ratio
 
 
-def _camera(
-    detected: Sequence[tuple[np.ndarray, tuple[int, int]]],
+def refuse_mixed_up(view: BoardView, ratio: float) -> BoardView:
+    """Return a view, unless its ratio of measured to true distance differs much from that of all.
+
+    Raises:
+        RefusedViewError: Depth and infrared image are not of the same view, or the pose is wrong.
+    """
+    if abs(view.ratio / ratio - 1.0) > _TENTH:
+        raise RefusedViewError(
+            f"the depth is {view.ratio:.3f} times the board's distance, in other views {ratio:.3f} "
+            f"times; {_SAME_VIEW}"
+        )
+    return view
+
+
+def agreement_warnings(
+    views: Sequence[BoardView], ratio: float, depth_kind: DepthKind
+) -> list[str]:
+    """Return warnings about the unit and the kind of depth.
+
+    The radial error is regressed on D (1 - cosine), with a constant and D as further regressors:
+    radial depth declared as z gives a slope of +1, z depth declared as radial gives -1.
+    """
+    warnings = []
+    if abs(ratio - 1.0) > _TENTH / 2:
+        warnings.append(
+            f"Depth reads {100 * (ratio - 1):+.1f} % against the board: check the square length, "
+            "the focal length and the unit of depth before calling it a distance error."
+        )
+    moments = np.sum([view.kind_moments for view in views], axis=0)
+    # After removing constant and D, D (1 - cosine) must vary by more than the camera's own error,
+    # some millimetres, to estimate its slope.
+    explained = moments[2, :2] @ np.linalg.pinv(moments[:2, :2]) @ moments[:2, 2]
+    spread_mm = 1000 * np.sqrt(max(moments[2, 2] - explained, 0.0) / moments[0, 0])
+    if spread_mm < 5:
+        return warnings
+    slope = float(np.linalg.solve(moments[:3, :3], moments[:3, 3])[2])
+    if abs(slope) > 0.5:
+        warnings.append(
+            f"Away from the image centre the depth error grows with {slope:+.2f} of what turns "
+            f"z into radial depth (0 expected): is depth really '{depth_kind}'?"
+        )
+    return warnings
+
+
+def study_degeneracy(
+    views: Sequence[tuple[np.ndarray, BoardPose, float]],
     board: FlatBoard,
-    intrinsics: GivenIntrinsics | None,
-) -> tuple[CameraIntrinsics, dict[str, Any], list[str]]:
-    """Return the camera of the images' commonest size, what to report of it, and warnings."""
-    size = Counter(size for _, size in detected).most_common(1)[0][0]
-    if intrinsics is not None:
-        camera = intrinsics.camera(size)
-        return camera, camera_mapping(camera, intrinsics.source), []
-    camera, found = calibrate([corners for corners, own in detected if own == size], board, size)
-    about = camera_mapping(camera, "calibrated from the boards") | found
-    return camera, about, [calibration_warning(camera, found)]
+    camera: CameraIntrinsics,
+    depth_kind: DepthKind,
+) -> dict[str, Any]:
+    """Estimate the poses again with other focal lengths and square lengths.
 
+    With a longer focal length the board is farther away, and its corners have almost the same
+    pixels; with longer squares exactly the same. Both look like a distance error proportional to
+    the distance.
 
-def _reported(view: BoardView, board: FlatBoard, files: Files, folder: Path) -> dict[str, Any]:
-    """Return what `import.json` says of a view.
+    Args:
+        views: Of each view the corners, the board's pose, and the median depth error, metres.
+        board: The board as given.
+        camera: The camera intrinsics used.
+        depth_kind: Kind of the views' depth errors.
 
-    `plane_sd_mm` is the standard deviation of the plane's position at the board's centre, along its
-    normal, propagated from the corners; errors that all views share (focal length, square length)
-    are not included. `depth_error_mm` is the median of measured minus true depth.
+    Returns:
+        What `import.json` says of it: `as_given`, and `alternatives` that the corners cannot
+        exclude (shorter and longer focal length, larger squares).
     """
-    pose, centre = view.pose, view.pose.centre(board)
-    cosine = abs(float(pose.plane()[0] @ centre)) / float(np.linalg.norm(centre))
-    return {
-        "view": view.name,
-        "depth_file": files["depth"].relative_to(folder).as_posix(),
-        "infrared_file": files["infrared"].relative_to(folder).as_posix(),
-        "reprojection_rms_px": pose.reprojection_rms,
-        "corners_used": int(pose.used.sum()),
-        "board_pixels": view.board_pixels,
-        "usable_pixels": view.usable_pixels,
-        "distance_m": view.distance,
-        "incidence_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))),
-        "plane_sd_mm": 1000 * pose.plane_deviation,
-        "depth_error_mm": 1000 * view.error,
-    }
+
+    def read_with(focal: float, square: float) -> dict[str, Any]:
+        (fx, skew, cx), (_, fy, cy), last = camera.matrix
+        other = replace(camera, matrix=((fx * focal, skew, cx), (0.0, fy * focal, cy), last))
+        larger = replace(board, square_length=board.square_length * square)
+        poses = [poses_of(corners, larger, other, pose.used)[0] for corners, pose, _ in views]
+        distances = np.array([distance(pose, larger) for pose in poses])
+        errors = np.array([error + distance(pose, board) for _, pose, error in views]) - distances
+        # Over less than 0.1 m a slope says nothing.
+        slope = None if np.ptp(distances) < _TENTH else np.polyfit(distances, 1000 * errors, 1)[0]
+        return {
+            "focal_factor": focal,
+            "square_factor": square,
+            "reprojection_rms_px": float(np.sqrt(np.mean([p.reprojection_rms**2 for p in poses]))),
+            "slope_mm_per_m": None if slope is None else float(slope),
+            "mean_error_mm": 1000 * float(errors.mean()),
+        }
+
+    def distance(pose: BoardPose, board: FlatBoard) -> float:
+        centre = pose.centre(board)
+        return float(centre[2] if depth_kind == "z" else np.linalg.norm(centre))
+
+    focal, square = _CHANGES
+    changes = ((1 - focal, 1.0), (1 + focal, 1.0), (1.0, 1 + square))
+    alternatives = [read_with(*change) for change in changes]
+    return {"as_given": read_with(1.0, 1.0), "alternatives": alternatives}
+
+
+def degeneracy_warning(found: dict[str, Any]) -> str:
+    """Return the result of `study_degeneracy` as a sentence with numbers."""
+
+    def said(one: dict[str, Any]) -> str:
+        slope = one["slope_mm_per_m"]
+        error = f"{one['reprojection_rms_px']:.3f} px and {one['mean_error_mm']:+.1f} mm"
+        return error if slope is None else f"{error}, slope {slope:+.1f} mm/m"
+
+    shorter, longer, larger = map(said, found["alternatives"])
+    focal, square = _CHANGES
+    return (
+        "A board cannot tell focal length, square length and slope of the distance error apart: "
+        f"reprojection error and mean depth error are {said(found['as_given'])}; with the focal "
+        f"length {focal:.0%} shorter {shorter}, longer {longer}; with squares {square:.0%} larger "
+        f"{larger}. Measure the printed board, and take the focal length from a source of its own, "
+        "before trusting offset and slope."
+    )

@@ -1,6 +1,5 @@
 """The camera intrinsics and the pose of a board from its corners, by OpenCV."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +29,7 @@ _FEWEST_VIEWS = 5
 _SMALLEST_TILT_DEG = 5.0
 """Parallel boards fit any focal length. The solver's standard deviations do not show it, because it
 stops somewhere along a valley; so the root mean square tilt of the boards must be so large, and
-focal length and deviation be sane (`_refuse_undetermined`). Set by hand."""
+focal length and deviation be sane. Set by hand."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +130,7 @@ def estimate_pose(
         same = best.plane()[0] @ other.plane()[0] > np.cos(np.radians(3))
         if not same and other.reprojection_rms < _AMBIGUOUS_RATIO * best.reprojection_rms:
             raise RefusedViewError(
-                f"two different poses explain the corners alike ({best.reprojection_rms:.3f} and "
-                f"{other.reprojection_rms:.3f} px); move the board nearer or tilt it more"
+                "two different poses explain the corners; move the board nearer or tilt it more"
             )
     return best
 
@@ -200,8 +198,7 @@ def calibrate(
     """
     if len(corner_sets) < _FEWEST_VIEWS:
         raise CalibrationDataError(
-            f"{len(corner_sets)} views show the board; at least {_FEWEST_VIEWS} are needed to "
-            "calibrate the camera. Record more, at several tilts, or give the intrinsics."
+            f"{len(corner_sets)} views show the board; at least {_FEWEST_VIEWS} calibrate a camera."
         )
     chosen = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
     most = 5
@@ -227,8 +224,7 @@ def calibrate(
         return camera, about
     if len(keep) < _FEWEST_VIEWS:
         raise CalibrationDataError(
-            f"only {len(keep)} of {len(corner_sets)} views fit one camera; at least "
-            f"{_FEWEST_VIEWS} are needed. Is the board flat, and its size right?"
+            f"only {len(keep)} of {len(corner_sets)} views fit one camera. Is the board flat?"
         )
     return _solve([corner_sets[i] for i in keep], [chosen[i] for i in keep], board, size)[:2]
 
@@ -238,8 +234,8 @@ def calibration_warning(camera: CameraIntrinsics, about: dict[str, Any]) -> str:
     focal_length, deviation = camera.matrix[0][0], about["standard_deviations"][0]
     return (
         f"The focal length calibrated from {about['views']} views is {focal_length:.1f} ± "
-        f"{deviation:.1f} px (one standard deviation); by itself that leaves the slope of the "
-        f"distance error uncertain by {1000 * deviation / focal_length:.1f} mm/m."
+        f"{deviation:.1f} px (one standard deviation): the distance error's slope is uncertain by "
+        f"{1000 * deviation / focal_length:.1f} mm/m."
     )
 
 
@@ -255,13 +251,25 @@ def _solve(
             )
         )
     except cv2.error as error:
-        raise CalibrationDataError(
-            f"OpenCV cannot calibrate the camera from these views ({error.err}); "
-            "tilt the board about both axes, or give the intrinsics."
-        ) from None
+        raise CalibrationDataError(f"OpenCV cannot calibrate the camera: {error.err}.") from None
     distortion = distortion.ravel()[:5]
     deviations = deviations.ravel()[:9]
-    _refuse_undetermined(matrix, deviations, rotations, size)
+    # Refused are focal lengths that are uncertain by a fifth, or unlike any camera's.
+    focal_lengths = matrix[[0, 1], [0, 1]]
+    sound = np.isfinite(matrix).all() and np.isfinite(deviations).all()
+    sane = (5 * focal_lengths > max(size)) & (focal_lengths < 20 * max(size))
+    sane &= 5 * deviations[:2] < focal_lengths
+    # The root mean square angle between the boards' normals and their mean.
+    normals = np.stack([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
+    mean = normals.mean(axis=0)
+    cosines = np.clip(normals @ mean / np.linalg.norm(mean), -1.0, 1.0)
+    tilt = float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2))))
+    if not (sound and sane.all()) or tilt < _SMALLEST_TILT_DEG:
+        raise CalibrationDataError(
+            f"the board's tilts vary by {tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed), and "
+            f"the focal length came out as {matrix[0, 0]:.4g} ± {deviations[0]:.2g} px; tilt the "
+            "board about both axes, or give the intrinsics."
+        )
     errors = [
         np.linalg.norm(
             cv2.projectPoints(points, turn, move, matrix, distortion)[0][:, 0] - own, axis=1
@@ -282,28 +290,3 @@ def _solve(
         "outlying_corners": seen - sum(int(u.sum()) for u in used),
     }
     return camera, about, errors
-
-
-def _refuse_undetermined(
-    matrix: np.ndarray,
-    deviations: np.ndarray,
-    rotations: Sequence[np.ndarray],
-    size: tuple[int, int],
-) -> None:
-    """Refuse focal lengths that are uncertain by a fifth, or unlike any camera's."""
-    focal_lengths = matrix[[0, 1], [0, 1]]
-    sound = np.isfinite(matrix).all() and np.isfinite(deviations).all()
-    sane = (5 * focal_lengths > max(size)) & (focal_lengths < 20 * max(size))
-    sane &= 5 * deviations[:2] < focal_lengths
-    # The root mean square angle between the boards' normals and their mean.
-    normals = np.stack([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
-    mean = normals.mean(axis=0)
-    cosines = np.clip(normals @ mean / np.linalg.norm(mean), -1.0, 1.0)
-    tilt = float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2))))
-    if not (sound and sane.all()) or tilt < _SMALLEST_TILT_DEG:
-        raise CalibrationDataError(
-            "these views do not determine the camera: the board's tilts vary by "
-            f"{tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed), and the focal length came out as "
-            f"{matrix[0, 0]:.4g} ± {deviations[0]:.2g} px for images of {size[0]}x{size[1]}; "
-            "tilt the board about both axes, or give the intrinsics."
-        )

@@ -37,7 +37,7 @@ def command(sources: tuple[Path, ...], out: Path, **given: Any) -> None:  # noqa
     or a folder that holds measurements.csv and transforms.csv. Several readings at one pose stand
     in one row; their median is used.
     """
-    from tofcorr.importing.distances.readings import open_distances, sensor_camera, zones_of
+    from tofcorr.importing.distances.readings import open_distances, sensor_lens, zones_of
     from tofcorr.importing.posed import import_posed
 
     zones = zones_of(given.pop("zones"))
@@ -45,6 +45,6 @@ def command(sources: tuple[Path, ...], out: Path, **given: Any) -> None:  # noqa
         # Along the one ray both kinds are the same.
         given["depth_kind"] = "radial"
     options = take_posed_options(given)
-    camera = sensor_camera(zones, given.pop("fov_deg"))
-    report = import_posed(open_distances(sources, camera, **given), out, options, progress_bar)
-    print_report(report, out)
+    lens = sensor_lens(zones, given.pop("fov_deg"))
+    images = open_distances(sources, zones, lens, **given)
+    print_report(import_posed(images, out, options, progress_bar), out)

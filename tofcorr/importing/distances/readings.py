@@ -3,14 +3,14 @@
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.images import DepthImage
-from tofcorr.importing.intrinsics import intrinsics_from_numbers
+from tofcorr.importing.intrinsics import GivenIntrinsics, intrinsics_from_numbers
 from tofcorr.importing.numbers import Line, any_numbers, lines_of, read_text
 from tofcorr.importing.pose_files import read_poses
 from tofcorr.importing.pose_track import PoseTrack
@@ -38,10 +38,10 @@ def zones_of(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def sensor_camera(
+def sensor_lens(
     zones: tuple[int, int], field_of_view_deg: tuple[float, ...] | None
-) -> CameraIntrinsics:
-    """Return a pinhole camera with one pixel a zone.
+) -> GivenIntrinsics:
+    """Return the intrinsics of a pinhole camera with one pixel a zone.
 
     Args:
         zones: Columns and rows.
@@ -55,23 +55,20 @@ def sensor_camera(
     focal = [1.0, 1.0]
     if zones != (1, 1):
         if field_of_view_deg is None:
-            raise ConfigError(
-                f"A sensor of {columns}x{rows} zones needs its field of view: --fov-deg H,V (a "
-                "VL53L5CX has 45,45)."
-            )
+            raise ConfigError(f"A sensor of {columns}x{rows} zones needs --fov-deg H,V.")
         if not all(0 < angle < 180 for angle in field_of_view_deg):
             raise ConfigError(f"--fov-deg must be between 0 and 180, got {field_of_view_deg}.")
         angles = field_of_view_deg[0], field_of_view_deg[-1]
         pairs = zip(zones, angles, strict=True)
         focal = [side / 2 / math.tan(math.radians(angle) / 2) for side, angle in pairs]
     centre = (columns - 1) / 2, (rows - 1) / 2
-    given = intrinsics_from_numbers(focal, centre, (), "--fov-deg")
-    return given.camera(zones)
+    return replace(intrinsics_from_numbers(focal, centre, (), "--fov-deg"), size=zones)
 
 
 def open_distances(
     sources: Sequence[Path],
-    camera: CameraIntrinsics,
+    zones: tuple[int, int],
+    lens: GivenIntrinsics,
     *,
     poses: Sequence[Path] = (),
     pose_format: str | None = None,
@@ -82,7 +79,8 @@ def open_distances(
 
     Args:
         sources: For each wall a file of distances, or a folder with one and a file of poses.
-        camera: The sensor's zones as pixels.
+        zones: Columns and rows of the sensor.
+        lens: Its zones as pixels.
         poses: For each wall a file of poses; none where folders hold them.
         pose_format: Of `tofcorr.importing.pose_files.POSE_FORMATS`; None: told from the content.
         names: What each wall is called; none: as its file or folder.
@@ -92,33 +90,28 @@ def open_distances(
         CalibrationDataError: A file is missing or damaged, or rows and poses are not as many.
         ConfigError: There are not as many poses or names as sources.
     """
-    zones = camera.width, camera.height
     names = _wall_names(sources, poses, names)
-    tables, tracks, units, typical = [], [], set[float](), []
-    for place, source in enumerate(sources):
-        metres, unit, usual = read_distances(_file_in(source, "distances"), zones, unit_mm)
-        path = poses[place] if poses else _file_in(source, "poses")
-        track = read_poses(path, pose_format)
-        if len(track) != len(metres):
+    tables = [read_distances(_file_in(source, "distances"), zones) for source in sources]
+    paths = poses or [_file_in(source, "poses") for source in sources]
+    tracks = [read_poses(path, pose_format).world_from_tool for path in paths]
+    for path, track, table in zip(paths, tracks, tables, strict=True):
+        if len(track) != len(table):
             raise CalibrationDataError(
-                f"{path}: {len(track)} poses beside {len(metres)} rows of distances; "
-                "expected one row for each pose."
+                f"{path}: {len(track)} poses beside {len(table)} rows of distances."
             )
-        tables.append(metres)
-        tracks.append(track.world_from_tool)
-        units.add(unit)
-        typical.append(f"{usual:g}")
+    typical = [float(np.nanmedian(table)) for table in tables]
+    # No such sensor sees 20 m.
+    units = {1.0 if one >= 20 else 1000.0 for one in typical} if unit_mm is None else {unit_mm}
     if len(units) > 1:
         raise CalibrationDataError(
-            "The sources seem to have different units: typical numbers are "
-            f"{', '.join(typical)}. State --depth-unit-mm."
+            f"The sources' units differ: typical numbers are {typical}. State --depth-unit-mm."
         )
+    (unit,) = units
     warnings = []
     if unit_mm is None:
-        (unit,) = units
         word = "millimetres" if unit == 1 else "metres"
         warnings.append(
-            f"Distances are typically {typical[0]} and read as {word}; state "
+            f"Distances are typically {typical[0]:g} and read as {word}; state "
             f"--depth-unit-mm {unit:g} if that is right."
         )
     if zones == (1, 1):
@@ -127,7 +120,7 @@ def open_distances(
             "on the tool can be found; a turn about the ray cannot."
         )
     origin = ", ".join(map(str, sources)) if len(sources) < 3 else f"{sources[0]}, ..."
-    every = np.concatenate(tables).astype(np.float32)
+    every = (unit * np.concatenate(tables) / 1000).astype(np.float32)
 
     def read(number: int) -> DepthImage:
         if not np.isfinite(every[number]).any():
@@ -139,7 +132,7 @@ def open_distances(
     return RobotImages(
         origin=origin,
         names=[f"{name} {row}" for name, row in zip(targets, rows, strict=True)],
-        camera=camera,
+        intrinsics=lens,
         read=read,
         track=PoseTrack.checked(np.concatenate(tracks), origin),
         targets=targets,
@@ -175,9 +168,7 @@ def _file_in(source: Path, what: str) -> Path:
     return found
 
 
-def read_distances(
-    path: Path, zones: tuple[int, int], unit_mm: float | None
-) -> tuple[np.ndarray, float, float]:
+def read_distances(path: Path, zones: tuple[int, int]) -> np.ndarray:
     """Read a table of distances: one row a pose, one or several readings a row.
 
     A row holds, after an optional time stamp, the distances of all zones row by row, once or
@@ -186,12 +177,10 @@ def read_distances(
     Args:
         path: The file.
         zones: Columns and rows of the sensor.
-        unit_mm: Millimetres per count; None: 1 if numbers are typically above 20, for no such
-            sensor sees 20 m; else 1000.
 
     Returns:
-        The median of the readings at each pose, shape (P, rows, columns), metres, NaN without
-        return; millimetres per count; and the median number in the file, as written.
+        The median of the readings at each pose, as written, shape (P, rows, columns); NaN without
+        return.
 
     Raises:
         CalibrationDataError: The file cannot be read, or a row does not hold whole readings.
@@ -200,21 +189,12 @@ def read_distances(
     lines = lines_of(read_text(path))
     if lines and not any(any_numbers(text).shape == () for text in lines[0][1]):
         lines = lines[1:]
-    if not lines:
-        raise CalibrationDataError(f"{path}: expected distances, found none.")
     readings = [_readings(line, columns * rows, path) for line in lines]
-    returned = np.concatenate([one[one > 0] for one in readings])
-    if not returned.size:
+    medians = [np.ma.median(np.ma.masked_where(~(one > 0), one), axis=0) for one in readings]
+    found = np.reshape([np.ma.filled(median, np.nan) for median in medians], (-1, rows, columns))
+    if not np.isfinite(found).any():
         raise CalibrationDataError(f"{path}: no distance is above zero.")
-    typical = float(np.median(returned))
-    if unit_mm is None:
-        unit_mm = 1.0 if typical >= 20 else 1000.0
-    medians = [
-        np.ma.median(np.ma.masked_where(~(np.isfinite(one) & (one > 0)), one), axis=0)
-        for one in readings
-    ]
-    metres = unit_mm * np.stack([np.ma.filled(median, np.nan) for median in medians]) / 1000
-    return metres.reshape(-1, rows, columns), unit_mm, typical
+    return found
 
 
 def _readings(line: Line, zones: int, path: Path) -> np.ndarray:
@@ -223,12 +203,8 @@ def _readings(line: Line, zones: int, path: Path) -> np.ndarray:
     # A time, or a number of the row.
     if any_numbers(fields[0]).shape or (len(fields) % zones == 1 and zones > 1):
         fields = fields[1:]
-    wrong = next((text for text in fields if any_numbers(text).shape), None)
-    if wrong is not None:
-        raise CalibrationDataError(f"{path}, line {number}: expected numbers, got '{wrong[:40]}'.")
-    if not fields or len(fields) % zones:
-        raise CalibrationDataError(
-            f"{path}, line {number}: {len(fields)} numbers are not whole readings of {zones} "
-            "zones. State the sensor's zones with --zones COLUMNSxROWS."
-        )
-    return any_numbers(fields).reshape(-1, zones)
+    values = any_numbers(fields)
+    if not values.size or values.size % zones:
+        said = f"{values.size} numbers are not whole readings of {zones} zones (--zones)"
+        raise CalibrationDataError(f"{path}, line {number}: {said}.")
+    return np.where(np.isfinite(values), values, 0.0).reshape(-1, zones)

@@ -1,6 +1,5 @@
 """Folders of depth images beside a file of robot poses."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +23,9 @@ from tofcorr.importing.command_line import (
 
 _DEPTH = "Names of the depth images (PNG, TIFF, NPY, EXR), such as 'depth/*.png'."
 _AMPLITUDE = "Names of the amplitude or infrared images; * stands for the same as in --depth."
-_GREY = (
-    "With --board: images in which its corners are found, 8 bits and colour allowed; left out: the "
-    "amplitude images."
-)
+_GREY = "With --board: images that show it, 8 bits and colour allowed; left out: the amplitudes."
 _POSES = "Poses of the tool in the base: a file, or a folder with a matrix a file."
-_BOARD = (
-    "Instead of --poses: a board that gives the plane of each image; as in import checkerboard."
-)
+_BOARD = "Instead of --poses: a board in each image; as in import checkerboard."
 _TIMES = "List of 'time name' lines, where the images' names are no times."
 
 
@@ -58,10 +52,8 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     cannot be used are left out, and import.json in the recording says why.
     """
     if (given["poses"] is None) == (given["board"] is None):
-        raise ConfigError(
-            "say where the planes come from, in one way: --poses FILE (of the robot's tool; walls "
-            "are then found), or --board and --square-mm."
-        )
+        ways = "--poses FILE (walls are then found), or --board and --square-mm"
+        raise ConfigError(f"say where the planes come from, in one way: {ways}.")
     run = _from_poses if given["board"] is None else _from_boards
     print_report(run(folder, out, given), out)
 
@@ -86,7 +78,6 @@ def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any
 def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any]:
     """Import images of a board, without a robot."""
     from tofcorr.importing.checkerboard.importer import CheckerboardOptions, import_checkerboard
-    from tofcorr.importing.frames.source import board_images
 
     amplitude = given["amplitude_pattern"]
     corners = given["grey_pattern"] or amplitude
@@ -103,5 +94,5 @@ def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, An
         "modulation_frequency": given["modulation_frequency_hz"],
     }
     options = CheckerboardOptions.from_mapping(mapping, "tofcorr import frames")
-    find = partial(board_images, coding=coding, amplitude_pattern=amplitude)
-    return import_checkerboard(folder, out, options, take_intrinsics(given), progress_bar, find)
+    lens, images = take_intrinsics(given), {"coding": coding, "amplitude_pattern": amplitude}
+    return import_checkerboard(folder, out, options, lens, progress_bar, **images)

@@ -1,7 +1,7 @@
 """ROS bags: depth images and the robot's transforms, read one message at a time.
 
-`bag` gives access to the messages of a topic by number and decodes images, `source` follows the
-transforms from base to tool and puts both together.
+`source` gives access to the messages of a topic by number, decodes images, and follows the
+transforms from base to tool.
 """
 
 from pathlib import Path

@@ -1,23 +1,20 @@
-"""A bag's images, camera, and the robot's transforms from base to tool, ready to be imported."""
+"""A bag's images, camera, and the robot's transforms from base to tool, ready to be imported.
+
+Everything that the package `rosbags` raises on a damaged file becomes one sentence.
+"""
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 import torch
 
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
 from tofcorr.geometry import se3
-from tofcorr.importing.images import (
-    DepthCoding,
-    DepthImage,
-    camera_of,
-    coded_image,
-    of_size,
-    turned,
-)
+from tofcorr.importing.images import DepthCoding, DepthImage, coded_image, decoded
 from tofcorr.importing.intrinsics import (
     GivenIntrinsics,
     intrinsics_from_mapping,
@@ -26,8 +23,7 @@ from tofcorr.importing.intrinsics import (
 from tofcorr.importing.pose_files import rigid_transforms
 from tofcorr.importing.pose_track import PoseTrack, nearest
 from tofcorr.importing.robot_images import RobotImages
-from tofcorr.importing.rosbag.bag import Bag, TopicMessages, damage_reported, seconds
-from tofcorr.importing.run import Refused
+from tofcorr.importing.run import Refused, RefusedViewError
 
 _SAME_IMAGE = 0.01
 """Seconds between the stamps of depth and amplitude of one exposure: a third of a frame at 30 Hz;
@@ -35,6 +31,187 @@ most drivers give both one stamp."""
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+
+_TYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "64FC1": "f8", "32SC1": "i4"}
+"""Number type of each encoding of one channel. Eight bits are a preview."""
+
+_DEPTH_HEADER = 12
+"""Bytes before the PNG of compressedDepth: its format, and two numbers that code depth in floats
+(image_transport_plugins, compressed_depth_image_transport)."""
+
+
+class Bag:
+    """An open bag: a ROS 1 file, a ROS 2 folder, or an MCAP or SQLite file of ROS 2.
+
+    Attributes:
+        path: The file or folder.
+        reader: An `AnyReader` of rosbags.
+    """
+
+    def __init__(self, path: Path, reader: Any) -> None:  # noqa: ANN401 - of rosbags
+        self.path, self.reader = path, reader
+
+    @property
+    def types(self) -> dict[str, str]:
+        """The message type of each topic, by its name, such as `sensor_msgs/msg/Image`."""
+        return {c.topic: c.msgtype for c in self.reader.connections}
+
+    def messages(self, topic: str, start: int | None = None) -> Iterator[tuple[int, Any]]:
+        """Yield the messages of a topic with the times they were received at, nanoseconds.
+
+        Args:
+            topic: Its name.
+            start: Messages received before are left out, nanoseconds.
+        """
+        own = [c for c in self.reader.connections if c.topic == topic]
+        with damage_reported(self.path):
+            for connection, received, content in self.reader.messages(own, start=start):
+                yield received, self.reader.deserialize(content, connection.msgtype)
+
+    def first(self, topic: str) -> Any:  # noqa: ANN401 - the type is the topic's
+        """Return the first message of a topic.
+
+        Raises:
+            CalibrationDataError: There is none.
+        """
+        for _, message in self.messages(topic):
+            return message
+        raise CalibrationDataError(f"{self.path}: {topic} has no message.")
+
+    def listed_topics(self) -> str:
+        """Return the topics and their types, for messages."""
+        listed = [f"{topic} ({kind.replace('/msg/', '/')})" for topic, kind in self.types.items()]
+        return ", ".join(sorted(listed)) or "none"
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Bag]:
+    """Open a bag.
+
+    Raises:
+        CalibrationDataError: It is no bag, is damaged, or the package `rosbags` is missing.
+    """
+    if not path.exists():
+        raise CalibrationDataError(f"{path}: there is no such bag.")
+    try:
+        from rosbags import highlevel
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise CalibrationDataError(f"{path} needs rosbags: pip install 'tofcorr[rosbag]'") from None
+    with damage_reported(path):
+        # The message types of bags that do not hold their own.
+        default = get_typestore(Stores.ROS2_HUMBLE)
+        reader = highlevel.AnyReader([path], default_typestore=default)
+        reader.open()
+    with closing(reader):
+        yield Bag(path, reader)
+
+
+@contextmanager
+def damage_reported(path: Path) -> Iterator[None]:
+    """Turn what a reader raises on damaged bytes into one sentence."""
+    try:
+        yield
+    except TofcorrError:
+        raise
+    except Exception as error:  # noqa: BLE001 - the reader raises whatever its bytes lead it to
+        detail = (str(error).splitlines() or [""])[0][:150]
+        raise CalibrationDataError(
+            f"{path}: not a readable ROS bag ({type(error).__name__}: {detail})."
+        ) from None
+
+
+def seconds(stamp: Any) -> float:  # noqa: ANN401 - of rosbags
+    """Return a time stamp in seconds."""
+    return stamp.sec + stamp.nanosec / 10**9
+
+
+class TopicMessages:
+    """Access to the messages of a topic by number, quickest in the order they were recorded.
+
+    Args:
+        bag: An open bag that nothing else is read from meanwhile.
+        topic: The topic.
+
+    Attributes:
+        topic: Its name.
+        stamps: Times in the messages' headers, shape (N,), seconds; of receipt where headers hold
+            none.
+        stamped: Whether headers hold times.
+        frame_id: The coordinate frame that the first header names; empty if none.
+    """
+
+    def __init__(self, bag: Bag, topic: str) -> None:
+        self._bag, self.topic, self.frame_id = bag, topic, ""
+        self._iterator: Iterator[tuple[int, Any]] | None = None
+        self._next, self._received = 0, list[int]()
+        stamps: list[float] = []
+        for time, message in bag.messages(topic):
+            self.frame_id = self.frame_id or str(message.header.frame_id)
+            self._received.append(time)
+            stamps.append(seconds(message.header.stamp))
+        self.stamped = bool(stamps) and all(stamp > 0 for stamp in stamps)
+        received = np.array(self._received, dtype=np.float64) / 10**9
+        self.stamps = np.array(stamps) if self.stamped else received
+
+    def image(self, number: int) -> np.ndarray:
+        """Return a message of type Image or CompressedImage as an array, shape (H, W).
+
+        Raises:
+            RefusedViewError: It is damaged, has several channels, or is coded with losses.
+            CalibrationDataError: The bag cannot be read any more.
+        """
+        # To read and drop 20 messages is as quick as a seek on a disk.
+        if self._iterator is None or not 0 <= number - self._next <= 20:
+            time = self._received[number]
+            self._iterator = self._bag.messages(self.topic, start=time)
+            # Several messages may have been received in one nanosecond.
+            self._next = self._received.index(time)
+        message = next((one for _, one in islice(self._iterator, number - self._next, None)), None)
+        self._next = number + 1
+        if message is None:
+            raise CalibrationDataError(
+                f"{self._bag.path}: message {number} of {self.topic} is gone. Was the bag changed?"
+            )
+        if hasattr(message, "encoding"):
+            return _plain(message, self.topic)
+        return _compressed(str(message.format), bytes(message.data), self.topic)
+
+
+def _plain(message: Any, topic: str) -> np.ndarray:  # noqa: ANN401 - of rosbags
+    kind = _TYPES.get(message.encoding)
+    if kind is None:
+        known = f"one channel of 16 bits or more: {', '.join(_TYPES)}"
+        raise RefusedViewError(
+            f"{topic} has the encoding '{message.encoding[:40]}'; expected {known}"
+        )
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row = width * np.dtype(kind).itemsize
+    if not height or not width or step < row or len(message.data) < height * step:
+        size = f"{width}x{height} pixels with {step} bytes a row"
+        raise RefusedViewError(f"{topic}: {len(message.data)} bytes do not hold {size}")
+    content = np.asarray(message.data, dtype=np.uint8)[: height * step].reshape(height, step)
+    order = ">" if message.is_bigendian else "<"
+    return np.ascontiguousarray(content[:, :row]).view(order + kind).astype(kind)
+
+
+def _compressed(coding: str, content: bytes, topic: str) -> np.ndarray:
+    """Undo compression; compressedDepth is a PNG of counts, or of inverse depth for floats."""
+    of_depth, lossy = "compressedDepth" in coding, "jpeg" in coding or "jpg" in coding
+    if "rvl" in coding.lower() or (lossy and not of_depth):
+        raise RefusedViewError(
+            f"{topic} is coded as '{coding[:60]}'; expected PNG. Record the raw topic"
+        )
+    image = decoded(content[_DEPTH_HEADER:] if of_depth else content)
+    if image is None or image.ndim != 2:
+        raise RefusedViewError(f"{topic}: a compressed image cannot be decoded to one channel")
+    if not of_depth or not coding.strip().startswith("32FC1"):
+        return image
+    scale, shift = np.frombuffer(content[4:_DEPTH_HEADER], dtype="<f4").astype(np.float64)
+    counts = image.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(counts > 0, scale / (counts - shift), np.nan)
+    return depth.astype(np.float32)
 
 
 @contextmanager
@@ -69,30 +246,29 @@ def open_bag(
         ConfigError: Intrinsics are named twice.
     """
     if camera_info is not None and intrinsics is not None:
-        raise ConfigError("say where the intrinsics come from, in one way: not both --camera-info "
-                          "and --intrinsics.")  # fmt: skip
-    warnings: list[str] = []
-    with closing(Bag(path)) as bag:
-        _check_image_topics(bag, depth_topic, amplitude_topic)
-        if intrinsics is not None:
-            given = read_named_intrinsics(intrinsics)
-        else:
-            topic = _camera_info_topic(bag, depth_topic, camera_info)
-            given, warnings = _read_camera_info(bag, topic, depth_topic)
-        with damage_reported(path):
-            parents, poses = _read_tf(bag)
-        frames = base_frame.lstrip("/"), tool_frame.lstrip("/")
-        track = _base_from_tool(parents, poses, *frames, str(path))
+        raise ConfigError("name the intrinsics once: --camera-info or --intrinsics.")
     with ExitStack() as opened:
+        bag, warnings = opened.enter_context(_opened(path)), list[str]()
         with damage_reported(path):
-            topics = [topic for topic in (depth_topic, amplitude_topic) if topic is not None]
-            messages = [opened.enter_context(closing(TopicMessages(path, t))) for t in topics]
-            images = _images(messages, given, coding, track, str(path), warnings)
+            _check_image_topics(bag, depth_topic, amplitude_topic)
+            if intrinsics is not None:
+                given = read_named_intrinsics(intrinsics)
+            else:
+                topic = _camera_info_topic(bag, depth_topic, camera_info)
+                given, warnings = _read_camera_info(bag, topic, depth_topic)
+            frames = base_frame.lstrip("/"), tool_frame.lstrip("/")
+            track = _base_from_tool(*_read_tf(bag), *frames, str(path))
+            depth, amplitude = TopicMessages(bag, depth_topic), None
+            if amplitude_topic is not None:
+                # Of its own, so that two topics can be read in turn.
+                amplitude = TopicMessages(opened.enter_context(_opened(path)), amplitude_topic)
+            images = _images(depth, amplitude, given, coding, track, str(path), warnings)
         yield images
 
 
 def _images(
-    messages: list[TopicMessages],
+    depth: TopicMessages,
+    amplitude: TopicMessages | None,
     intrinsics: GivenIntrinsics,
     coding: DepthCoding,
     track: PoseTrack,
@@ -100,7 +276,6 @@ def _images(
     warnings: list[str],
 ) -> RobotImages:
     """Put the messages of depth, and of amplitude if there are any, in the order of their times."""
-    depth, amplitude = messages[0], messages[-1] if len(messages) > 1 else None
     order = np.argsort(depth.stamps, kind="stable")
     names = [f"{stamp:.6f}" for stamp in depth.stamps]
     refused, partner = Refused(), order
@@ -110,35 +285,27 @@ def _images(
         gap = np.abs(depth.stamps - amplitude.stamps[partner])
         if (gap > _SAME_IMAGE).all():
             raise CalibrationDataError(
-                f"{origin}: no image of {amplitude.topic} is stamped within "
-                f"{1000 * _SAME_IMAGE:.0f} ms of one of {depth.topic}; the nearest is "
-                f"{gap.min():.3f} s away."
+                f"{origin}: no image of {amplitude.topic} is stamped within {_SAME_IMAGE:g} s of "
+                f"one of {depth.topic}; the nearest is {gap.min():.3f} s away."
             )
         reason = f"{amplitude.topic} has no image of its time"
         refused = {names[k]: reason for k in order if gap[k] > _SAME_IMAGE}
         order = order[gap[order] <= _SAME_IMAGE]
 
-    def counts(number: int) -> np.ndarray:
-        return turned(depth.image(int(order[number])), coding.rotate)
-
-    camera = camera_of(intrinsics, counts, len(order), origin)
-
     def read(number: int) -> DepthImage:
         place, beside = int(order[number]), None
         if amplitude is not None:
             beside = amplitude.image(int(partner[place])), amplitude.topic
-        image = coded_image(coding, (depth.image(place), depth.topic), beside)
-        return of_size(image, camera)
+        return coded_image(coding, (depth.image(place), depth.topic), beside)
 
     if not depth.stamped:
         warnings.append(
-            f"The headers of {depth.topic} hold no time stamps; the times of receipt are used, "
-            "which jitter by the delays of the network."
+            f"The headers of {depth.topic} hold no time stamps; the times of receipt are used."
         )
     return RobotImages(
         origin=origin,
         names=[names[k] for k in order],
-        camera=camera,
+        intrinsics=intrinsics,
         read=read,
         track=track,
         times=depth.stamps[order],
@@ -163,10 +330,8 @@ def _check_image_topics(bag: Bag, depth: str, amplitude: str | None) -> None:
         # By ROS's convention (REP 118) depth has these encodings, and amplitude has not.
         if beside.startswith(("16UC1", "32FC1")):
             advice = f"name {topic} with --depth" if amplitude is None else "swap them"
-            raise CalibrationDataError(
-                f"{bag.path}: --depth {depth} is coded '{seen}', as amplitudes are, and {topic} "
-                f"'{beside}', as depth is: {advice}."
-            )
+            said = f"--depth {depth} is coded '{seen}', as amplitudes are, and {topic} '{beside}'"
+            raise CalibrationDataError(f"{bag.path}: {said}, as depth is: {advice}.")
 
 
 def _camera_info_topic(bag: Bag, depth: str, given: str | None) -> str:
@@ -189,9 +354,9 @@ def _camera_info_topic(bag: Bag, depth: str, given: str | None) -> str:
     if near or len(found) == 1:
         return (near or found)[0]
     many = f"several topics hold camera intrinsics: {', '.join(sorted(found))}"
+    said = many if found else "no topic holds camera intrinsics (CameraInfo)"
     raise CalibrationDataError(
-        f"{bag.path}: {many if found else 'no topic holds camera intrinsics (CameraInfo)'}. "
-        "Name one with --camera-info, or a file with --intrinsics."
+        f"{bag.path}: {said}. Name --camera-info TOPIC or --intrinsics FILE."
     )
 
 
@@ -211,8 +376,7 @@ def _read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics
     )
     if not any(matrix):
         raise CalibrationDataError(
-            f"{bag.path}: {topic} holds a matrix K of zeros: the driver knows no calibration. Name "
-            "a file with --intrinsics."
+            f"{bag.path}: {topic} holds a matrix K of zeros. Name a file with --intrinsics."
         )
     model = str(message.distortion_model) or "none"
     values: dict[str, Any] = {"K": matrix, "distortion": lens, "distortion_model": model}
@@ -223,19 +387,18 @@ def _read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics
         matrix = [*projection[:3], *projection[4:7], *projection[8:11]]
         values |= {"K": matrix, "distortion": []}
         warnings.append(
-            f"{depth} is undistorted by its name: the projection P of {topic} is used, without "
-            "its distortion. State --intrinsics if that is wrong."
+            f"{depth} is undistorted by its name: the projection P of {topic} is used. State "
+            "--intrinsics if that is wrong."
         )
     return intrinsics_from_mapping(values, f"{bag.path}: {topic}"), warnings
 
 
 def _check(bag: Bag, topic: str, option: str, wanted: tuple[str, ...]) -> None:
     kind = bag.types.get(topic)
-    if kind in wanted:
-        return
-    found = "there is no such topic" if kind is None else f"it is {kind}"
-    said = f"{option} {topic}: expected {' or '.join(wanted)}, {found}".replace("/msg/", "/")
-    raise CalibrationDataError(f"{bag.path}: {said}. The topics: {bag.listed_topics()}.")
+    if kind not in wanted:
+        found = "there is no such topic" if kind is None else f"it is {kind}"
+        said = f"{option} {topic}: expected {' or '.join(wanted)}, {found}".replace("/msg/", "/")
+        raise CalibrationDataError(f"{bag.path}: {said}. The topics: {bag.listed_topics()}.")
 
 
 def _encoding(bag: Bag, topic: str) -> str:
@@ -252,10 +415,8 @@ def _read_tf(bag: Bag) -> tuple[dict[str, str], dict[str, PoseTrack]]:
     kinds = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
     topics = [topic for topic, kind in bag.types.items() if kind in kinds]
     if not topics:
-        raise CalibrationDataError(
-            f"{bag.path}: no topic holds transforms (tf2_msgs/TFMessage); record /tf and "
-            f"/tf_static. The topics: {bag.listed_topics()}."
-        )
+        topics = bag.listed_topics()
+        raise CalibrationDataError(f"{bag.path}: no topic holds transforms. The topics: {topics}.")
     parents: dict[str, str] = {}
     rows: dict[str, list[list[float]]] = {}
     moving: set[str] = set()
@@ -264,10 +425,8 @@ def _read_tf(bag: Bag) -> tuple[dict[str, str], dict[str, PoseTrack]]:
             for one in message.transforms:
                 parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
                 if parents.setdefault(child, parent) != parent:
-                    raise CalibrationDataError(
-                        f"{bag.path}: tf gives the frame '{child}' two parents, "
-                        f"'{parents[child]}' and '{parent}'."
-                    )
+                    two = f"'{parents[child]}' and '{parent}'"
+                    raise CalibrationDataError(f"{bag.path}: tf: '{child}' has parents {two}.")
                 rows.setdefault(child, []).append(_row(one))
                 # A frame that is published on both topics moves.
                 moving |= set() if topic.rstrip("/").endswith("_static") else {child}
@@ -309,17 +468,16 @@ def _base_from_tool(
     up, down = _chain(parents, base, source), _chain(parents, tool, source)
     common = next((name for name in down if name in up), None)
     if common is None:
+        roots = f"'{base}' (under '{up[-1]}') with '{tool}' (under '{down[-1]}')"
         raise CalibrationDataError(
-            f"{source}: tf does not connect '{base}' (under '{up[-1]}') with '{tool}' (under "
-            f"'{down[-1]}'). Is /tf_static recorded?"
+            f"{source}: tf does not connect {roots}. Is /tf_static recorded?"
         )
     to_tool = down[: down.index(common)][::-1]
     to_base = up[: up.index(common)][::-1]
     moving = [child for child in (*to_tool, *to_base) if tracks[child].timestamp is not None]
     if not moving:
         raise CalibrationDataError(
-            f"{source}: every transform between '{base}' and '{tool}' is static; the tool does "
-            "not move. Is --tool-frame the flange or the tool of the arm?"
+            f"{source}: tf between '{base}' and '{tool}' is static. Is --tool-frame the arm's tool?"
         )
     # The stamps of all tracks within the time that all of them cover.
     stamps = [np.asarray(tracks[child].timestamp) for child in moving]

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -102,33 +102,26 @@ def walls_of_planes(
             fourth is the check.
 
     Raises:
-        CalibrationDataError: No robot moves, or there is no wall in the images.
+        CalibrationDataError: There is no wall in the images.
     """
-    if (world_from_tool == world_from_tool[0]).all():
-        raise CalibrationDataError(
-            f"{origin}: walls are found in images from several robot poses, and "
-            "world_from_tool is the same for every image. Give the robot's poses."
-        )
-    given, index = (None, None) if targets is None else np.unique(targets, return_inverse=True)
-    labels = None if index is None else torch.from_numpy(index)
-    planes = seen_planes(images, torch.from_numpy(np.array(world_from_tool)), pixels, labels)
-    if given is not None and planes.label is not None:
-        # A wall without a single measurement has no place.
-        used, label = torch.unique(planes.label, return_inverse=True)
-        given, planes = given[used.numpy()], replace(planes, label=label)
-    seeing = len(planes.image.unique())
+    seen = np.array([bool(own) for own in images])
+    seeing = int(seen.sum())
     if seeing < fewest:
         raise CalibrationDataError(
-            f"{origin}: {seeing} of {len(images)} images show anything flat, {fewest} are "
-            f"needed; a plane must cover {100 * options.least_share:g} % of an image to within "
-            f"{options.tolerance_mm:g} mm."
+            f"{origin}: {seeing} of {len(images)} images show anything flat on "
+            f"{options.least_share:.0%} and to within {options.tolerance_mm:g} mm; {fewest} must."
         )
+    given = labels = None
+    if targets is not None:
+        # A wall without a single measurement has no place.
+        given = np.unique(targets[seen])
+        labels = torch.from_numpy(np.searchsorted(given, targets))
+    planes = seen_planes(images, torch.from_numpy(np.array(world_from_tool)), pixels, labels)
     joint = match_single_ray(planes) if pixels == 1 else match(planes, options.fewest_images)
     if not bool((joint.wall >= 0).any()):
         raise CalibrationDataError(
-            f"{origin}: {len(planes)} planes were found in {len(images)} images, and no hand-eye "
-            f"transform makes those of {options.fewest_images} images one wall. Do the poses "
-            "belong to the images, and are they world_from_tool in metres?"
+            f"{origin}: no hand-eye transform makes planes of {options.fewest_images} images one "
+            "wall. Do the poses belong to the images, and are they world_from_tool in metres?"
         )
     return _summarised(options, names, planes, joint, given)
 
@@ -192,15 +185,16 @@ def _left_out(
 ) -> dict[str, str]:
     """Return why images, and planes of images, are on no wall, in the order of the images."""
     seen, on_wall = (set(planes.image[own].tolist()) for own in (joint.wall > -2, joint.wall >= 0))
-    share = f"{100 * options.least_share:g} %"
-    flat = f"nothing flat covers {share} of it to within {options.tolerance_mm:g} mm"
+    flat = f"nothing flat covers {100 * options.least_share:g} % of it to within "
+    flat += f"{options.tolerance_mm:g} mm"
     found = {k: {} for k in range(len(names))}
     for k in found.keys() - on_wall:
         found[k][names[k]] = "none of its planes is on a wall" if k in seen else flat
     for k in (joint.wall < 0).nonzero()[:, 0].tolist():
         off, image = float(joint.deviation[k]), int(planes.image[k])
-        near = f"{1000 * off:.0f} mm from the nearest wall"
-        far = near if math.isfinite(off) else "faces no wall"
+        far = (
+            f"{1000 * off:.0f} mm from the nearest wall" if math.isfinite(off) else "faces no wall"
+        )
         name = f"{names[image]}, plane {int(planes.number[k]) + 1}"
         found[image][name] = f"{far}, or not seen in enough images"
     return {name: reason for own in found.values() for name, reason in own.items()}

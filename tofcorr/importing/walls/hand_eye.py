@@ -26,7 +26,12 @@ from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import HAND_EYE_SYMBOLS, ImageMoments, Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls, joint_image_equations
 from tofcorr.estimation.robust import robust_weights
-from tofcorr.estimation.uncertainty import PRIOR_SIGMA
+from tofcorr.estimation.uncertainty import (
+    PRIOR_SIGMA,
+    named_components,
+    posterior_covariance,
+    sparse_basis,
+)
 from tofcorr.geometry import se3
 from tofcorr.importing.walls.image_planes import SeenPlanes
 from tofcorr.spread import sigma_from_mad
@@ -387,11 +392,9 @@ def _followed(planes: SeenPlanes, transform: Tensor, fewest: int) -> Joint:
         if again.cost() >= joint.cost():
             break
         joint = again
-    if planes.label is not None:
-        return joint
-    # Walls that too few images show after all are dropped.
+    # Walls that too few images show after all are dropped; those that are known stay.
     count = [len(planes.image[joint.wall == k].unique()) for k in range(len(joint.walls))]
-    kept = torch.tensor(count) >= fewest
+    kept = torch.tensor(count) >= (fewest if planes.label is None else 0)
     if bool(kept.all()):
         return joint
     return _fit_jointly(planes, joint.tool_from_camera, joint.walls[kept])
@@ -519,20 +522,11 @@ def undetermined(planes: SeenPlanes, joint: Joint, names: Sequence[str]) -> list
     each = joint_image_equations(moments, joint.parameters, walls)
     precision = each.hessian.sum(dim=0) / _TYPICAL**2
     precision[6:8, 6:8] += torch.diag(1 / _ERROR**2)
-    prior = torch.eye(len(precision), dtype=precision.dtype) / PRIOR_SIGMA**2
-    variance, vectors = torch.linalg.eigh(torch.linalg.inv(precision + prior))
+    variance, vectors = torch.linalg.eigh(posterior_covariance(precision))
     symbols = [f"{symbol} of the hand-eye" for symbol in HAND_EYE_SYMBOLS]
     symbols += ["constant error", "slope of the error"]
     for name in names:
         symbols += [f"the tilt of {name}", f"the tilt of {name}", f"the distance of {name}"]
-    # Turn the basis of what the prior determines more than the planes do into one whose directions
-    # concern few unknowns, and name those of a fifth of the largest component or more.
-    left, found = vectors[:, 2 * variance > PRIOR_SIGMA**2], []
-    for _ in range(left.shape[1]):
-        inside = left @ left.T
-        vector = torch.nn.functional.normalize(inside[:, inside.diagonal().argmax()], dim=0)
-        left = left - vector[:, None] * (vector @ left)
-        size = vector.abs()
-        order = [k for k in size.argsort(descending=True).tolist() if 5 * size[k] > size.max()]
-        found.append(" against ".join(dict.fromkeys(symbols[k] for k in order)))
+    open_ones = sparse_basis(vectors[:, 2 * variance > PRIOR_SIGMA**2]).T
+    found = [" against ".join(named_components(vector, symbols)) for vector in open_ones]
     return list(dict.fromkeys(found))

@@ -79,7 +79,6 @@ class SeenPlanes:
         normal: Unit normals towards the camera, camera frame, shape (M, 3).
         points: Points that stand for the plane, camera frame, shape (M, P, 3), metres.
         support: Share of the image's pixels, shape (M,).
-        gradient: The vectors g of the planes g . x = 1, shape (M, 3), per metre.
         world_from_tool: The pose of each plane's image, shape (M, 4, 4).
         label: The wall of each plane where it is known, shape (M,), counted from zero; None: not
             known.
@@ -90,7 +89,6 @@ class SeenPlanes:
     normal: Tensor
     points: Tensor
     support: Tensor
-    gradient: Tensor
     world_from_tool: Tensor
     label: Tensor | None = None
 
@@ -107,6 +105,11 @@ class SeenPlanes:
         """Return which pairs of planes may show one wall, shape (M, M): not two of one image."""
         pair = self.image[:, None] != self.image
         return pair if self.label is None else pair & (self.label[:, None] == self.label)
+
+    @property
+    def gradient(self) -> Tensor:
+        """The vectors g of the planes g . x = 1, shape (M, 3), per metre."""
+        return self.normal / (self.normal * self.points.mean(dim=1)).sum(dim=1, keepdim=True)
 
     @property
     def rotation(self) -> Tensor:
@@ -136,7 +139,7 @@ def seen_planes(
     """Put the planes of all images together, sorted by what was measured, not by images' numbers.
 
     Args:
-        planes: The planes of each image.
+        planes: The planes of each image, some of which have any.
         world_from_tool: The images' poses, shape (N, 4, 4).
         pixels: Pixels of an image.
         labels: The wall that each image shows, shape (N,); None: not known.
@@ -145,14 +148,12 @@ def seen_planes(
     pose = world_from_tool.flatten(1).tolist()
     every.sort(key=lambda one: (pose[one[0]], one[2].offset, one[2].normal.tolist()))
     image = torch.tensor([i for i, _, _ in every], dtype=torch.int64)
-    empty = torch.zeros(0, 3, dtype=torch.float64)
     return SeenPlanes(
         image=image,
         number=torch.tensor([k for _, k, _ in every], dtype=torch.int64),
-        normal=torch.stack([plane.normal for *_, plane in every]) if every else empty,
-        points=torch.stack([plane.points for *_, plane in every]) if every else empty[:, None],
+        normal=torch.stack([plane.normal for *_, plane in every]),
+        points=torch.stack([plane.points for *_, plane in every]),
         support=torch.tensor([plane.support / pixels for *_, plane in every]).double(),
-        gradient=torch.stack([plane.gradient for *_, plane in every]) if every else empty,
         world_from_tool=world_from_tool[image],
         label=None if labels is None else labels[image],
     )
