@@ -14,12 +14,8 @@ from scipy.spatial.transform import Rotation
 def write_intrinsics(recorded: Recorded, path: Path) -> Path:
     """Write K, distortion and image size as YAML."""
     width, height = recorded.size
-    values = {
-        "width": width,
-        "height": height,
-        "K": recorded.matrix.tolist(),
-        "distortion": list(recorded.distortion),
-    }
+    values = {"width": width, "height": height}
+    values |= {"K": recorded.matrix.tolist(), "distortion": list(recorded.distortion)}
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
     return path
 
@@ -30,10 +26,8 @@ def write_png(recorded: Recorded, folder: Path, *, swap_bytes: bool = False, tur
         (folder / kind).mkdir(parents=True)
         for stamp, image in zip(recorded.image_times, images, strict=True):
             written = image.byteswap() if swap_bytes and kind == "depth" else image
-            cv2.imwrite(
-                str(folder / kind / f"{stamp:.6f}.png"),
-                np.ascontiguousarray(np.rot90(written, turn)),
-            )
+            path = folder / kind / f"{stamp:.6f}.png"
+            cv2.imwrite(str(path), np.ascontiguousarray(np.rot90(written, turn)))
 
 
 def write_numbered(recorded: Recorded, folder: Path, ending: str) -> None:
@@ -43,10 +37,15 @@ def write_numbered(recorded: Recorded, folder: Path, ending: str) -> None:
         for number, image in enumerate(images):
             path = folder / kind / f"{number}.{ending}"
             written = (image / 1e3).astype(np.float32) if kind == "depth" else image
-            if ending == "npy":
-                np.save(path, written)
-            else:
-                cv2.imwrite(str(path), written)
+            (np.save if ending == "npy" else cv2.imwrite)(str(path), written)
+
+
+def write_images(recorded: Recorded, folder: Path, ending: str) -> None:
+    """Write PNG by their times, or others by their numbers."""
+    if ending == "png":
+        write_png(recorded, folder)
+    else:
+        write_numbered(recorded, folder, ending)
 
 
 def write_tum(times: np.ndarray, poses: np.ndarray, path: Path) -> Path:
@@ -79,12 +78,9 @@ def write_matrices(poses: np.ndarray, path: Path) -> Path:
 
 def write_moveit(poses: np.ndarray, path: Path) -> Path:
     """Write samples as MoveIt's hand-eye calibration does."""
+    other = np.eye(4).ravel().tolist()
     samples = [
-        {
-            "effector_wrt_world": pose.ravel().tolist(),
-            "object_wrt_sensor": np.eye(4).ravel().tolist(),
-        }
-        for pose in poses
+        {"effector_wrt_world": pose.ravel().tolist(), "object_wrt_sensor": other} for pose in poses
     ]
     path.write_text(yaml.safe_dump(samples), encoding="utf-8")
     return path

@@ -12,15 +12,9 @@ from tofcorr.importing.registry import IMPORTERS
 
 
 @pytest.mark.parametrize("name", IMPORTERS)
-def test_the_registered_command_has_the_registered_name(name: str) -> None:
+def test_every_importer_has_its_name_writes_to_out_and_explains_its_options(name: str) -> None:
     command = import_module(f"tofcorr.importing.{name}").command
-    assert isinstance(command, click.Command)
     assert command.name == name
-
-
-@pytest.mark.parametrize("name", IMPORTERS)
-def test_every_importer_writes_to_out_and_explains_its_options(name: str) -> None:
-    command = import_module(f"tofcorr.importing.{name}").command
     options = [option for option in command.params if isinstance(option, click.Option)]
     assert [option.required for option in options if option.name == "out"] == [True]
     assert [option.name for option in options if not option.help] == []

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from importing.posed_scene import unit_rays
 
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.boards import Board
@@ -33,11 +34,7 @@ class Placement:
 
     @property
     def normal(self) -> np.ndarray:
-        return (
-            -self.rotation[:, 2]
-            if self.translation @ self.rotation[:, 2] > 0
-            else (self.rotation[:, 2])
-        )
+        return -self.rotation[:, 2] * np.sign(self.translation @ self.rotation[:, 2])
 
     @property
     def offset(self) -> float:
@@ -55,22 +52,21 @@ def placement(
     angles = np.radians([tilt_x, tilt_y, roll])
     turns = [cv2.Rodrigues(np.eye(3)[axis] * angles[axis])[0] for axis in range(3)]
     rotation = turns[0] @ turns[1] @ turns[2]
-    centre = np.array([*aside, distance])
-    return Placement(
-        rotation=rotation, translation=centre - rotation @ BOARD.corner_points().mean(axis=0)
-    )
+    centre = np.array([*aside, distance]) - rotation @ BOARD.corner_points().mean(axis=0)
+    return Placement(rotation=rotation, translation=centre)
 
 
 def varied_placements(count: int, seed: int = 3) -> list[Placement]:
     generator = np.random.default_rng(seed)
-    placements = []
-    for _ in range(count):
-        distance = generator.uniform(0.45, 0.8)
-        tilt_x, tilt_y = generator.uniform(10, 30, 2) * generator.choice([-1, 1], 2)
-        roll = generator.uniform(-40, 40)
-        aside = generator.uniform(-0.06, 0.06, 2).tolist()
-        placements.append(placement(distance, tilt_x, tilt_y, roll, aside))
-    return placements
+    return [
+        placement(
+            generator.uniform(0.45, 0.8),
+            *(generator.uniform(10, 30, 2) * generator.choice([-1, 1], 2)),
+            roll=generator.uniform(-40, 40),
+            aside=generator.uniform(-0.06, 0.06, 2).tolist(),
+        )
+        for _ in range(count)
+    ]
 
 
 def project(
@@ -86,19 +82,10 @@ def project(
 
 @lru_cache(maxsize=24)
 def rays(camera: CameraIntrinsics, shift: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-    """Unit rays by OpenCV's undistortion, shape (H, W, 3)."""
-    v, u = np.mgrid[: camera.height, : camera.width].astype(float)
-    pixels = np.stack([u + shift[0], v + shift[1]], -1).reshape(-1, 1, 2)
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
-    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
-    of_opencv_4 = getattr(cv2, "undistortPointsIter", None)
-    if of_opencv_4 is None:
-        xy = cv2.undistortPoints(pixels, matrix, distortion, criteria=stop)
-    else:
-        xy = of_opencv_4(pixels, matrix, distortion, np.eye(3), np.eye(3), stop)
-    xy = xy.reshape(camera.height, camera.width, 2)
-    homogeneous = np.concatenate([xy, np.ones_like(xy[..., :1])], -1)
-    return homogeneous / np.linalg.norm(homogeneous, axis=-1, keepdims=True)
+    """Unit rays, shape (H, W, 3)."""
+    matrix = np.array(camera.matrix)
+    matrix[:2, 2] -= shift
+    return unit_rays(matrix, camera.width, camera.height, camera.distortion)
 
 
 def radial_distance(where: Placement, camera: CameraIntrinsics = CAMERA) -> np.ndarray:
@@ -113,11 +100,8 @@ def infrared(where: Placement, camera: CameraIntrinsics = CAMERA) -> np.ndarray:
         ray = rays(camera, (_centred(i), _centred(i * _LATTICE_STEP % _SAMPLES)))
         cosine = ray @ where.normal
         distance = -where.offset / cosine
-        squares = (
-            (distance[..., None] * ray - where.translation)
-            @ where.rotation[:, :2]
-            / BOARD.square_length
-        )
+        on_board = (distance[..., None] * ray - where.translation) @ where.rotation[:, :2]
+        squares = on_board / BOARD.square_length
         total += _reflectivity(squares) * -cosine / distance**2
     blurred = cv2.GaussianBlur(total / _SAMPLES, (0, 0), _LENS_BLUR_PIXELS)
     return np.clip(3000 * blurred + 60, 0, 65535).astype(np.uint16)

@@ -1,5 +1,7 @@
 """The board's plane follows from its corners, and doubtful ones are refused."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from importing.checkerboard.rendered_board import (
@@ -47,25 +49,23 @@ def test_a_corner_gone_astray_is_left_out() -> None:
     np.testing.assert_allclose(pose.plane()[0], where.normal, atol=1e-6)
 
 
-def test_corners_that_fit_no_board_are_refused() -> None:
-    corners = project(placement(0.6, tilt_x=25))
-    scattered = corners + np.random.default_rng(1).normal(0, 2.0, corners.shape)
-    with pytest.raises(RefusedViewError, match=r"miss the board by \d\.\d\d px.*0\.5 px"):
-        estimate_pose(scattered, BOARD, CAMERA, 0.5)
-
-
-def test_a_row_of_corners_gone_astray_is_too_much() -> None:
-    corners = project(placement(0.6, tilt_x=25))
-    corners[:10] += np.random.default_rng(1).normal(0, 30.0, (10, 2))
-    with pytest.raises(RefusedViewError, match=r"corners fit one pose|miss the board"):
+@pytest.mark.parametrize(
+    ("distance", "tilt", "moved", "by", "said"),
+    [
+        (0.6, 25, 35, 2.0, r"miss the board by \d\.\d\d px.*0\.5 px"),
+        (0.6, 25, 10, 30.0, r"corners fit one pose|miss the board"),
+        # Its tilt could be either way.
+        (3.0, 10, 35, 0.1, "two different poses"),
+    ],
+    ids=["no board", "a row astray", "far"],
+)
+def test_corners_of_no_board_and_of_two_are_refused(
+    distance: float, tilt: float, moved: int, by: float, said: str
+) -> None:
+    corners = project(placement(distance, tilt_x=tilt))
+    corners[:moved] += np.random.default_rng(3).normal(0, by, (moved, 2))
+    with pytest.raises(RefusedViewError, match=said):
         estimate_pose(corners, BOARD, CAMERA, 0.5)
-
-
-def test_a_far_board_whose_tilt_could_be_either_way_is_refused() -> None:
-    corners = project(placement(3.0, tilt_x=10))
-    noisy = corners + np.random.default_rng(3).normal(0, 0.1, corners.shape)
-    with pytest.raises(RefusedViewError, match="two different poses"):
-        estimate_pose(noisy, BOARD, CAMERA, 0.5)
 
 
 def test_the_stated_deviation_of_the_plane_is_the_scatter_under_noise() -> None:
@@ -96,29 +96,19 @@ def signed_distance_to_outline(where: Placement, margin: float) -> np.ndarray:
     import cv2
 
     side = np.linspace(0, 1, 50)[:, None]
-    low, high = np.array([-margin, -margin]), np.array([4 + margin, 6 + margin])
-    edges = [(low, (high[0], low[1])), ((high[0], low[1]), high)]
-    edges += [(high, (low[0], high[1])), ((low[0], high[1]), low)]
-    outline = np.concatenate([np.array(a) + side * (np.array(b) - a) for a, b in edges])
+    (left, top), (right, bottom) = (-margin, -margin), (4 + margin, 6 + margin)
+    around = np.array([(left, top), (right, top), (right, bottom), (left, bottom), (left, top)])
+    outline = np.concatenate([a + side * (b - a) for a, b in pairwise(around)])
     points = np.concatenate([outline * BOARD.square_length, np.zeros((len(outline), 1))], 1)
     polygon = project(where, points=points).astype(np.float32)[:, None]
-    return np.array(
-        [
-            [cv2.pointPolygonTest(polygon, (float(u), float(v)), True) for u in range(320)]
-            for v in range(240)
-        ]
-    )
+    inside = [cv2.pointPolygonTest(polygon, (u, v), True) for v in range(240) for u in range(320)]
+    return np.reshape(inside, (240, 320))
 
 
-def test_a_board_behind_the_camera_is_nowhere_in_the_image() -> None:
-    where = placement(0.5, tilt_x=30)
-    pose = estimate_pose(project(where), BOARD, CAMERA, 0.5)
-    assert not pose.area(BOARD, -rays(CAMERA), 1.0).any()
-
-
-def test_true_distance_runs_along_the_ray_to_the_plane() -> None:
+def test_distance_runs_along_the_ray_to_the_plane_and_a_board_behind_is_nowhere() -> None:
     where = placement(0.5, tilt_x=30)
     pose = estimate_pose(project(where), BOARD, CAMERA, 0.5)
     directions = rays(CAMERA)[100:110, 100:110].reshape(-1, 3)
     points = pose.distance(directions)[:, None] * directions
     np.testing.assert_allclose(points @ where.normal + where.offset, 0, atol=1e-6)
+    assert not pose.area(BOARD, -rays(CAMERA), 1.0).any()

@@ -5,9 +5,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from importing.frames.imported import run_import
+from importing.frames.imported import Imported, run_import
 from scipy.spatial.transform import Rotation
 
+PINHOLE = ("--focal", "420", "--centre", "319.5,239.5")
 LENS = ("--focal", "365.5", "--centre", "255.5,205", "--distortion", "0.0905,-0.268,0,0,0.095")
 
 
@@ -15,15 +16,11 @@ def test_real_boards_are_the_same_through_frames_and_through_checkerboard(
     real_data: Path, tmp_path: Path
 ) -> None:
     folder = real_data / "kinect2_checkerboard"
-    board = ("--board", "5x7", "--square-mm", "30", *LENS)
-    first = run_import(
-        "checkerboard", folder, *board, "--depth", "00?5_sync_depth.png", "--infrared",
-        "00?5_sync_ir.png", out=tmp_path / "checkerboard",
-    )  # fmt: skip
-    second = run_import(
-        "frames", folder, *board, "--depth", "00?5_sync_depth.png", "--grey", "00?5_sync_ir.png",
-        "--amplitude", "00?5_sync_ir.png", "--saturation", 65535, out=tmp_path / "frames",
-    )  # fmt: skip
+    depth, infrared = "00?5_sync_depth.png", "00?5_sync_ir.png"
+    board = ("--board", "5x7", "--square-mm", "30", *LENS, "--depth", depth)
+    given = ("--grey", infrared, "--amplitude", infrared, "--saturation", 65535)
+    first = run_import("checkerboard", folder, *board, "--infrared", infrared, out=tmp_path / "one")
+    second = run_import("frames", folder, *board, *given, out=tmp_path / "other")
     assert first.done.num_frames > 3
     for name in ("depth", "amplitude", "mask"):
         np.testing.assert_array_equal(getattr(first.done, name), getattr(second.done, name))
@@ -46,14 +43,18 @@ def test_corners_are_found_in_a_preview_of_8_bits_and_without_amplitudes(
         cv2.imwrite(str(folder / path.name.replace("ir", "grey")), cv2.merge([preview] * 3))
         depth = path.with_name(path.name.replace("ir", "depth"))
         (folder / depth.name).write_bytes(depth.read_bytes())
-    board = ("--board", "5x7", "--square-mm", "30", *LENS)
-    images = ("--depth", "*_sync_depth.png", "--grey", "*_sync_grey.png")
-    imported = run_import("frames", folder, *board, *images, out=tmp_path / "out")
+    imported = import_views(folder, "5x7", *LENS)
     assert imported.done.amplitude is None
     assert imported.done.num_frames > 3
     for view in imported.report["views"]:
         assert view["reprojection_rms_px"] < 0.5
         assert abs(view["depth_error_mm"]) < 40
+
+
+def import_views(folder: Path, board: str, *more: str) -> Imported:
+    """Import views that show a board of 30 mm: `N_depth.png` and `N_grey.png`."""
+    images = ("--depth", "*_depth.png", "--grey", "*_grey.png", "--board", board)
+    return run_import("frames", folder, *images, "--square-mm", 30, *more, out=folder / "out")
 
 
 MATRIX = np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]])
@@ -109,10 +110,7 @@ def test_other_boards_give_the_plane_even_where_a_part_is_hidden(
 ) -> None:
     folder = tmp_path / "views"
     write_views(folder, *draw(kind), count=4)
-    imported = run_import(
-        "frames", folder, "--depth", "*_depth.png", "--grey", "*_grey.png", "--board", board,
-        "--square-mm", "30", "--focal", "420", "--centre", "319.5,239.5", out=tmp_path / "out",
-    )  # fmt: skip
+    imported = import_views(folder, board, *PINHOLE)
     recording = imported.done
     assert [view["view"] for view in imported.report["views"]] == ["0", "1", "2", "3"]
     assert set(recording.frames.target) == {kind}
@@ -135,17 +133,14 @@ def test_other_boards_give_the_plane_even_where_a_part_is_hidden(
 )  # fmt: skip
 def test_boards_that_do_not_exist_are_refused(board: str, said: str, tmp_path: Path) -> None:
     write_views(tmp_path / "views", *draw("charuco"), count=1)
-    refused = run_import(
-        "frames", tmp_path / "views", "--depth", "*_depth.png", "--grey", "*_grey.png", "--board",
-        board, "--square-mm", "30", "--focal", "420", "--centre", "319.5,239.5",
-        out=tmp_path / "out",
-    )  # fmt: skip
+    refused = import_views(tmp_path / "views", board, *PINHOLE)
     assert refused.exit_code == 2
     assert said in refused.text
 
 
 def test_planes_come_from_poses_or_from_a_board_and_not_from_both(tmp_path: Path) -> None:
-    lens = ("--focal", "420", "--centre", "319.5,239.5")
     for more in ((), ("--poses", "p.txt", "--board", "5x7")):
-        refused = run_import("frames", tmp_path, "--depth", "*", *lens, *more, out=tmp_path / "o")
+        refused = run_import(
+            "frames", tmp_path, "--depth", "*", *PINHOLE, *more, out=tmp_path / "o"
+        )
         assert "say where the planes come from" in refused.text

@@ -1,12 +1,13 @@
 """Depth images and robot poses in files, of all formats, become one recording."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from importing import scene_files
 from importing.frames.imported import Imported, assert_equal_recordings, import_png, import_written
-from importing.posed_scene import Drive, Recorded, apart
+from importing.posed_scene import Recorded, apart
 
 # How near the start of the fit is: the camera's error of 10 mm is not calibrated yet.
 NEAR_MM, NEAR_DEG = 15.0, 0.5
@@ -42,25 +43,20 @@ def test_stops_are_used_and_every_other_image_is_listed_with_its_reason(
     assert "the tool was moving" in plain.text
 
 
-def test_planes_are_estimated_and_frames_of_one_stop_share_a_pose_id(plain: Imported) -> None:
+def test_planes_are_estimated_stops_share_a_pose_id_and_masks_hold_the_frame_s_own_wall(
+    plain: Imported,
+) -> None:
     recording = plain.done
     assert recording.planes == "estimated"
     assert (recording.frame_names.world, recording.frame_names.tool) == ("base", "tool")
     assert set(recording.frames.target) == {"wall 1", "wall 2", "floor"}
-    stops = [frame["stop"] for frame in plain.report["views"]]
     assert recording.frames.pose_id is not None
-    assert list(recording.frames.pose_id) == [f"stop {stop}" for stop in stops]
-
-
-def test_masks_hold_the_pixels_of_the_frame_s_own_wall(plain: Imported, drive: Recorded) -> None:
-    recording = plain.done
-    assert recording.mask is not None
-    shares = np.asarray(recording.mask).mean(axis=(1, 2))
-    assert shares.min() > 0.03
-    images = [frame["view"] for frame in plain.report["views"]]
+    stops = [f"stop {frame['stop']}" for frame in plain.report["views"]]
+    assert list(recording.frames.pose_id) == stops
+    masks, images = np.array(recording.mask), [frame["view"] for frame in plain.report["views"]]
+    assert masks.mean(axis=(1, 2)).min() > 0.03
     for view in set(images):
-        own = [np.asarray(recording.mask[k]) for k, name in enumerate(images) if name == view]
-        assert np.sum(own, axis=0).max() == 1
+        assert masks[np.array(images) == view].sum(axis=0).max() == 1
 
 
 @pytest.mark.parametrize("late", [0.08, pytest.param(-0.15, marks=pytest.mark.slow)])
@@ -104,10 +100,8 @@ def test_a_camera_that_stands_still_has_its_poses_inverted_and_its_frames_named(
     imported = import_png(drive.with_camera_fixed(), tmp_path, "--eye-to-hand", *names)
     assert_start_is_near(imported, drive)
     recording = imported.done
-    assert recording.frame_names.world == "flange"
-    assert recording.frame_names.tool == "base_link"
-    assert recording.frame_names.camera == "tof"
-    assert recording.frame_names.eye_to_hand
+    names = {"world": "flange", "tool": "base_link", "camera": "tof", "eye_to_hand": True}
+    assert recording.frame_names.to_mapping() == names
     np.testing.assert_allclose(
         recording.frames.world_from_tool, plain.done.frames.world_from_tool, atol=1e-6
     )
@@ -116,23 +110,19 @@ def test_a_camera_that_stands_still_has_its_poses_inverted_and_its_frames_named(
 def test_all_formats_of_images_and_poses_give_one_recording(
     at_stops: Recorded, tmp_path: Path
 ) -> None:
-    folders = {name: tmp_path / name for name in ("png", "npy", "tiff", "moveit")}
-    scene_files.write_png(at_stops, folders["png"])
-    scene_files.write_numbered(at_stops, folders["npy"], "npy")
-    scene_files.write_numbered(at_stops, folders["tiff"], "tiff")
-    scene_files.write_numbered(at_stops, folders["moveit"], "npy")
-    times, poses = at_stops.image_times, at_stops.exact
-    files = {
-        "png": scene_files.write_tum(times, poses, folders["png"] / "poses.txt"),
-        "npy": scene_files.write_csv(poses, folders["npy"] / "poses.csv"),
-        "tiff": scene_files.write_matrices(poses, folders["tiff"] / "poses.txt"),
-        "moveit": scene_files.write_moveit(poses, folders["moveit"] / "samples.yaml"),
-    }
-    endings = {"png": "png", "npy": "npy", "tiff": "tiff", "moveit": "npy"}
-    imported = {
-        name: import_written(at_stops, folders[name], endings[name], files[name])
-        for name in folders
-    }
+    imported = {}
+    for name, ending, write_poses in (
+        ("png", "png", partial(scene_files.write_tum, at_stops.image_times)),
+        ("npy", "npy", scene_files.write_csv),
+        ("tiff", "tiff", scene_files.write_matrices),
+        ("moveit", "npy", scene_files.write_moveit),
+    ):
+        folder = tmp_path / name
+        scene_files.write_images(at_stops, folder, ending)
+        poses = write_poses(
+            at_stops.exact, folder / ("poses.yaml" if name == "moveit" else "poses")
+        )
+        imported[name] = import_written(at_stops, folder, ending, poses)
     paired = {name: one.report["paired_by"] for name, one in imported.items()}
     assert paired == {"png": "time", "npy": "name", "tiff": "order", "moveit": "order"}
     for name in ("npy", "tiff", "moveit"):
@@ -157,10 +147,3 @@ def test_turned_images_and_swapped_bytes_are_undone_when_named_and_refused_when_
         assert f"Add {' '.join(arguments)}" in refused.text
         undone = import_written(at_stops, folder, "png", poses, *arguments)
         assert_equal_recordings(from_files.done, undone.done, 0.0)
-
-
-@pytest.mark.slow
-def test_radial_depth_is_recorded_as_such(tmp_path: Path) -> None:
-    recorded = Drive(stops=12, width=32, height=24).record().one_a_stop()
-    imported = import_png(recorded, tmp_path, "--depth-kind", "radial")
-    assert imported.done.depth_kind == "radial"

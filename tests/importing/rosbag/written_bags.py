@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 KINDS = ("ros1", "sqlite3", "mcap")
-DEPTH, INFRARED, INFO = (
-    "/camera/depth/image_raw",
-    "/camera/ir/image_raw",
-    "/camera/depth/camera_info",
-)
+DEPTH, INFRARED = "/camera/depth/image_raw", "/camera/ir/image_raw"
+INFO = "/camera/depth/camera_info"
 TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms"
 BASE, TOOL, CAMERA = "base_link", "tool0", "tof_optical"
 
@@ -30,23 +26,12 @@ ARM[:3, :3] = Rotation.from_rotvec([0.0, 0.5, 0.2]).as_matrix()
 ARM[:3, 3] = [0.02, 0.0, 0.11]
 
 
-@dataclass
 class Bag:
-    """A bag being written.
+    """A bag being written; of ROS 1 or not."""
 
-    Attributes:
-        path: File or folder.
-        one: Whether it is of ROS 1.
-    """
-
-    path: Path
-    one: bool
-    _writer: Any
-    _store: Any
-
-    def __post_init__(self) -> None:
+    def __init__(self, writer: Any, store: Any, *, one: bool) -> None:
+        self.one, self._writer, self._store = one, writer, store
         self._connections: dict[str, Any] = {}
-        self._count = 0
 
     def make(self, kind: str, **fields: Any) -> Any:
         """Make a message; fields of ROS 1 alone are filled in."""
@@ -57,8 +42,7 @@ class Bag:
 
     def header(self, time: float, frame: str = CAMERA) -> Any:
         """Make a header."""
-        nanoseconds = round(time * 1e6) * 1000
-        seconds, rest = divmod(nanoseconds, 10**9)
+        seconds, rest = divmod(round(time * 1e6) * 1000, 10**9)
         stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
@@ -73,13 +57,7 @@ class Bag:
         self._writer.write(self._connections[topic], round(received * 1e9), content)
 
     def image(
-        self,
-        topic: str,
-        time: float,
-        pixels: np.ndarray,
-        encoding: str,
-        *,
-        big_endian: bool = False,
+        self, topic: str, time: float, pixels: np.ndarray, encoding: str, big_endian: bool = False
     ) -> None:
         """Write a sensor_msgs/Image."""
         order = ">" if big_endian else "<"
@@ -120,12 +98,8 @@ class Bag:
             "sensor_msgs/msg/RegionOfInterest",
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
         )  # fmt: skip
-        values = {
-            "k": recorded.matrix.ravel(),
-            "d": np.array(recorded.distortion),
-            "r": np.eye(3).ravel(),
-            "p": projection,
-        }
+        values = {"k": recorded.matrix.ravel(), "r": np.eye(3).ravel(), "p": projection}
+        values["d"] = np.array(recorded.distortion)
         if self.one:
             values = {name.upper(): value for name, value in values.items()}
         message = self.make(
@@ -158,11 +132,11 @@ def writing(path: Path, kind: str) -> Iterator[Bag]:
         with Writer1(path) as writer:
             store = get_typestore(Stores.ROS1_NOETIC)
             store.register(get_types_from_msg(TF_MESSAGE, "tf2_msgs/msg/TFMessage"))
-            yield Bag(path, True, writer, store)
+            yield Bag(writer, store, one=True)
         return
     plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
     with Writer2(path, version=9, storage_plugin=plugin) as writer:
-        yield Bag(path, False, writer, get_typestore(Stores.ROS2_HUMBLE))
+        yield Bag(writer, get_typestore(Stores.ROS2_HUMBLE), one=False)
 
 
 def bag_path(folder: Path, kind: str) -> Path:
@@ -204,9 +178,8 @@ def compressed_depth(counts: np.ndarray, *, floats: bool = False) -> bytes:
     header = np.zeros(3, dtype="<f4")
     if floats:
         # Inverse depth: counts = A / depth + B, exact to 0.1 mm at 2 m.
-        quantum, farthest = 100.0, 10.0
-        scale = np.float32(quantum * (quantum + 1.0))
-        shift = np.float32(1.0 - scale / farthest)
+        scale = np.float32(100.0 * 101.0)
+        shift = np.float32(1.0 - scale / 10.0)
         header[1:] = scale, shift
         depth = counts / 1e3
         with np.errstate(divide="ignore"):

@@ -36,24 +36,19 @@ def test_an_image_far_from_every_pose_is_refused_with_the_gap() -> None:
 
 def test_a_list_of_stops_gives_each_image_the_nearest_pose() -> None:
     track = screw(np.array([0.0, 3.0, 6.0]))
-    times = np.array([0.1, 2.9, 4.5])
-    _, found, refused, _ = pair(["a", "b", "c"], times, track, tolerance=0.2)
+    _, found, refused, _ = pair(["a", "b", "c"], np.array([0.1, 2.9, 4.5]), track, tolerance=0.2)
     np.testing.assert_array_equal(found, track.world_from_tool[:2])
     assert list(refused) == ["c"]
 
 
-def test_names_pair_whatever_the_order_and_the_endings() -> None:
+def test_names_pair_whatever_the_order_and_lists_without_them_must_be_as_long() -> None:
     poses = screw(np.arange(3.0)).world_from_tool
     track = PoseTrack.checked(poses, "list", names=["c.png", "a.png", "x.png"])
     images, found, _, _ = pair(["a", "b", "c"], None, track, tolerance=0.2)
     assert list(images) == [0, 2]
     np.testing.assert_array_equal(found, poses[[1, 0]])
-
-
-def test_lists_of_other_lengths_without_times_or_names_are_refused() -> None:
-    track = PoseTrack.checked(screw(np.arange(3.0)).world_from_tool, "list")
     with pytest.raises(CalibrationDataError, match="3 poses and 2 images"):
-        pair(["a", "b"], None, track, tolerance=0.2)
+        pair(["a", "b"], None, PoseTrack.checked(poses, "list"), tolerance=0.2)
 
 
 def followed(recorded: Recorded) -> tuple[PoseTrack, np.ndarray]:

@@ -48,14 +48,7 @@ def rendered(room: Room, number: int, seed: int) -> tuple[np.ndarray, Views]:
     return poses, room.views(poses, generator)
 
 
-@pytest.mark.parametrize(
-    ("camera", "clutter"),
-    [
-        (Camera(), 0.0),
-        pytest.param(Camera(), 0.2, marks=pytest.mark.slow),
-        (Camera(320, 240, 285.0), 0.2),
-    ],
-)
+@pytest.mark.parametrize(("camera", "clutter"), [(Camera(), 0.0), (Camera(320, 240, 285.0), 0.2)])
 def test_every_large_plane_is_found_once_and_pixels_are_given_to_the_right_one(
     camera: Camera, clutter: float
 ) -> None:
@@ -69,13 +62,10 @@ def test_every_large_plane_is_found_once_and_pixels_are_given_to_the_right_one(
         assert {int(k) for k in np.flatnonzero(share > 2 * OPTIONS.least_share)} <= set(found)
         walls = [k for k in found if k is not None]
         assert len(walls) == len(set(walls))
-        masks = plane_masks(
-            torch.from_numpy(depth),
-            torch.from_numpy(depth).isfinite(),
-            torch.from_numpy(camera.rays),
-            torch.stack([plane.gradient for plane in planes]),
-            OPTIONS.tolerance_mm * 1e-3,
-        ).numpy()
+        distance, rays = torch.from_numpy(depth), torch.from_numpy(camera.rays)
+        gradients = torch.stack([plane.gradient for plane in planes])
+        tolerance = OPTIONS.tolerance_mm * 1e-3
+        masks = plane_masks(distance, distance.isfinite(), rays, gradients, tolerance).numpy()
         for k, mask in zip(found, masks, strict=True):
             if k is not None and share[k] > 2 * OPTIONS.least_share:
                 assert (true[mask] == k).mean() > 0.95
