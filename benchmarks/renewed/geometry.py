@@ -40,6 +40,12 @@ def small_motions(translation: Array, rotation: Array) -> Array:
     return transforms(rotations(rotation), translation)
 
 
+def image_grid(height: int, width: int) -> tuple[Array, Array]:
+    """Column and row (H, W) of every pixel, each from -1 to 1."""
+    column, row = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+    return column, row
+
+
 @dataclass(frozen=True)
 class Camera:
     """A camera with OpenCV's five-coefficient lens model; `sensitivity` is in electrons."""

@@ -20,7 +20,7 @@ import yaml
 
 from benchmarks.renewed import ranges
 from benchmarks.renewed.forms import FORM
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, image_grid
 from benchmarks.renewed.recording import Data, read
 from benchmarks.renewed.signal_chain import (
     Form,
@@ -103,13 +103,12 @@ def real_view(data: Data) -> View:
     distance = np.where(seen, data.depth, 1.0)
     amplitude = np.ones_like(distance) if data.amplitude is None else data.amplitude
     count, height, width = distance.shape
-    column, row = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     lens = SimpleNamespace(width=width, height=height)
     world: Any = SimpleNamespace(
         frames=count,
         sensor=SimpleNamespace(lens=lens, frequencies=(MODULATION,), sun=0.0),
         conditions=SimpleNamespace(ambient=np.zeros(count), exposure=np.full(count, NOMINAL_US)),
-        pixel_position=(column, row),
+        pixel_position=image_grid(height, width),
     )
     return View(
         world=world,

@@ -45,6 +45,16 @@ class Room:
     albedo: float = 0.5
     gloss: float = 0.0
 
+    def walls(self) -> dict[str, tuple[int, float]]:
+        """Axis and position of every wall that is there."""
+        axes = {"floor": 1, "ceiling": 1, "side": 0, "other_side": 0, "back": 2}
+        placed = {name: (axis, getattr(self, name)) for name, axis in axes.items()}
+        return {name: wall for name, wall in placed.items() if wall[1] is not None}
+
+    def sides(self) -> list[tuple[int, float]]:
+        """Axis and position of those beside the way from camera to target."""
+        return [(axis, at) for axis, at in self.walls().values() if axis < 2]
+
 
 def scene_of(room: Room, camera: np.ndarray) -> dict[str, Any]:
     """Mitsuba's description of a room, lit by a spot at the camera (target_from_camera, 4x4)."""
@@ -73,11 +83,11 @@ def scene_of(room: Room, camera: np.ndarray) -> dict[str, Any]:
             "bsdf": {"type": "diffuse", "reflectance": _grey(room.target_albedo)},
         },
     }
-    for name, axis, position, facing in _walls(room):
+    for name, (axis, position) in room.walls().items():
         shiny = name == "side" and room.gloss > 0
         parts[name] = {
             "type": "rectangle",
-            "to_world": mi.ScalarTransform4f(_placed(axis, position, facing).tolist()),
+            "to_world": mi.ScalarTransform4f(_placed(axis, position).tolist()),
             "bsdf": glossy if shiny else diffuse,
         }
     return parts
@@ -87,17 +97,10 @@ def _grey(value: float) -> dict[str, Any]:
     return {"type": "rgb", "value": value}
 
 
-def _walls(room: Room) -> list[tuple[str, int, float, float]]:
-    """Name, axis, position and direction of the normal of every wall that is there."""
-    axes = {"floor": 1, "ceiling": 1, "side": 0, "other_side": 0, "back": 2}
-    there = [(name, axis, getattr(room, name)) for name, axis in axes.items()]
-    return [(name, axis, at, -float(np.sign(at))) for name, axis, at in there if at is not None]
-
-
-def _placed(axis: int, position: float, facing: float) -> np.ndarray:
-    """Transform (4, 4) of the unit square, whose normal is z, to a wall across an axis."""
+def _placed(axis: int, position: float) -> np.ndarray:
+    """Transform (4, 4) of the unit square, whose normal is z, to a wall that faces the origin."""
     normal = np.zeros(3)
-    normal[axis] = facing
+    normal[axis] = -np.sign(position)
     along = np.roll(np.abs(normal), 1)
     result = np.eye(4)
     result[:3, :3] = REACH * np.stack([along, np.cross(normal, along), normal], axis=1)

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, directions, inverse
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, directions, image_grid, inverse
 from benchmarks.renewed.world import CONTRAST, NOMINAL_US, READ_NOISE, WHITE, World
 
 Stage = Literal["poses", "rays", "plane", "relief", "path", "light", "taps"]
@@ -71,6 +71,12 @@ def form(
 ) -> Callable[[Callable[[np.random.Generator, Any], Change]], Form]:
     """Make a form, with the function's name, of a function that draws it."""
     return lambda draw: Form(effect, draw.__name__, stage, textbook, draw, guess, scaled, wanted)
+
+
+def adding(field: Any) -> Change:  # noqa: ANN401 - an array, or a function of the view
+    """The value of a stage plus the strength times a field, one of all views or one of each."""
+    of_view = field if callable(field) else lambda _: field
+    return lambda strength, view, value: value + strength * of_view(view)
 
 
 @dataclass(frozen=True)
@@ -148,10 +154,8 @@ def _hit(view: View) -> View:
     x, y = ox + distance * rx, oy + distance * ry
     cosine, other = -rz, (np.abs(x) > surface.half[0]) | (np.abs(y) > surface.half[1])
     far, facing = (-surface.behind - oz) / steep, -rz
-    walls = ((room.floor, oy, ry, y), (room.ceiling, oy, ry, y), (room.side, ox, rx, x))
-    for wall, o, r, at in (*walls, (room.other_side, ox, rx, x)):
-        if wall is None:
-            continue
+    for axis, wall in room.sides():
+        o, r, at = (oy, ry, y) if axis else (ox, rx, x)
         beyond = at * np.sign(wall) > abs(wall)
         there = np.divide(wall - o, r, out=np.full_like(r, np.inf), where=np.abs(r) > 1e-6)
         nearer = beyond & (~other | (there < far))
@@ -174,7 +178,7 @@ def _lit(view: View, hooks: Sequence[Hook]) -> View:
     """Reflectivity, amplitude, and the path with base errors and what changes it."""
     world = view.world
     shine = np.where(view.on_target, _footprint(view), 0.5)
-    column, row = np.meshgrid(*(np.linspace(-1, 1, n) for n in view.distance.shape[:0:-1]))
+    column, row = image_grid(*view.distance.shape[1:])
     vignette = 1 - VIGNETTE * (column**2 + row**2) / 2
     exposure = (world.conditions.exposure / NOMINAL_US)[:, None, None]
     light = world.sensor.lens.sensitivity * exposure * vignette * view.cosine / view.distance**2

@@ -11,6 +11,7 @@ from benchmarks.renewed.geometry import (
     SPEED_OF_LIGHT,
     Array,
     Camera,
+    image_grid,
     inverse,
     rotations,
     small_motions,
@@ -41,8 +42,7 @@ class BaseErrors:
     def terms(self, distance: Array, amplitude: Array) -> dict[str, Array]:
         """Errors in metres by term; `amplitude` (N, H, W) is over that of a bright pixel."""
         v = np.clip((distance - self.middle) / self.half, -2.3, 2.3)
-        height, width = distance.shape[1:]
-        column, row = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+        column, row = image_grid(*distance.shape[1:])
         c0, c1, c2, c3 = self.of_distance
         a, b, aa, bb = self.of_pixel
         i1, i2 = self.of_amplitude
@@ -54,8 +54,7 @@ class BaseErrors:
 
     def at(self, distance: Array, amplitude: Array) -> Array:
         """The error (N, H, W) in metres."""
-        terms = self.terms(distance, amplitude)
-        return terms["distance"] + terms["pixel"] + terms["amplitude"]
+        return sum(self.terms(distance, amplitude).values(), np.zeros(1))
 
 
 @dataclass(frozen=True)
@@ -179,9 +178,7 @@ class World:
     @cached_property
     def pixel_position(self) -> tuple[Array, Array]:
         """Column and row (H, W), each from -1 to 1."""
-        lens = self.sensor.lens
-        column, row = np.meshgrid(np.linspace(-1, 1, lens.width), np.linspace(-1, 1, lens.height))
-        return column, row
+        return image_grid(self.sensor.lens.height, self.sensor.lens.width)
 
     def world_from_tool(self, late: Array | float = 0.0) -> Array:
         """True poses (N, 4, 4) some seconds after each frame's stamp."""
@@ -450,11 +447,9 @@ def _indoors(rng: np.random.Generator, design: Design, room: Room, count: int) -
     """Places (count, 6) between the walls: those outside get other tilts, at last none at all."""
     places = _draw_places(rng, count, design)
     for attempt in range(TRIES):
-        x, y = _camera(places)[:, :2, 3].T
-        outside = np.zeros(count, dtype=bool)
-        for wall, at in ((room.floor, y), (room.ceiling, y), (room.side, x), (room.other_side, x)):
-            if wall is not None:
-                outside |= at * np.sign(wall) > abs(wall) - MARGIN * design.near
+        where, outside = _camera(places)[:, :, 3], np.zeros(count, dtype=bool)
+        for axis, wall in room.sides():
+            outside |= where[:, axis] * np.sign(wall) > abs(wall) - MARGIN * design.near
         if not outside.any():
             break
         tilt = 0.0 if attempt == TRIES - 2 else design.tilt

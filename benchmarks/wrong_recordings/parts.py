@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.renewed.geometry import transforms
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameTable
 from tofcorr.data.writing import write_recording
@@ -97,8 +98,5 @@ def drawn_rotation(degrees: float, generator: np.random.Generator) -> np.ndarray
 
 def drawn_motion(metres: float, degrees: float, generator: np.random.Generator) -> np.ndarray:
     """Return a turn by this angle and a shift by this length, both at random, shape (4, 4)."""
-    motion = np.eye(4)
-    motion[:3, :3] = drawn_rotation(degrees, generator)
-    step = generator.normal(size=3)
-    motion[:3, 3] = metres * step / np.linalg.norm(step)
-    return motion
+    rotation, step = drawn_rotation(degrees, generator), generator.normal(size=3)
+    return transforms(rotation, metres * step / np.linalg.norm(step))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from benchmarks.renewed.geometry import transforms
 from benchmarks.wrong_recordings.parts import Parts, drawn_motion, drawn_rotation
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
@@ -49,9 +50,22 @@ def where(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
     return np.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
 
-def since(parts: Parts, first: int) -> np.ndarray:
-    """Which frames come from a number on."""
-    return np.arange(len(parts.poses)) >= first
+def since(share: float) -> Callable[[int, Draw], np.ndarray]:
+    """Which frames come after a share of all."""
+    return lambda count, _: np.arange(count) >= int(share * count)
+
+
+def some(chosen: Callable[[int, Draw], np.ndarray], fault: Fault) -> Fault:
+    """Some frames as a fault makes them, the others as they were."""
+
+    def fault_of_some(parts: Parts, generator: Draw) -> Parts:
+        wrong = fault(parts, generator)
+        which = chosen(len(parts.poses), generator)
+        pairs = {k: (getattr(wrong, k), old) for k, old in vars(parts).items() if k != "header"}
+        mixed = {k: where(which, *pair) for k, pair in pairs.items() if pair[1] is not None}
+        return parts.changed(**mixed)
+
+    return fault_of_some
 
 
 def over_image(parts: Parts) -> tuple[np.ndarray, np.ndarray]:
@@ -134,30 +148,22 @@ def inverted_mask(parts: Parts, generator: Draw) -> Parts:
     return parts.changed(depth=depth, mask=np.repeat(outside[None], len(depth), axis=0))
 
 
-def two_cameras(parts: Parts, generator: Draw) -> Parts:
-    """The second half comes from another camera of the same make: other offset, pattern, mount."""
-    later, (row, column) = since(parts, len(parts.depth) // 2), over_image(parts)
+def another_camera(parts: Parts, generator: Draw) -> Parts:
+    """Another camera of the same make: other offset, pattern, mount."""
+    row, column = over_image(parts)
     tilted = generator.normal(0, 0.015)
     tilted = tilted + generator.normal(0, 0.010) * row + generator.normal(0, 0.010) * column
     error = tilted + generator.normal(0, 0.004, size=row.shape)
-    mount = np.eye(4)
-    mount[:3, :3] = drawn_rotation(generator.uniform(0.5, 1.5), generator)
-    mount[:3, 3] = generator.normal(0, 0.005, 3)
-    return parts.changed(
-        depth=where(later, parts.depth + error, parts.depth),
-        poses=where(later, parts.poses @ mount, parts.poses),
-    )
+    turn = drawn_rotation(generator.uniform(0.5, 1.5), generator)
+    mount = transforms(turn, generator.normal(0, 0.005, 3))
+    return parts.changed(depth=parts.depth + error, poses=parts.poses @ mount)
 
 
 def other_exposure(parts: Parts, generator: Draw) -> Parts:
-    """Every second frame has four times the exposure: other amplitude, other distance."""
+    """Four times the exposure: other amplitude, other distance."""
     assert parts.amplitude is not None
-    even = np.arange(len(parts.depth)) % 2 == 0
     off = generator.choice([-1, 1]) * generator.uniform(0.02, 0.04)
-    return parts.changed(
-        depth=where(even, parts.depth + off, parts.depth),
-        amplitude=where(even, 4 * parts.amplitude, parts.amplitude),
-    )
+    return parts.changed(depth=parts.depth + off, amplitude=4 * parts.amplitude)
 
 
 # Walls and targets.
@@ -249,18 +255,9 @@ def drifting(parts: Parts, generator: Draw) -> np.ndarray:
 
 
 def homed_anew(parts: Parts, generator: Draw) -> np.ndarray:
-    """The second half of the poses is of another world: the robot was re-homed."""
-    turn = np.eye(4)
-    turn[:3, :3] = drawn_rotation(10, generator)
-    turn[:3, 3] = generator.normal(0, 0.1, 3)
-    return where(since(parts, len(parts.poses) // 2), turn @ parts.poses, parts.poses)
-
-
-def two_worlds(parts: Parts, generator: Draw) -> np.ndarray:
-    """Two recordings joined, the robot's base moved by 60 mm and 4 degrees between them."""
-    moved, count = drawn_motion(0.06, 4, generator), len(parts.poses)
-    cut = int(generator.integers(count // 4, 3 * count // 4))
-    return where(since(parts, cut), moved @ parts.poses, parts.poses)
+    """Poses of another world: the robot was re-homed."""
+    turn = drawn_rotation(10, generator)
+    return transforms(turn, generator.normal(0, 0.1, 3)) @ parts.poses
 
 
 def varying_lag(parts: Parts, generator: Draw) -> np.ndarray:
@@ -274,17 +271,9 @@ def varying_lag(parts: Parts, generator: Draw) -> np.ndarray:
     return poses
 
 
-def other_flange(parts: Parts, generator: Draw) -> np.ndarray:
-    """Half of the frames, at random, have the pose of another tool frame: 20 mm and 2 degrees."""
-    tool = drawn_motion(0.02, 2, generator)
-    chosen = generator.uniform(size=len(parts.poses)) < 0.5
-    return where(chosen, parts.poses @ tool, parts.poses)
-
-
-def remounted(parts: Parts, generator: Draw) -> np.ndarray:
-    """The last quarter was recorded after the camera was knocked: 8 mm and 1 degree."""
-    last = since(parts, 3 * len(parts.poses) // 4)
-    return where(last, parts.poses @ drawn_motion(0.008, 1, generator), parts.poses)
+def other_tool(metres: float, degrees: float) -> Fault:
+    """Poses of another tool frame, or of a camera that was knocked."""
+    return to(poses=lambda parts, g: parts.poses @ drawn_motion(metres, degrees, g))
 
 
 def only(chosen: Callable[[int, Draw], np.ndarray]) -> Fault:
@@ -320,7 +309,7 @@ TABLE: dict[str, Fault] = {
     "left-handed world": mirrored(None),
     "rows shifted by one": lambda p, g: p.frames(slice(0, -1)).changed(poses=p.poses[1:]),
     "mask inverted": inverted_mask,
-    "two cameras mixed": two_cameras,
+    "two cameras mixed": some(since(1 / 2), another_camera),
     "focal length 10 % off": of_matrix(
         lambda k, g: np.where(np.diag([1, 1, 0]), either(1.1, g), 1.0) * k
     ),
@@ -371,12 +360,16 @@ FURTHER: dict[str, Fault] = {
     "a table in the image": of_depth(a_table_below),
     "every eighth pose off": to(poses=several_poses_off),
     "amplitude of one value": to(amplitude=lambda p, g: np.full(p.depth.shape, 100.0)),
-    "robot homed anew half way": to(poses=homed_anew),
+    "robot homed anew half way": some(since(1 / 2), to(poses=homed_anew)),
 }
 """Kinds of wrong input as users make them."""
 
 UNLISTED: dict[str, Fault] = {
-    "two worlds joined": to(poses=two_worlds),
+    # The robot's base was moved between them, by 60 mm and 4 degrees.
+    "two worlds joined": some(
+        lambda count, g: np.arange(count) >= g.integers(count // 4, 3 * count // 4),
+        to(poses=lambda p, g: drawn_motion(0.06, 4, g) @ p.poses),
+    ),
     "poses too late by a varying lag": to(poses=varying_lag),
     "distortion as k1 k2 k3 p1 p2": of_camera(distortion=tangential_last),
     "distortion left out": of_camera(distortion=lambda camera, g: ()),
@@ -386,7 +379,9 @@ UNLISTED: dict[str, Fault] = {
         lambda k, g: np.where(np.diag([1, 0, 0]), either(1.1, g), 1.0) * k
     ),
     "counts of 16 bits that wrap": of_depth(wrapped_counts),
-    "every second frame of another exposure": other_exposure,
+    "every second frame of another exposure": some(
+        lambda count, _: np.arange(count) % 2 == 0, other_exposure
+    ),
     "frames averaged in time": of_depth(
         lambda depth: np.concatenate([depth[:1], 0.9 * depth[1:] + 0.1 * depth[:-1]])
     ),
@@ -396,7 +391,9 @@ UNLISTED: dict[str, Fault] = {
     ),
     "amplitude one frame late": to(amplitude=lambda p, g: np.roll(np.array(p.amplitude), 1, 0)),
     "images rolled by two columns": of_images(lambda images: np.roll(images, 2, axis=2)),
-    "half of the poses of another flange": to(poses=other_flange),
+    "half of the poses of another flange": some(
+        lambda count, g: g.uniform(size=count) < 0.5, other_tool(0.02, 2)
+    ),
     "a robot 4 % too long": to(place=lambda p, g: either(1.04, g) * p.place),
     "holes filled from the frame before": to(
         depth=lambda p, g: np.where(
@@ -408,7 +405,7 @@ UNLISTED: dict[str, Fault] = {
     "planes as n . x = d": to(
         place=lambda p, g: p.place + p.normal, offset=lambda p, g: 1.0 - p.offset
     ),
-    "poses of the camera before it was remounted": to(poses=remounted),
+    "poses of the camera before it was remounted": some(since(3 / 4), other_tool(0.008, 1)),
     "depth of every pixel's median over the frames": of_depth(
         lambda depth: 0.95 * depth + 0.05 * np.nanmedian(depth, axis=0)
     ),

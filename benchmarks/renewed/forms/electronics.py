@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array
-from benchmarks.renewed.signal_chain import Change, View, demodulate, form
+from benchmarks.renewed.signal_chain import Change, View, adding, demodulate, form
 from benchmarks.renewed.world import World
 
 TAPS = np.arange(4)[:, None, None, None] * np.pi / 2
@@ -45,11 +45,10 @@ def phase_table(rng: np.random.Generator, world: World) -> Change:
     table = np.cos(2 * knots + rng.uniform(0, 6)) + 0.6 * rng.standard_normal(16)
     table -= table.mean()
 
-    def change(strength: float, view: View, path: Array) -> Array:
-        phase = 4 * np.pi * world.sensor.frequencies[-1] / SPEED_OF_LIGHT * view.distance
-        return path + strength * np.interp(phase % (2 * np.pi), knots, table, period=2 * np.pi)
-
-    return change
+    turn = 4 * np.pi * world.sensor.frequencies[-1] / SPEED_OF_LIGHT
+    return adding(
+        lambda view: np.interp(turn * view.distance % (2 * np.pi), knots, table, period=2 * np.pi)
+    )
 
 
 @form("saturation", "taps", 0.5, textbook=True, exposure="random")
@@ -92,7 +91,7 @@ def blooming(rng: np.random.Generator, world: World) -> Change:
 def dark_power_law(rng: np.random.Generator, world: World) -> Change:
     """Dark pixels drift, by a power of the amplitude."""
     power, sign = rng.uniform(0.3, 0.8), rng.choice([-1.0, 1.0])
-    return lambda strength, view, path: path + sign * strength * (_shine(view) / 0.1) ** -power
+    return adding(lambda view: sign * (_shine(view) / 0.1) ** -power)
 
 
 @form("amplitude", "path", 0.008)
@@ -108,9 +107,7 @@ def gain_switch(rng: np.random.Generator, world: World) -> Change:
 def amplitude_table(rng: np.random.Generator, world: World) -> Change:
     """A bench table over the logarithm of the amplitude, up and down."""
     knots, table = np.linspace(-5.5, 0.5, 9), rng.standard_normal(9)
-    return lambda strength, view, path: (
-        path + strength * np.interp(np.log(_shine(view)), knots, table)
-    )
+    return adding(lambda view: np.interp(np.log(_shine(view)), knots, table))
 
 
 def _shine(view: View) -> Array:

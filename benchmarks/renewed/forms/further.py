@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.renewed.forms.light import rendered
 from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, small_motions
-from benchmarks.renewed.signal_chain import Change, View, form
+from benchmarks.renewed.signal_chain import Change, View, adding, form
 from benchmarks.renewed.world import World
 
 CAMERA_WEIGHT = np.array([0.0, 0.0, -1.0])  # direction in the world
@@ -66,7 +66,7 @@ def sagging_bracket(rng: np.random.Generator, world: World) -> Change:
 def knee(rng: np.random.Generator, world: World) -> Change:
     """The error has a knee in distance."""
     at = rng.uniform(0.3, 0.7) * (world.design.near + world.design.far)
-    return lambda strength, view, path: path + strength * np.abs(view.distance - at)
+    return adding(lambda view: np.abs(view.distance - at))
 
 
 @form("pixel", "path", 0.005)
@@ -74,14 +74,10 @@ def trefoil(rng: np.random.Generator, world: World) -> Change:
     """The error over the image is a trefoil."""
     column, row = world.pixel_position
     wave = np.hypot(column, row) ** 3 * np.cos(3 * np.arctan2(row, column) + rng.uniform(0, 6))
-    return lambda strength, view, path: path + strength * wave
+    return adding(wave)
 
 
 @form("amplitude", "path", 0.0005)
 def inverse_amplitude(rng: np.random.Generator, world: World) -> Change:
     """The error goes with one over the amplitude."""
-
-    def change(strength: float, view: View, path: Array) -> Array:
-        return path + strength * np.minimum(view.bright / view.amplitude, 50.0)
-
-    return change
+    return adding(lambda view: np.minimum(view.bright / view.amplitude, 50.0))

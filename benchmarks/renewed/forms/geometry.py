@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.renewed.geometry import Array, small_motions
-from benchmarks.renewed.signal_chain import Change, View, form
+from benchmarks.renewed.signal_chain import Change, View, adding, form
 from benchmarks.renewed.world import World
 
 STEEP = float(np.deg2rad(35.0))
@@ -39,11 +39,7 @@ def bow(rng: np.random.Generator, world: World) -> Change:
     """A bowed sheet: a cylinder across some direction."""
     angle, size = rng.uniform(0, np.pi), _size(world)
 
-    def change(strength: float, view: View, height: Array) -> Array:
-        across = (np.cos(angle) * view.x + np.sin(angle) * view.y) / size
-        return height + strength * np.minimum(across**2, 6.0)
-
-    return change
+    return adding(lambda view: np.minimum((_across(view, angle) / size) ** 2, 6.0))
 
 
 @form("target_shape", "relief", 0.005)
@@ -68,20 +64,23 @@ def panels(rng: np.random.Generator, world: World) -> Change:
     angle, at, size = rng.uniform(0, np.pi), rng.uniform(-0.2, 0.2), _size(world)
     step, kink = rng.normal(0, 1, 2)
 
-    def change(strength: float, view: View, height: Array) -> Array:
-        across = (np.cos(angle) * view.x + np.sin(angle) * view.y) / size - at
-        return height + strength * (step * (across > 0) + 2 * kink * np.clip(across, 0, 2))
+    def relief(view: View) -> Array:
+        across = _across(view, angle) / size - at
+        return step * (across > 0) + 2 * kink * np.clip(across, 0, 2)
 
-    return change
+    return adding(relief)
+
+
+def _across(view: View, angle: float) -> Array:
+    """Metres on the target in a direction, at every pixel."""
+    return np.cos(angle) * view.x + np.sin(angle) * view.y
 
 
 @form("target_registration", "plane", 0.005, textbook=True)
 def misplaced(rng: np.random.Generator, world: World) -> Change:
     """The target stands turned and shifted against its survey."""
     turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.5)
-    return lambda strength, view, plane: (
-        plane @ small_motions(strength * np.array([0, 0, shift]), strength * np.array([*turn, 0]))
-    )
+    return _leaning(turn, shift)
 
 
 @form("target_registration", "plane", 0.005)
@@ -90,22 +89,21 @@ def bumped(rng: np.random.Generator, world: World) -> Change:
     turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.7)
     after = np.arange(world.frames) >= world.frames * rng.uniform(0.25, 0.75)
     after = after[world.way.pose_id.searchsorted(world.way.pose_id)]  # a pose is of one side
-    moved: Array = after.astype(np.float64)[:, None]
-
-    def change(strength: float, view: View, plane: Array) -> Array:
-        step: Array = np.float64(strength) * moved
-        return plane @ small_motions(step * np.array([0, 0, shift]), step * np.array([*turn, 0]))
-
-    return change
+    return _leaning(turn, shift, after.astype(np.float64)[:, None])
 
 
 @form("target_registration", "plane", 0.005)
 def sinking(rng: np.random.Generator, world: World) -> Change:
     """The stand gives way slowly: the target leans more and more."""
     turn, when = rng.normal(0, 1, 2) / _size(world), world.way.seconds / world.way.seconds[-1]
+    return _leaning(turn, 0.0, when[:, None])
+
+
+def _leaning(turn: Array, shift: float, share: Array | float = 1.0) -> Change:
+    """The target turned about its axes and shifted along its normal, by a share in every frame."""
+    place, leaning = np.array([0, 0, shift]), np.array([*turn, 0])
     return lambda strength, view, plane: (
-        plane
-        @ small_motions(np.zeros((len(when), 3)), strength * when[:, None] * np.array([*turn, 0]))
+        plane @ small_motions(strength * share * place, strength * share * leaning)
     )
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array
-from benchmarks.renewed.signal_chain import Change, View, background, form
+from benchmarks.renewed.signal_chain import Change, View, adding, background, form
 from benchmarks.renewed.world import NOMINAL_US, World, heat
 
 EXPOSED: dict[str, Any] = {"exposure": "random", "logged": ("integration_time_us",)}
@@ -16,7 +16,7 @@ LAMPS: dict[str, Any] = {"logged": ("ambient",)}
 
 def _per_frame(values: Array) -> Change:
     """A path changed by a strength times a value of every frame (N,)."""
-    return lambda strength, view, path: path + strength * values[:, None, None]
+    return adding(values[:, None, None])
 
 
 @form("integration_time", "path", 0.01, textbook=True, **EXPOSED)
@@ -96,9 +96,8 @@ def bowl(rng: np.random.Generator, world: World) -> Change:
 def coarse_sensor(rng: np.random.Generator, world: World) -> Change:
     """Compensated with a thermometer of whole steps: what is left is a saw-tooth over a slope."""
     room, step = world.conditions.room, rng.uniform(1.0, 2.5)
-    return _per_frame(
-        rng.choice([-1.0, 1.0]) * (0.3 * (room - room.mean()) - np.round(room / step) * step + room)
-    )
+    left = 0.3 * (room - room.mean()) - np.round(room / step) * step + room
+    return _per_frame(rng.choice([-1.0, 1.0]) * left)
 
 
 @form("ambient_light", "light", 0.05, textbook=True, **LAMPS)

@@ -59,12 +59,9 @@ def rendered(world: World, room: Room) -> Change:
 def _within(points: Array, room: Room) -> Array:
     """Points moved off the joints between target and walls, and not beyond them."""
     result = points.copy()
-    for axis, walls in ((0, (room.side, room.other_side)), (1, (room.floor, room.ceiling))):
-        for wall in walls:
-            if wall is not None:
-                inner = 0.98 * wall
-                clip = np.minimum if wall > 0 else np.maximum
-                result[..., axis] = clip(result[..., axis], inner)
+    for axis, wall in room.sides():
+        clip = np.minimum if wall > 0 else np.maximum
+        result[..., axis] = clip(result[..., axis], 0.98 * wall)
     return result
 
 
@@ -117,9 +114,7 @@ def ghost(rng: np.random.Generator, world: World) -> Change:
 @form("stray_light", "light", 0.05, target="checkerboard")
 def veil(rng: np.random.Generator, world: World) -> Change:
     """A dirty cover glass: every pixel sees a share of the mean of the image."""
-    return lambda strength, view, phasor: (
-        phasor + strength * phasor.mean(axis=(1, 2), keepdims=True)
-    )
+    return lambda strength, _, phasor: phasor + strength * phasor.mean((1, 2), keepdims=True)
 
 
 @form("mixed_pixels", "light", textbook=True, scaled=False, scene="board", mask=UNERODED)
@@ -132,8 +127,7 @@ def defocus(rng: np.random.Generator, world: World) -> Change:
 def aperture(rng: np.random.Generator, world: World) -> Change:
     """Every pixel sees a square footprint, at a board's edge half of it behind the board."""
     grid = (np.arange(4) - 1.5) / 4
-    offsets = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    return _footprint(world, offsets)
+    return _footprint(world, np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2))
 
 
 def _footprint(world: World, offsets: Array) -> Change:

@@ -115,11 +115,9 @@ def _at_times(times: Array) -> Change:
         mean = taps.mean(0)
         phasor = (taps[0] - taps[2]) / 2 + 0.5j * (taps[3] - taps[1])
         turn = 4 * np.pi * view.frequency / SPEED_OF_LIGHT * speed(view) * strength
-        turned = (
-            mean + np.real(phasor * np.exp(0.5j * np.pi * i) * np.exp(1j * turn * t))
-            for i, t in enumerate(times)
-        )
-        return np.stack(list(turned))
+        stepped = (phasor * np.exp(0.5j * np.pi * i) for i in range(4))
+        turned = (one * np.exp(1j * turn * t) for one, t in zip(stepped, times, strict=True))
+        return mean + np.stack([np.real(one) for one in turned])
 
     return change
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.renewed.signal_chain import Change, form
+from benchmarks.renewed.signal_chain import Change, adding, form
 from benchmarks.renewed.world import World
 
 
@@ -12,9 +12,7 @@ def interference(rng: np.random.Generator, world: World) -> Change:
     column, row = world.pixel_position
     along = rng.normal(0, 6, 2)
     start = rng.uniform(0, 2 * np.pi, world.frames)[:, None, None]
-    return lambda strength, view, path: (
-        path + strength * np.sin(along[0] * column + along[1] * row + start)
-    )
+    return adding(np.sin(along[0] * column + along[1] * row + start))
 
 
 @form("parallax", "path", 0.005)
@@ -22,7 +20,7 @@ def parallax(rng: np.random.Generator, world: World) -> Change:
     """Two lamps beside the lens, one of them late: near pixels see more of one or the other."""
     column, _ = world.pixel_position
     near = rng.choice([-1.0, 1.0]) * world.design.near
-    return lambda strength, view, path: path + strength * np.tanh(3 * column * near / view.distance)
+    return adding(lambda view: np.tanh(3 * column * near / view.distance))
 
 
 @form("every_other", "path", 0.005, moving=False, repeated=0.0)
@@ -30,4 +28,4 @@ def every_other(rng: np.random.Generator, world: World) -> Change:
     """Two buffers take turns; one of them is late in the lower part of the image."""
     _, row = world.pixel_position
     turn = (np.arange(world.frames) % 2)[:, None, None]
-    return lambda strength, view, path: path + strength * turn * (row > -1 / 3)
+    return adding(turn * (row > -1 / 3))

@@ -2,14 +2,8 @@
 
 import numpy as np
 
-from benchmarks.renewed.geometry import Array
-from benchmarks.renewed.signal_chain import Change, form
+from benchmarks.renewed.signal_chain import Change, adding, form
 from benchmarks.renewed.world import World
-
-
-def _map(values: Array) -> Change:
-    """A path changed by a strength times a map (H, W)."""
-    return lambda strength, view, path: path + strength * values
 
 
 def _shape(world: World) -> tuple[int, int]:
@@ -19,7 +13,7 @@ def _shape(world: World) -> tuple[int, int]:
 @form("fixed_pattern", "path", 0.005, textbook=True)
 def every_pixel(rng: np.random.Generator, world: World) -> Change:
     """Every pixel has a delay of its own."""
-    return _map(rng.standard_normal(_shape(world)))
+    return adding(rng.standard_normal(_shape(world)))
 
 
 @form("fixed_pattern", "path", 0.02)
@@ -28,7 +22,7 @@ def hot_pixels(rng: np.random.Generator, world: World) -> Change:
     shape = _shape(world)
     seeds = rng.uniform(size=shape) < rng.uniform(0.01, 0.04)
     beside = np.roll(seeds, 1, 1) & (rng.uniform(size=shape) < 0.5)
-    return _map((seeds | np.roll(seeds, 1, 0) | beside) * rng.normal(0.5, 1.0, shape))
+    return adding((seeds | np.roll(seeds, 1, 0) | beside) * rng.normal(0.5, 1.0, shape))
 
 
 @form("fixed_pattern", "path", 0.005)
@@ -37,14 +31,14 @@ def blocks(rng: np.random.Generator, world: World) -> Change:
     height, width = _shape(world)
     size = int(rng.integers(4, 9))
     table = rng.standard_normal((height // size + 1, width // size + 1))
-    return _map(table.repeat(size, 0).repeat(size, 1)[:height, :width])
+    return adding(table.repeat(size, 0).repeat(size, 1)[:height, :width])
 
 
 @form("row_column_pattern", "path", 0.005, textbook=True)
 def free_columns(rng: np.random.Generator, world: World) -> Change:
     """Every column has an offset of its own, and rows a smaller one."""
     height, width = _shape(world)
-    return _map(rng.standard_normal(width) + 0.4 * rng.standard_normal(height)[:, None])
+    return adding(rng.standard_normal(width) + 0.4 * rng.standard_normal(height)[:, None])
 
 
 @form("row_column_pattern", "path", 0.005)
@@ -53,7 +47,7 @@ def halves_and_pairs(rng: np.random.Generator, world: World) -> Change:
     height, width = _shape(world)
     rows = (np.arange(height) % 2 - 0.5) * rng.uniform(0.5, 2.0)
     half = np.arange(width) >= width // 2
-    return _map(rows[:, None] + half * rng.uniform(0.5, 2.0) * rng.choice([-1.0, 1.0]))
+    return adding(rows[:, None] + half * rng.uniform(0.5, 2.0) * rng.choice([-1.0, 1.0]))
 
 
 @form("row_column_pattern", "path", 0.005)
@@ -62,4 +56,4 @@ def clock_beat(rng: np.random.Generator, world: World) -> Change:
     height, width = _shape(world)
     period = rng.uniform(3.0, 9.0)
     wave = np.sin(2 * np.pi * np.arange(height) / period + rng.uniform(0, 6))
-    return _map(np.broadcast_to(wave[:, None], (height, width)))
+    return adding(np.broadcast_to(wave[:, None], (height, width)))
