@@ -38,6 +38,7 @@ from tofcorr.simulation.simulator import simulate
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import calibration_state, run_reference, train
 
+Values = dict[str, Any]
 WALLS: tuple[Wall, ...] = ("per_image", "one", "recorded")
 FRAMES = (1, 3, 5, 10, 20, 40)
 MODELS = ("ea", "ea", "e0", "eb", "ea_log")
@@ -46,7 +47,7 @@ MODELS = ("ea", "ea", "e0", "eb", "ea_log")
 DRIFT_MM, REACH = 5.0, 0.2
 
 
-def drawn_camera(generator: np.random.Generator) -> dict[str, Any]:
+def drawn_camera(generator: np.random.Generator) -> Values:
     """Return the simulator's options of a training recording."""
     values = drawn_simulator(generator)
     matrix = [[45.0, 0.0, 16.0], [0.0, 45.0, 12.5], [0.0, 0.0, 1.0]]
@@ -60,9 +61,7 @@ def drawn_camera(generator: np.random.Generator) -> dict[str, Any]:
     return values
 
 
-def check_options(
-    training: dict[str, Any], frames: int, generator: np.random.Generator
-) -> dict[str, Any]:
+def check_options(training: Values, frames: int, generator: np.random.Generator) -> Values:
     """Return the options of the frames to check: the same camera and robot, later."""
     values = json.loads(json.dumps(training))
     values["seed"] = training["seed"] + 1
@@ -76,7 +75,7 @@ def check_options(
     return values
 
 
-def one_draw(number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
+def one_draw(number: int, seed: int, folder: Path) -> list[Values]:
     """Train once and check twice, unchanged and drifted; return a line for each wall and state."""
     generator = np.random.default_rng([seed, 16, number])
     frames = FRAMES[number % len(FRAMES)]
@@ -94,18 +93,18 @@ def one_draw(number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
     for wall in WALLS:
         found = check_drift(state, same, wall, reference=reference)
         said = {"verdict": found.verdict, "headline": found.headline}
-        lines.append(_line(wall, frames, 0.0, found.offset, *found.interval) | said)
+        lines.append(_line(wall, frames, 0.0, found.offset, found.interval) | said)
         own = reference or unknown_reference(state, wall_is_known=False)
         sums = OffsetSums(state, moved, wall, own)
         for count, _ in enumerate(sums.read(), 1):
             if count in FRAMES:
                 drift = sums.estimate()
                 ends = drift.value - drift.half_width, drift.value + drift.half_width
-                lines.append(_line(wall, count, DRIFT_MM, drift.value, *ends))
+                lines.append(_line(wall, count, DRIFT_MM, drift.value, ends))
     return [{"draw": number, "model": model, **line} for line in lines]
 
 
-def recorded(later: dict[str, Any], folder: Path, frames: int, drift: float) -> Dataset:
+def recorded(later: Values, folder: Path, frames: int, drift: float) -> Dataset:
     """Simulate the frames to check."""
     values = json.loads(json.dumps(later))
     values["shots"][0]["poses"] = frames
@@ -115,21 +114,22 @@ def recorded(later: dict[str, Any], folder: Path, frames: int, drift: float) -> 
 
 
 def _line(
-    wall: Wall, frames: int, drift_mm: float, offset: float, low: float, high: float
-) -> dict[str, Any]:
+    wall: Wall, frames: int, drift_mm: float, offset: float, interval: tuple[float, float]
+) -> Values:
     """Return what was found with a wall and a number of frames; offset and interval in metres."""
+    low, high = (1e3 * end for end in interval)
     return {
         "frames": frames,
         "wall": wall,
         "drift_mm": drift_mm,
         "offset_mm": 1e3 * offset,
-        "interval_mm": [1e3 * low, 1e3 * high],
-        "covered": 1e3 * low <= drift_mm <= 1e3 * high,
+        "interval_mm": [low, high],
+        "covered": low <= drift_mm <= high,
         "differs_from_0": low > 0 or high < 0,
     }
 
 
-def summary(lines: Sequence[dict[str, Any]]) -> str:
+def summary(lines: Sequence[Values]) -> str:
     """Return coverage and power by wall and number of frames."""
     head = ("wall", "frames", "draws, unchanged", "coverage of 0", "half width, median mm")
     head += ("RMS error, mm", "said `drifted`", "headlines", "draws, drifted")
@@ -162,7 +162,7 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
 def main(count: int, seed: int, out: Path | None) -> None:
     """Measure coverage and power of the check's intervals."""
     torch.set_num_threads(1)
-    lines: list[dict[str, Any]] = []
+    lines: list[Values] = []
     left_out = []
     for number in tqdm(range(count), desc="cameras", disable=None):
         with tempfile.TemporaryDirectory() as folder:

@@ -271,9 +271,7 @@ def compare_command(before: Path, after: Path, only: tuple[str, ...], rows: int)
                 words.append(f"{name}/{key}: {a!r} -> {b!r}")
     numbers.sort(key=lambda row: -row[0])
     outside = sum(off > 1 for off, *_ in numbers)
-    click.echo(
-        f"{len(numbers)} numbers, {outside} outside their tolerance; {len(words)} words differ"
-    )
+    click.echo(f"{len(numbers)} numbers, {outside} outside tolerance; {len(words)} words differ")
     click.echo("off/tolerance  key: before -> after")
     for off, key, a, b in numbers[: max(rows, 0)]:
         click.echo(f"{off:13.3g}  {key}: {a:.9g} -> {b:.9g}")

@@ -34,14 +34,8 @@ CONDITIONS = {
 }
 
 
-def sensor_with(name: str | None, strength: float = 0.05) -> SensorModel | None:
-    """Return the sensor with one effect, every coefficient used; None if no image can show it.
-
-    Args:
-        name: Of the effect.
-        strength: Every coefficient, as a share of its prior deviation; the time does not depend
-            on it.
-    """
+def sensor_with(name: str | None) -> SensorModel | None:
+    """Return the sensor with one effect, every coefficient used; None if no image can show it."""
     values = SensorModel.load("kinect_v2").sensor.to_mapping() | VGA
     effects = []
     if name is not None:
@@ -49,7 +43,8 @@ def sensor_with(name: str | None, strength: float = 0.05) -> SensorModel | None:
         drawn = {"rms_m": 0.004} if name == "fixed_pattern" else {}
         terms = () if shape else CATALOGUE[name].terms(CATALOGUE[name].shape_type())
         effects = [{"name": name, **shape, **drawn}]
-        effects[0] |= {term.name: strength * term.prior_sd for term in terms}
+        # A share of the prior deviation; the time does not depend on it.
+        effects[0] |= {term.name: term.prior_sd / 20 for term in terms}
     sensor = SensorFile.from_mapping(values | {"effects": effects}, "the benchmark")
     shown = ImageEffects(sensor.intrinsics(), sensor.effects, sensor.modulation_frequency_hz)
     return None if shown.left_out else SensorModel(sensor)
@@ -97,9 +92,8 @@ def main(effects: tuple[str, ...], threads: int, repeats: int) -> None:
             processor, clock = milliseconds(sensor, repeats)
             times = (f"{processor:.1f}", f"{clock:.1f}", f"{1e3 / clock:.1f}")
         rows.append((name or "none", *times))
-    click.echo(
-        table((f"effect, {threads} threads", "processor, ms", "clock, ms", "frames/s"), rows)
-    )
+    head = (f"effect, {threads} threads", "processor, ms", "clock, ms", "frames/s")
+    click.echo(table(head, rows))
 
 
 if __name__ == "__main__":

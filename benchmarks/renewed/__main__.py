@@ -1,6 +1,6 @@
 """`python -m benchmarks.renewed`: the check on forms, sensors and robots that nobody tuned on."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from benchmarks.renewed.cases import TIERS, write_case
@@ -38,13 +38,11 @@ TARGETS = {
 }
 
 
-def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
-    """Write cases, real ones too where they are asked for."""
-    for tier, count in counts.items():
-        if tier == "K":
-            yield from write_real(seed, out)
-        else:
-            yield from (write_case(seed, tier, index, out) for index in range(count))
+def generate(seed: int, tier: str, index: int, out: Path) -> Iterable[Entry]:
+    """Write a case; all real ones, of which there is one set, come with the first."""
+    if tier == "K":
+        return () if index else write_real(seed, out)
+    return (write_case(seed, tier, index, out),)
 
 
 def findable(outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -76,9 +74,9 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
         *_coverage("one effect", cases, out),
         *_coverage("nothing", nulls, out),
         *figures("real, effect added", real["added"]),
-        share_score("real", NEW_NAME, real["added"], names_something_new(outcomes)),
+        share_score("real", NEW_NAME, map(names_something_new(outcomes), real["added"])),
         *figures("real, term withheld", real["term"]),
-        share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
+        share_score("all", "runs that failed", (bool(one.said.failure) for one in outcomes)),
     ]
     judged = [(one.case, (named(one), unknown(one), detected(one))) for one in nulls]
     head = ("nothing missing", "", "n", "named", "unknown", "detected")
@@ -93,9 +91,7 @@ def _many(cases: Sequence[Outcome]) -> list[Outcome]:
 def _coverage(title: str, cases: Sequence[Outcome], out: Path) -> list[Score]:
     held = [covered(one, out) for one in cases]
     return [
-        share_score(
-            title, f"{gap}_ci holds the truth", held, lambda one, gap=gap: one.get(gap), COVERAGE
-        )
+        share_score(title, f"{gap}_ci holds the truth", (one.get(gap) for one in held), COVERAGE)
         for gap in ("before", "after", "closed")
     ]
 

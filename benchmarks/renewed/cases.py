@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.renewed import ranges
 from benchmarks.renewed.forms import INSIDE, OUTSIDE
-from benchmarks.renewed.geometry import Array
+from benchmarks.renewed.geometry import Array, Random
 from benchmarks.renewed.recording import Recorded, Truth, record, write_recording
 from benchmarks.renewed.signal_chain import Change, Form, Hook, noise_of, scaled
 from benchmarks.renewed.world import World, draw_world
@@ -61,7 +61,7 @@ class Case:
 
 
 def make_case(
-    rng: np.random.Generator,
+    rng: Random,
     forms: Sequence[Form] = (),
     sizes: ranges.Range = ranges.RANGES["sizes_mm"],
     wanted: Mapping[str, Any] | None = None,
@@ -78,7 +78,7 @@ def make_case(
 def seeded(forms: Sequence[Form], seed: int) -> tuple[Form, ...]:
     """The forms, each drawn by a generator of its own: another session has the same effects."""
 
-    def draw(form: Form) -> Callable[[np.random.Generator, World], Change]:
+    def draw(form: Form) -> Callable[[Random, World], Change]:
         return lambda _, world: form.draw(np.random.default_rng(seed), world)
 
     return tuple(replace(form, draw=draw(form)) for form in forms)
@@ -123,7 +123,7 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
 
 
 def write_sealed(
-    rng: np.random.Generator,
+    rng: Random,
     case: Case,
     out: Path,
     about: Mapping[str, Any],

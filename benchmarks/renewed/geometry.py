@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Random = np.random.Generator
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 
 

@@ -10,6 +10,8 @@ from unittest.mock import patch
 import numpy as np
 import yaml
 
+from benchmarks.renewed.geometry import Random
+
 
 @dataclass(frozen=True)
 class Range:
@@ -19,14 +21,14 @@ class Range:
     high: float
     log: bool = False
 
-    def draw(self, rng: np.random.Generator) -> float:
+    def draw(self, rng: Random) -> float:
         """One number."""
         if self.log:
             return float(np.exp(rng.uniform(np.log(self.low), np.log(self.high))))
         return float(rng.uniform(self.low, self.high))
 
 
-def draw(name: str, rng: np.random.Generator) -> Any:  # noqa: ANN401 - of any kind
+def draw(name: str, rng: Random) -> Any:  # noqa: ANN401 - of any kind
     """One number of a range, or one of the choices, which have these probabilities."""
     given = RANGES[name]
     if isinstance(given, Range):

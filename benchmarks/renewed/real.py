@@ -20,7 +20,7 @@ import yaml
 
 from benchmarks.renewed import ranges
 from benchmarks.renewed.forms import FORM
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, image_grid
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, Random, image_grid
 from benchmarks.renewed.recording import Data, read
 from benchmarks.renewed.signal_chain import (
     Form,
@@ -123,7 +123,7 @@ def real_view(data: Data) -> View:
     )
 
 
-def _added(rng: np.random.Generator, view: View, form: Form) -> tuple[Form, Array, Array]:
+def _added(rng: Random, view: View, form: Form) -> tuple[Form, Array, Array]:
     """A form with its change of depth (N, H, W), metres, and its factor of the amplitude."""
     change = form.draw(rng, view.world)
     before = _measured(view, [])
@@ -149,7 +149,7 @@ def _measured(view: View, hooks: list[Hook]) -> tuple[Array, Array]:
 
 
 def _write(
-    rng: np.random.Generator,
+    rng: Random,
     out: Path,
     thin: Path,
     data: Data,

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from benchmarks.renewed.geometry import Array, Camera, small_motions, transforms
+from benchmarks.renewed.geometry import Array, Camera, Random, small_motions, transforms
 from benchmarks.renewed.signal_chain import Hook, Measured, field_of, mask_of, measure
 from benchmarks.renewed.world import World
 
@@ -39,7 +39,6 @@ class Recorded:
 class Truth:
     """What is withheld, metres: each effect's error, and the radial distance without noise."""
 
-    hooks: tuple[Hook, ...]
     fields: Mapping[str, Array]
     expected: Array
 
@@ -50,7 +49,7 @@ class Truth:
         return {name: 1e3 * float(size) for name, size in sizes.items()}
 
 
-def record(rng: np.random.Generator, world: World, hooks: Sequence[Hook]) -> tuple[Recorded, Truth]:
+def record(rng: Random, world: World, hooks: Sequence[Hook]) -> tuple[Recorded, Truth]:
     """Record a world with effects."""
     clean, expected = measure(world), measure(world, hooks)
     seen = measure(world, hooks, rng)
@@ -71,17 +70,17 @@ def record(rng: np.random.Generator, world: World, hooks: Sequence[Hook]) -> tup
         amplitude=seen.amplitude * world.sensor.lens.counts_per_electron,
         mask=mask,
     )
-    return recorded, Truth(tuple(hooks), fields, expected.depth)
+    return recorded, Truth(fields, expected.depth)
 
 
-def pose_noise(rng: np.random.Generator, world: World) -> Array:
+def pose_noise(rng: Random, world: World) -> Array:
     """Transforms (N, 4, 4) from the tool as the robot states it to where it is; one a pose."""
     slip, shape = world.design.robot, (world.way.poses, 3)
     noise = small_motions(slip * rng.standard_normal(shape), slip * rng.standard_normal(shape))
     return noise[world.way.pose_id]
 
 
-def exactly(rng: np.random.Generator, recorded: Recorded, truth: Truth) -> Recorded:
+def exactly(rng: Random, recorded: Recorded, truth: Truth) -> Recorded:
     """The same recording by a perfect robot, with `FAINT` noise and without rounding."""
     faint = truth.expected + FAINT * rng.standard_normal(truth.expected.shape)
     depth = np.where(np.isnan(recorded.depth), np.nan, faint * depth_over_range(recorded.world))
@@ -100,16 +99,13 @@ def _returned(seen: Measured) -> np.ndarray:
     return (seen.amplitude > WEAKEST * noise) & (seen.depth > 0)
 
 
-def write_recording(
-    folder: Path, recorded: Recorded, without: Collection[str] = (), **others: object
-) -> None:
+def write_recording(folder: Path, recorded: Recorded, without: Collection[str] = ()) -> None:
     """Write a recording.
 
     Args:
         folder: Where; nothing may be there.
         recorded: What to write.
         without: Columns, files and entries of the header that are left out.
-        others: Entries of the header that differ.
     """
     folder.mkdir(parents=True)
     images = {"depth": np.float32, "mask": np.uint8, "amplitude": np.float32}
@@ -131,7 +127,7 @@ def write_recording(
         "modulation_frequency_hz": sensor.frequencies[-1],
         "saturation_amplitude": None,
         "tool_from_camera": recorded.world.guess.tolist(),
-    } | others
+    }
     # YAML's flow style, which is JSON.
     lines = [f"{k}: {json.dumps(v)}\n" for k, v in entries.items() if k not in without]
     (folder / "recording.yaml").write_text("".join(lines))

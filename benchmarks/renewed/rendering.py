@@ -204,10 +204,8 @@ class Renderer:
         toward = points - origin
         length = np.linalg.norm(toward, axis=-1)
         index = dr.arange(mi.UInt32, count * samples) // samples
-        rays = mi.Ray3f(
-            start,
-            dr.gather(mi.Vector3f, mi.Vector3f((toward / length[:, None]).T), index),
-        )
+        ahead = mi.Vector3f((toward / length[:, None]).T)
+        rays = mi.Ray3f(start, dr.gather(mi.Vector3f, ahead, index))
         there_and_back = dr.gather(mi.Float, mi.Float(2 * length), index)
         direct = dr.zeros(mi.Float, count)
         bins = dr.zeros(mi.Float, count * BINS)

@@ -11,7 +11,14 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, directions, image_grid, inverse
+from benchmarks.renewed.geometry import (
+    SPEED_OF_LIGHT,
+    Array,
+    Random,
+    directions,
+    image_grid,
+    inverse,
+)
 from benchmarks.renewed.world import CONTRAST, NOMINAL_US, READ_NOISE, WHITE, World
 
 Stage = Literal["poses", "rays", "plane", "relief", "path", "light", "taps"]
@@ -54,7 +61,7 @@ class Form:
     name: str
     stage: Stage
     textbook: bool
-    draw: Callable[[np.random.Generator, World], Change]
+    draw: Callable[[Random, World], Change]
     guess: float
     scaled: bool
     wanted: Mapping[str, Any]
@@ -68,14 +75,14 @@ def form(
     textbook: bool = False,
     scaled: bool = True,
     **wanted: object,
-) -> Callable[[Callable[[np.random.Generator, Any], Change]], Form]:
+) -> Callable[[Callable[[Random, Any], Change]], Form]:
     """Make a form, with the function's name, of a function that draws it."""
     return lambda draw: Form(effect, draw.__name__, stage, textbook, draw, guess, scaled, wanted)
 
 
 def adding(field: Any) -> Change:  # noqa: ANN401 - an array, or a function of the view
     """The value of a stage plus the strength times a field, one of all views or one of each."""
-    of_view = field if callable(field) else lambda _: field
+    of_view: Callable[[Any], Any] = field if callable(field) else lambda _: field
     return lambda strength, view, value: value + strength * of_view(view)
 
 
@@ -201,9 +208,7 @@ def _footprint(view: View) -> Array:
     return total / 4
 
 
-def measure(
-    world: World, hooks: Sequence[Hook] = (), rng: np.random.Generator | None = None
-) -> Measured:
+def measure(world: World, hooks: Sequence[Hook] = (), rng: Random | None = None) -> Measured:
     """Measure a world with effects; without a generator of noise there is none."""
     view = see(world, hooks)
     depth, square = np.zeros_like(view.path), np.zeros_like(view.path)
@@ -259,7 +264,7 @@ def demodulate(taps: Array) -> tuple[Array, Array]:
     return np.arctan2(imaginary, real), np.hypot(real, imaginary)
 
 
-def _noise(rng: np.random.Generator, taps: Array, world: World) -> Array:
+def _noise(rng: Random, taps: Array, world: World) -> Array:
     """Shot and read noise as the camera's filters leave it: they act on nothing else here.
 
     A filter that also blurs the picture would be an effect; this one leaves neighbours and
@@ -356,9 +361,7 @@ MOST_EMPTY = 20  # pixels in the region marked: with fewer the frame is left out
 NOISE_TIMES = 3.0  # the threshold is at least so many times the scatter
 
 
-def mask_of(
-    rng: np.random.Generator, seen: Measured, depth: Array, kind: str, threshold: float
-) -> np.ndarray:
+def mask_of(rng: Random, seen: Measured, depth: Array, kind: str, threshold: float) -> np.ndarray:
     """The mask (N, H, W) of measured depths with NaN where nothing returned."""
     if kind == "all that is seen":
         return seen.view.on_target
@@ -374,9 +377,7 @@ def mask_of(
     return found & within
 
 
-def _plane_pixels(
-    rng: np.random.Generator, points: Array, about: np.ndarray, threshold: float
-) -> np.ndarray:
+def _plane_pixels(rng: Random, points: Array, about: np.ndarray, threshold: float) -> np.ndarray:
     """Pixels (H, W) within the threshold of the plane that most of a marked region agrees with.
 
     The region keeps the search from the wall behind a board; the pixels found may lie anywhere.

@@ -11,6 +11,7 @@ from benchmarks.renewed.geometry import (
     SPEED_OF_LIGHT,
     Array,
     Camera,
+    Random,
     image_grid,
     inverse,
     rotations,
@@ -186,7 +187,7 @@ class World:
         return self.world_from_target @ there @ inverse(self.tool_from_camera)
 
 
-def draw_world(rng: np.random.Generator, wanted: Mapping[str, Any] | None = None) -> World:
+def draw_world(rng: Random, wanted: Mapping[str, Any] | None = None) -> World:
     """Draw a camera, a robot, a target and a design; `wanted` fixes some of the design."""
     near = draw("near_m", rng)
     far = min(near * draw("farthest_times", rng), RANGES["farthest_m"])
@@ -216,7 +217,7 @@ def draw_world(rng: np.random.Generator, wanted: Mapping[str, Any] | None = None
     )
 
 
-def session_again(rng: np.random.Generator, world: World, **design: object) -> World:
+def session_again(rng: Random, world: World, **design: object) -> World:
     """Another session of the same camera, robot and target; `design` changes entries of its own.
 
     Exposures are those of the first session, unless their design changes.
@@ -239,7 +240,7 @@ def session_again(rng: np.random.Generator, world: World, **design: object) -> W
     )
 
 
-def _draw_sensor(rng: np.random.Generator, near: float, far: float) -> Sensor:
+def _draw_sensor(rng: Random, near: float, far: float) -> Sensor:
     """Draw a camera that is exposed for distances from near to far."""
     frequencies = tuple(1e6 * f for f in draw("frequencies_mhz", rng))
     electrons = _electrons(draw("noise_mm", rng) * 1e-3, frequencies)
@@ -264,7 +265,7 @@ def _draw_sensor(rng: np.random.Generator, near: float, far: float) -> Sensor:
     )
 
 
-def _draw_lens(rng: np.random.Generator) -> Camera:
+def _draw_lens(rng: Random) -> Camera:
     width, height = draw("images", rng)
     focal = width * draw("focal_widths", rng)
     barrel = draw("barrel", rng)
@@ -293,7 +294,7 @@ def _electrons(noise: float, frequencies: tuple[float, ...]) -> float:
 
 
 def _draw_design(
-    rng: np.random.Generator, pixels: int, near: float, far: float, wanted: Mapping[str, Any]
+    rng: Random, pixels: int, near: float, far: float, wanted: Mapping[str, Any]
 ) -> Design:
     """Draw a design; `wanted` fixes what an effect cannot do without."""
     frames = min(draw("frames", rng), max(15, int(RANGES["most_pixels"] / pixels)))
@@ -323,7 +324,7 @@ def _draw_design(
     return Design(**layout, logged=tuple(logged))
 
 
-def _draw_room(rng: np.random.Generator, design: Design) -> Room:
+def _draw_room(rng: Random, design: Design) -> Room:
     """Draw the walls of a design."""
     low, left = float(np.sqrt(design.near * design.far)) * rng.uniform(0.3, 0.6, 2)
     side = float(left * rng.choice([-1.0, 1.0]))
@@ -338,7 +339,7 @@ def _draw_room(rng: np.random.Generator, design: Design) -> Room:
     )
 
 
-def _draw_surface(rng: np.random.Generator, design: Design, room: Room, way: Way) -> Surface:
+def _draw_surface(rng: Random, design: Design, room: Room, way: Way) -> Surface:
     """Draw the target of a design."""
     middle = float(np.sqrt(design.near * design.far))
     half = middle * rng.uniform(0.3, 0.6, 2)
@@ -357,7 +358,7 @@ def _draw_surface(rng: np.random.Generator, design: Design, room: Room, way: Way
     )
 
 
-def _draw_conditions(rng: np.random.Generator, design: Design, way: Way) -> Conditions:
+def _draw_conditions(rng: Random, design: Design, way: Way) -> Conditions:
     """Draw the conditions of a way."""
     t, n = way.seconds, design.frames
     swing = draw("room_k", rng)
@@ -387,7 +388,7 @@ def heat(way: Way, powered: float, constant: float) -> Array:
     return result
 
 
-def _draw_exposure(rng: np.random.Generator, design: Design, way: Way) -> Array:
+def _draw_exposure(rng: Random, design: Design, way: Way) -> Array:
     levels = NOMINAL_US * np.exp(np.linspace(-1, 1, rng.integers(3, 7)) * rng.uniform(0.4, 1.1))
     n = design.frames
     if design.exposure == "constant":
@@ -401,12 +402,12 @@ def _draw_exposure(rng: np.random.Generator, design: Design, way: Way) -> Array:
     return levels[rng.integers(len(levels), size=way.poses)][way.pose_id]
 
 
-def _draw_way(rng: np.random.Generator, design: Design, room: Room) -> Way:
+def _draw_way(rng: Random, design: Design, room: Room) -> Way:
     """Draw a way of a design that stays in a room."""
     return _moving(rng, design) if design.moving else _standing(rng, design, room)
 
 
-def _standing(rng: np.random.Generator, design: Design, room: Room) -> Way:
+def _standing(rng: Random, design: Design, room: Room) -> Way:
     ids: list[int] = []  # of stations; a share of them comes several times in a row
     while len(ids) < design.frames:
         times = design.repeats if rng.uniform() < design.repeated else 1
@@ -425,7 +426,7 @@ def _standing(rng: np.random.Generator, design: Design, room: Room) -> Way:
     return Way(seconds, pose_id, pauses, lambda late: np.broadcast_to(where, (len(late), 4, 4)))
 
 
-def _moving(rng: np.random.Generator, design: Design) -> Way:
+def _moving(rng: Random, design: Design) -> Way:
     """A sum of slow swings in every direction; frames every half second."""
     n = design.frames
     seconds = np.cumsum(np.append(0.0, 0.5 + rng.uniform(-0.05, 0.05, n - 1)))
@@ -443,7 +444,7 @@ def _moving(rng: np.random.Generator, design: Design) -> Way:
     return Way(seconds, np.arange(n), np.zeros(n), camera_at)
 
 
-def _indoors(rng: np.random.Generator, design: Design, room: Room, count: int) -> Array:
+def _indoors(rng: Random, design: Design, room: Room, count: int) -> Array:
     """Places (count, 6) between the walls: those outside get other tilts, at last none at all."""
     places = _draw_places(rng, count, design)
     for attempt in range(TRIES):
@@ -457,7 +458,7 @@ def _indoors(rng: np.random.Generator, design: Design, room: Room, count: int) -
     return places
 
 
-def _draw_places(rng: np.random.Generator, count: int, design: Design) -> Array:
+def _draw_places(rng: Random, count: int, design: Design) -> Array:
     """Distance, tilts, roll and the point looked at (count, 6); distances evenly, out of order."""
     share = rng.permutation((np.arange(count) + rng.uniform(0, 1, count)) / count)
     distance = design.near + (design.far - design.near) * share

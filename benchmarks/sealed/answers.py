@@ -106,11 +106,6 @@ class Said:
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def detected(self) -> bool:
-        """Whether the report says that a gap was detected."""
-        return bool(self.report.get("detected"))
-
-    @property
     def abstains(self) -> float:
         """How strongly it says that no effect of its catalogue explains the gap, from 0 to 2.
 

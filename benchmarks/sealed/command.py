@@ -22,9 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 HELP = {"help_option_names": ["-h", "--help"]}
 SEED = click.option("--seed", type=click.IntRange(0), required=True, help="Draws the cases.")
-OUT = click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="A line a recording, as JSON."
-)
+OUT = click.option("--out", type=click.Path(path_type=Path), required=True, help="JSON lines.")
 
 
 def counts_by_name(text: str, cases: int, known: Collection[str], what: str) -> dict[str, int]:
@@ -55,7 +53,7 @@ class Check:
         about: What it checks.
         what: What a kind of cases is called; with an s the option that lists them.
         kinds: Those that there are, each with an environment variable that it needs, or "".
-        write: Writes cases of a seed and yields the manifest's entries.
+        write: Writes a case of a seed, by kind and number, and yields the manifest's entries.
         scores_of: Scores outcomes: figures, and a text to print.
         cases: Of each kind, unless asked for otherwise.
         config: What `tofcorr diagnose` gets without `--config`.
@@ -67,7 +65,7 @@ class Check:
         about: str,
         what: str,
         kinds: Mapping[str, str],
-        write: Callable[[int, dict[str, int], Path], Iterable[Entry]],
+        write: Callable[[int, str, int, Path], Iterable[Entry]],
         scores_of: Callable[[Sequence[Outcome], Path], tuple[list[Score], str]],
         *,
         cases: int = 40,
@@ -77,7 +75,8 @@ class Check:
         self._what, self._kinds, self._write, self._scores_of = what, kinds, write, scores_of
         self._config = config
         usual = ",".join(name for name, needed in kinds.items() if not needed)
-        path, least, many = click.Path(path_type=Path), click.IntRange(1), "Cases of each kind."
+        path, least = click.Path(path_type=Path), click.IntRange(1)
+        many = _option("--cases", type=least, default=cases, help="Cases of each kind.")
         own = _option(f"--{what}s", "kinds", default=usual, help="X:400 asks for 400 of X.")
         out = _option("--out", type=path, required=True, help="Folder of the whole check.")
         jobs = _option("--jobs", "--workers", "jobs", type=least, default=2)
@@ -85,12 +84,7 @@ class Check:
         limit = _option("--limit", "limit_s", default=300.0, help="Seconds for one recording.")
         given = _option("--config", type=path, help="Handed to `tofcorr diagnose`.")
         self._steps: dict[Callable[..., None], list[click.Parameter]] = {
-            self.generate: [
-                seed,
-                _option("--cases", type=least, default=cases, help=many),
-                own,
-                out,
-            ],
+            self.generate: [seed, many, own, out],
             self.diagnose: [out, jobs, limit, given],
             **({self.remains: [out, jobs]} if with_remains else {}),
             self.score: [out, jobs],
@@ -98,9 +92,8 @@ class Check:
         every = list(dict.fromkeys(itertools.chain(*self._steps.values())))
         self.group = click.Group(help=about, context_settings=HELP)
         for step, taken in (self._steps | {self.all: every}).items():
-            self.group.add_command(
-                click.Command(step.__name__, None, step, taken, help=step.__doc__)
-            )
+            command = click.Command(step.__name__, None, step, taken, help=step.__doc__)
+            self.group.add_command(command)
 
     def generate(self, seed: int, cases: int, kinds: str, out: Path) -> None:
         """Write recordings and, apart, sealed answers."""
@@ -108,10 +101,9 @@ class Check:
         for name in counts:
             if (needed := self._kinds[name]) and needed not in os.environ:
                 raise click.UsageError(f"{name} needs the environment variable {needed}")
-        for _ in tqdm(
-            write_cases(seed, self._write(seed, counts, out), out), "recordings", unit=""
-        ):
-            pass
+        numbered = [(name, index) for name, count in counts.items() for index in range(count)]
+        entries = (one for case in numbered for one in self._write(seed, *case, out))
+        list(tqdm(write_cases(seed, entries, out), "recordings", unit=""))
 
     def diagnose(self, out: Path, jobs: int, limit_s: float, config: Path | None) -> None:
         """Run `tofcorr diagnose` on the recordings alone; go on where it was interrupted."""

@@ -87,13 +87,8 @@ class Problem:
         return solve(*self.fitted()[:2])
 
 
-def ask(
-    data: Data, fields: Mapping[str, Array], expected: Array, count: Array | None = None
-) -> Oracle:
-    """Ask the oracle; `fields` and `expected` (N, H, W) in metres are the sealed truth.
-
-    `count` (N, H, W) is how much each pixel counts in a gap; None: all alike.
-    """
+def ask(data: Data, fields: Mapping[str, Array], expected: Array) -> Oracle:
+    """Ask the oracle; `fields` and `expected` (N, H, W) in metres are the sealed truth."""
     base, valid = linearise(data), data.valid
     problem = base.with_columns(*(field[valid] for field in fields.values()))
     noiseless = problem.target + (expected - data.depth)[valid]
@@ -102,10 +97,9 @@ def ask(
     fit = problem.fitted()
     t = coefficients[plain:] / np.maximum(errors[plain:], 1e-12)
     evidence = np.where(_left(fit, plain) > ABSORBED, t / 2, 0.0)
-    weight = np.ones_like(noiseless) if count is None else count[valid]
-    score = problem.moments(noiseless, weight)
+    score = problem.moments(noiseless, np.ones_like(noiseless))
     before, after = (
-        1e3 * float(np.sqrt(held_out(fit, score, keep).sum() / weight.sum()))
+        1e3 * float(np.sqrt(held_out(fit, score, keep).sum() / len(noiseless)))
         for keep in (slice(plain), slice(None))
     )
     return Oracle(before, after, dict(zip(fields, evidence.tolist(), strict=True)))
@@ -129,10 +123,10 @@ def _left(fit: Moments, plain: int) -> Array:
     return np.array(shares)
 
 
-def linearise(data: Data, steps: int = 4) -> Problem:
+def linearise(data: Data) -> Problem:
     """Fit hand-eye and base errors; return the problem at the solution."""
     problem = _problem(data, data.tool_from_camera)
-    for _ in range(steps if data.moves else 0):
+    for _ in range(4 if data.moves else 0):
         problem = _stepped(data, problem, _step(problem))
     return problem
 

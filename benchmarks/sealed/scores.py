@@ -77,15 +77,9 @@ def share(outcomes: Iterable[bool | None]) -> Share:
     return Share(sum(judged), len(judged))
 
 
-def share_score(
-    tier: str,
-    what: str,
-    cases: Iterable[Case],
-    judge: Callable[[Case], bool | None],
-    target: Limits = ANY,
-) -> Score:
+def share_score(tier: str, what: str, judged: Iterable[bool | None], target: Limits = ANY) -> Score:
     """The share of the cases judged true among those that can be judged."""
-    counted = share(map(judge, cases))
+    counted = share(judged)
     return Score(tier, what, counted.value, counted.interval, counted.total, target)
 
 
@@ -170,9 +164,8 @@ def covers(one: Outcome, name: str) -> bool:
 
 def wrong(one: Outcome) -> bool:
     """Whether a set of one effect names one that is not there."""
-    return any(
-        len(members) == 1 and not members & one.truths for members in map(known, one.said.sets)
-    )
+    sets = map(known, one.said.sets)
+    return any(len(members) == 1 and not members & one.truths for members in sets)
 
 
 def named(one: Outcome) -> bool:
@@ -197,7 +190,7 @@ def silent(one: Outcome) -> bool:
 
 def detected(one: Outcome) -> bool:
     """Whether the report says that a gap was detected."""
-    return one.said.detected
+    return bool(one.said.report.get("detected"))
 
 
 NEW_NAME = "named though neither added nor seen before"
@@ -217,11 +210,10 @@ def figures(
     nulls = [one for one in cases if not one.truths]
     effects = [(one, name) for one in find for name in sorted(one.must_find)]
     held = [covers(one, name) for one, name in effects]
+    either = [a or unknown(one) for a, (one, _) in zip(held, effects, strict=True)]
     judged: dict[str, Iterable[bool]] = {
         "in the set": held,
-        "in the set or unknown": [
-            a or unknown(one) for a, (one, _) in zip(held, effects, strict=True)
-        ],
+        "in the set or unknown": either,
         "named first": map(named_first, find),
         "something named": map(named, find),
         "called unknown": map(unknown, find),
@@ -233,9 +225,7 @@ def figures(
     }
     wanted = targets or {}
     sizes = [float(len(one.said.sets[0])) for one in find if one.said.sets]
-    scores = [
-        share_score(title, what, some, bool, wanted.get(what, ANY)) for what, some in judged.items()
-    ]
+    scores = [share_score(title, k, some, wanted.get(k, ANY)) for k, some in judged.items()]
     size = "size of the set"
     return [*scores, mean_score(title, size, sizes, wanted.get(size, ANY))]
 

@@ -1,10 +1,10 @@
 """`python -m benchmarks.withheld`: the regression set, and pairs of a camera and a simulator."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.sealed.answers import Entry, Outcome
+from benchmarks.sealed.answers import Outcome
 from benchmarks.sealed.command import Check
 from benchmarks.sealed.scores import (
     Limits,
@@ -32,13 +32,6 @@ REMEDIES = {  # words of an advice that names what a confounded design lacks
 }
 
 
-def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
-    """Write cases."""
-    for tier, count in counts.items():
-        for index in range(count):
-            yield from write_case(seed, tier, index, out)
-
-
 TARGETS: dict[str, dict[str, Limits]] = {
     "A": {
         "named first": at_least(0.85),
@@ -61,18 +54,15 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
         scores += figures(tier, cases, TARGETS.get(tier))
     scores += _closed(main["A"], again)
     limits = bootstrap(main["B"], macro_f1)
-    scores.append(
-        Score("B", "macro-F1", macro_f1(main["B"]), limits, len(main["B"]), at_least(0.75))
-    )
+    scores += [Score("B", "macro-F1", macro_f1(main["B"]), limits, len(main["B"]), at_least(0.75))]
     abstains = {k: [one.said.abstains for one in main[k] if one.must_find] for k in "ADE"}
     for tier, target in (("D", at_least(0.95)), ("E", at_least(0.85))):
         what = "AUROC of abstention against tier A"
         scores.append(area_score(tier, what, abstains[tier], abstains["A"], target))
     scores += _confounded(main["F"], again)
     blind = [one for one in main["G"] if not one.case["judged"]]
-    scores.append(
-        share_score("G", "says that the effect cannot be judged", blind, _says_unavailable)
-    )
+    unavailable = map(_says_unavailable, blind)
+    scores.append(share_score("G", "says that the effect cannot be judged", unavailable))
     for what, tier, of in (
         ("frames", "H", lambda one: one.case["design"]["frames"]),
         ("noise", "I", lambda one: one.case["noise"]),
@@ -82,7 +72,7 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
             some = [one for one in main[tier] if of(one) == value]
             scores += figures(f"{tier}, {what} {value}", some)
     failed = [bool(one.said.failure) for one in outcomes]
-    scores.append(share_score("all", "runs that failed", failed, bool))
+    scores.append(share_score("all", "runs that failed", failed))
     text = [scores_table(scores), *([audit_table(main["L"])] if main["L"] else [])]
     return [one for one in scores if one.count], "\n\n".join(text)
 
@@ -91,12 +81,12 @@ def _closed(cases: Sequence[Outcome], fresh: Mapping[str, Outcome]) -> list[Scor
     """Of tier A: what share of the gap is said to be closed."""
     said = [one for one in cases if one.must_find and named(one)]
     closed = [_share(one) / one.oracle.closed_fraction for one in said]
-    both = [(one, fresh[one.name]) for one in said if one.name in fresh]
+    held = [_holds(one, fresh[one.name]) for one in said if one.name in fresh]
     seen_again = "closed_ci holds what a fresh session shows"
     return [
         quantile_score("A", "shrinkage against the oracle, median", closed, 0.5, at_least(0.9)),
         quantile_score("A", "the same, 10th percentile", closed, 0.1, at_least(0.6)),
-        share_score("A", seen_again, both, lambda pair: _holds(*pair), at_least(0.9)),
+        share_score("A", seen_again, held, at_least(0.9)),
     ]
 
 
@@ -117,8 +107,8 @@ def _confounded(cases: Sequence[Outcome], cured: Mapping[str, Outcome]) -> list[
     open_ = [one for one in cases if one.must_find and [*map(len, one.said.sets)][:1] > [1]]
     resolved = [one.name in cured and cured[one.name].said.sets == (one.truths,) for one in open_]
     return [
-        share_score("F", "sets that a sound session resolves", resolved, bool),
-        share_score("F", "advice that names the remedy", open_, _advises),
+        share_score("F", "sets that a sound session resolves", resolved),
+        share_score("F", "advice that names the remedy", map(_advises, open_)),
     ]
 
 
@@ -168,7 +158,7 @@ main = Check(
     "Check `tofcorr diagnose` on recordings whose effect is withheld from it.",
     "tier",
     dict.fromkeys(TIERS, "") | {"L": "DRJIT_LIBLLVM_PATH"},
-    generate,
+    write_case,
     score_all,
     cases=40,
 ).group

@@ -9,7 +9,7 @@ constant is, so that the mean of every part counts as distance.
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.renewed import ranges
 from benchmarks.renewed.cases import agree, in_world, make_case, seeded, turn
-from benchmarks.renewed.geometry import Array, inverse
+from benchmarks.renewed.geometry import Array, Random, inverse
 from benchmarks.renewed.recording import (
     Data,
     Recorded,
@@ -94,19 +94,19 @@ class Pair:
         return not self.terms and not self.shared
 
 
-def _two(index: int, rng: np.random.Generator) -> tuple[Form, Form]:
+def _two(index: int, rng: Random) -> tuple[Form, Form]:
     while True:
         one, other = turn(0, FORMS, index), FORMS[rng.integers(len(FORMS))]
         if agree((one, other)):
             return one, other
 
 
-def _shared(index: int, rng: np.random.Generator) -> Pair:
+def _shared(index: int, rng: Random) -> Pair:
     one, other = _two(index, rng)
     return Pair((one,), (other,), terms=TERMS, noise=1.0)
 
 
-def _noise(index: int, rng: np.random.Generator) -> Pair:
+def _noise(index: int, rng: Random) -> Pair:
     lost, exact = DROPOUT_SHARES.draw(rng), index % 4 == 0
     gain = 1.0 if exact else float(rng.uniform(0.8, 1.25))
     dropouts = (lost, lost if exact else 0.0)
@@ -118,7 +118,7 @@ def _one(index: int, kind: int) -> tuple[Form, ...]:
     return (turn(kind, FORMS, index),)
 
 
-KINDS: dict[str, Callable[[int, np.random.Generator], Pair]] = {
+KINDS: dict[str, Callable[[int, Random], Pair]] = {
     "ideal": lambda index, rng: Pair(_one(index, 1), sizes=FIXED_MM),
     "terms": lambda index, rng: Pair(
         _one(index, 2), terms=("distance", "pixel"), noise=NOISE_FACTORS[index % 4]
@@ -140,14 +140,8 @@ KINDS: dict[str, Callable[[int, np.random.Generator], Pair]] = {
 }
 
 
-def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
-    """Write pairs; entries name the simulator's recording, and ideal frames to be degraded."""
-    for kind, count in counts.items():
-        yield from (write_pair(seed, kind, index, out) for index in range(count))
-
-
 def write_pair(seed: int, kind: str, index: int, out: Path) -> Entry:
-    """Write one pair; return the manifest's entry."""
+    """Write one pair; return its entry: of the simulator's recording too, and of ideal frames."""
     rng = np.random.default_rng([seed, 1000 + list(KINDS).index(kind), index])
     pair = KINDS[kind](index, rng)
     with ranges.drawn_from(**ranges.PLAIN):
@@ -207,7 +201,7 @@ def _at_tool(world: World, slip: Array) -> World:
 
 
 def _simulated(
-    rng: np.random.Generator, world: World, shared: Sequence[Hook], pair: Pair, slip: Array
+    rng: Random, world: World, shared: Sequence[Hook], pair: Pair, slip: Array
 ) -> Recorded:
     """The simulator's recording."""
     there = session_again(rng, world) if pair.other_poses else _at_tool(world, slip)
@@ -218,7 +212,7 @@ def _simulated(
     return replace(recorded, depth=depth)
 
 
-def _dropped(rng: np.random.Generator, one: Recorded, chance: float) -> tuple[Recorded, float]:
+def _dropped(rng: Random, one: Recorded, chance: float) -> tuple[Recorded, float]:
     """The recording without some pixels, dark ones first, and the share that is missing of all."""
     dark = (1 + (one.amplitude / np.median(one.amplitude[one.mask])) ** 2) ** -1
     lost = np.where(one.mask, np.minimum(chance * dark / dark[one.mask].mean(), 1.0), 0.0)
@@ -227,9 +221,7 @@ def _dropped(rng: np.random.Generator, one: Recorded, chance: float) -> tuple[Re
     return replace(one, depth=depth), missing
 
 
-def _truth(
-    world: World, hooks: Sequence[Hook], simulator: World, shared: Sequence[Hook]
-) -> dict[str, Any]:
+def _truth(world: World, hooks: Sequence[Hook], simulator: World, shared: Sequence[Hook]) -> Entry:
     """The gap as given, mm, and the share of each cause; both worlds stand at the true poses."""
     terms, effects, used = [], [], np.ones(1, dtype=bool)
     for one, own in ((world, hooks), (simulator, in_world(simulator, shared))):
@@ -252,7 +244,7 @@ def _truth(
 
 
 def _held_out(
-    rng: np.random.Generator, world: World, hooks: Sequence[Hook]
+    rng: Random, world: World, hooks: Sequence[Hook]
 ) -> tuple[Recorded, dict[str, Array]]:
     """Ideal frames of another session, and what the camera would measure there, metres."""
     session = session_again(rng, world, **STATIONS)
@@ -263,14 +255,12 @@ def _held_out(
     depth = view.distance * depth_over_range(session)
     ideal = Recorded(exact, exact.world_from_tool(), depth, view.amplitude * counts, view.on_target)
     both = view.on_target & real.view.on_target
-    arrays = {
-        "held_out": np.where(both, real.depth, np.nan),
-        "held_out_sigma": noise_of(session, own),
-    }
-    fields = {
-        f"held_out_field_{x.form.effect}": field_of(measure(session, [x]), clean) for x in own
-    }
-    return ideal, arrays | fields
+    arrays = {"held_out": np.where(both, real.depth, np.nan)}
+    arrays["held_out_sigma"] = noise_of(session, own)
+    for hook in own:
+        field = field_of(measure(session, [hook]), clean)
+        arrays[f"held_out_field_{hook.form.effect}"] = field
+    return ideal, arrays
 
 
 def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> dict[str, float] | None:
@@ -359,6 +349,7 @@ def oracle_error(real: Data, ideal: Data, fields: list[tuple[Array, Array]]) -> 
     return error
 
 
+Figures = Mapping[str, float]
 Held = dict[str, bool | None]
 """What is held against the truth, by figure; None was not measured."""
 
@@ -374,7 +365,7 @@ TARGETS = {
 }
 
 
-def judge(one: Outcome, found: Mapping[str, float] | None = None) -> Held:
+def judge(one: Outcome, found: Figures | None = None) -> Held:
     """Hold what was said of one pair, and degraded frames, against the truth.
 
     A failed run is wrong in size, shares and cause.
@@ -394,26 +385,26 @@ def judge(one: Outcome, found: Mapping[str, float] | None = None) -> Held:
         }
     # The first number of the verdict is what people read.
     first, shared = re.search(r"(\d+\.\d+) mm", report.get("verdict") or ""), {*one.case["shared"]}
-    in_set = any(members & one.truths for members in sets)
+    in_set, read_first = any(members & one.truths for members in sets), first and float(first[1])
+    sizes: Held = {
+        "gap as given within 5 %": _near(given, truth["as_given_mm"]),
+        "first number of the verdict within 5 %": _near(read_first, truth["as_given_mm"]),
+        "every share within 0.05": _shares_right(one, sets),
+    }
     return {
         "runs that failed": failed,
-        "gap as given within 5 %": _near(given, truth["as_given_mm"], failed),
-        "first number of the verdict within 5 %": _near(
-            first and float(first[1]), truth["as_given_mm"], failed
-        ),
-        "every share within 0.05": _shares_right(one, sets),
+        **(dict.fromkeys(sizes, False) if failed else sizes),
         "effect in its set": in_set,
         "effect in its set, of those findable": in_set if one.must_find else None,
         "something else named": None if failed else bool(false),
         "an effect named that both have": bool(shared & false) if shared and not failed else None,
-        **_degraded_right(one, stages.get("with_effects", {}), found),
+        **_images_right(one, stages.get("with_effects", {}), found),
     }
 
 
-def _near(said: float | None, true: float | None, failed: bool = False) -> bool | None:
-    if failed or said is None or true is None or math.isnan(said):
-        return False if failed else None
-    return abs(said / true - 1) <= WITHIN
+def _near(said: float | None, true: float | None) -> bool | None:
+    known = said is not None and true is not None and not math.isnan(said)
+    return abs(said / true - 1) <= WITHIN if known else None  # type: ignore[operator]
 
 
 def _blocks_right(report: Mapping[str, Any], truth: Mapping[str, Any]) -> Held:
@@ -441,8 +432,8 @@ def _meant(one: Outcome, cause: str, sets: Sequence[frozenset[str]]) -> str:
 
 def _shares_right(one: Outcome, sets: Sequence[frozenset[str]]) -> bool | None:
     """Whether every share that is there or was said is right."""
-    if one.said.failure or not one.said.report.get("attribution"):
-        return False if one.said.failure else None
+    if not one.said.report.get("attribution"):
+        return None
     errors = {name: -share for name, share in one.answer["truth"]["shares"].items()}
     for row in one.said.report["attribution"]:
         name = _meant(one, row["cause"], sets)
@@ -460,9 +451,7 @@ def shares_covered(one: Outcome) -> list[bool]:
     ]
 
 
-def _degraded_right(
-    one: Outcome, stage: Mapping[str, Any], found: Mapping[str, float] | None
-) -> Held:
+def _images_right(one: Outcome, stage: Mapping[str, Any], found: Figures | None) -> Held:
     """Whether degraded frames are as near, as noisy and as full as they should be.
 
     *Not significantly more*: squares are compared, for these have normal errors (one-sided, 5 %);
@@ -501,9 +490,9 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]
         held = [judge(one, read_degraded(out, one.name, one.answer)) for one in cases]
         for what in dict.fromkeys(what for row in held for what in row):
             judged = [row.get(what) for row in held]
-            scores.append(share_score(kind, what, judged, lambda one: one, TARGETS.get(what, ANY)))
+            scores.append(share_score(kind, what, judged, TARGETS.get(what, ANY)))
         covered = [found for one in cases for found in shares_covered(one)]
-        scores.append(share_score(kind, "single shares in their intervals", covered, bool))
+        scores.append(share_score(kind, "single shares in their intervals", covered))
     scores = [one for one in scores if one.count]
     return scores, scores_table(scores)
 
@@ -512,7 +501,7 @@ pairs = Check(
     "Check `tofcorr diagnose --sim RECORDING` on pairs of a camera and a simulator.",
     "kind",
     dict.fromkeys(KINDS, ""),
-    generate,
+    lambda *case: [write_pair(*case)],
     score_all,
     cases=40,
 ).group

@@ -11,7 +11,7 @@ from benchmarks.renewed import ranges
 from benchmarks.renewed.cases import Case, agree, in_world, make_case, seeded, turn, write_sealed
 from benchmarks.renewed.forms import EFFECTS, FORM, INSIDE, OUTSIDE
 from benchmarks.renewed.forms.further import inverse_amplitude, knee, trefoil
-from benchmarks.renewed.geometry import inverse, small_motions
+from benchmarks.renewed.geometry import Random, inverse, small_motions
 from benchmarks.renewed.ranges import Range
 from benchmarks.renewed.recording import Recorded, depth_over_range, record
 from benchmarks.renewed.signal_chain import Form
@@ -56,7 +56,7 @@ class Draw:
     without: tuple[str, ...] = ()
     judged: bool = True
     exclude: tuple[str, ...] = ()
-    fault: Callable[[np.random.Generator, Recorded], Recorded] | None = None
+    fault: Callable[[Random, Recorded], Recorded] | None = None
     partner: Mapping[str, Any] | None = None
     role: str = ""
     about: Mapping[str, Any] = field(default_factory=dict)
@@ -92,39 +92,37 @@ def _one(index: int, names: Sequence[str] = EFFECTS) -> tuple[Form, ...]:
     return (turn(0, effects, index),)
 
 
-def _several(index: int, rng: np.random.Generator) -> Draw:
+def _several(index: int, rng: Random) -> Draw:
     while True:
         forms = tuple(FORMS[i] for i in rng.choice(len(FORMS), 2 + index % 2, replace=False))
         if agree(forms):
             return Draw(forms, Range(2.0, 12.0, log=True))
 
 
-def _left_out(index: int, rng: np.random.Generator) -> Draw:
+def _left_out(index: int, rng: Random) -> Draw:
     name = _one(index)[0].effect
     return Draw(_one(index), LARGE, exclude=(name, *HOLDERS.get(name, ())))
 
 
-def _confounded(index: int, rng: np.random.Generator) -> Draw:
+def _confounded(index: int, rng: Random) -> Draw:
     design, names = CONFOUNDED[index % len(CONFOUNDED)]
     name = names[index // len(CONFOUNDED) % len(names)]
-    cure = {key: SOUND[key] for key in design}
-    return Draw(
-        (FORM[name],), LARGE, design, partner=cure, role="cured", about={"lacks": [*design]}
-    )
+    cure, about = {key: SOUND[key] for key in design}, {"lacks": [*design]}
+    return Draw((FORM[name],), LARGE, design, partner=cure, role="cured", about=about)
 
 
-def _missing(index: int, rng: np.random.Generator) -> Draw:
+def _missing(index: int, rng: Random) -> Draw:
     name, without, judged = MISSING[index % len(MISSING)]
     return Draw((FORM[name],), LARGE, without=without, judged=judged)
 
 
-def _noise(index: int, rng: np.random.Generator) -> Draw:
+def _noise(index: int, rng: Random) -> Draw:
     kind, changed = list(NOISES.items())[index // 2 % len(NOISES)]
     forms = _one(index // 2) if index % 2 else ()
     return Draw(forms, ranges=changed, about={"noise": kind})
 
 
-def _base(index: int, rng: np.random.Generator) -> Draw:
+def _base(index: int, rng: Random) -> Draw:
     own = (knee, trefoil, inverse_amplitude)[index // 2 % 3]
     others = [name for name in EFFECTS if name != own.effect]
     forms = (own, *_one(index // 2, others)) if index % 2 else (own,)
@@ -137,14 +135,14 @@ BOARD = (1e-3, 2e-3)  # metres and radians, each axis: errors of a board's pose
 OFF_SHARE, OFF_BY = 0.03, 0.7  # of the pixels; metres
 
 
-def far_pixels(rng: np.random.Generator, recorded: Recorded) -> Recorded:
+def far_pixels(rng: Random, recorded: Recorded) -> Recorded:
     """Single pixels are far off, and the mask has them."""
     off = rng.uniform(size=recorded.depth.shape) < OFF_SHARE
     depth = recorded.depth + off * OFF_BY * depth_over_range(recorded.world)
     return replace(recorded, depth=depth)
 
 
-def board_planes(rng: np.random.Generator, recorded: Recorded) -> Recorded:
+def board_planes(rng: Random, recorded: Recorded) -> Recorded:
     """No robot: each pose's plane comes from the picture of a board, with its errors."""
     world = recorded.world
     draws = (size * rng.standard_normal((world.way.poses, 3)) for size in BOARD)
@@ -182,10 +180,7 @@ AUDIT: dict[str, tuple[str, dict[str, Any]]] = {
         "two_exponentials line_with_pauses",
         {"ranges": {"frames": {200: 1.0}}},
     ),
-    "0.5 to 6 m": (
-        "odd_harmonics duty_cycle",
-        {"ranges": {"farthest_times": Range(12.0, 12.0)}},
-    ),
+    "0.5 to 6 m": ("odd_harmonics duty_cycle", {"ranges": {"farthest_times": Range(12.0, 12.0)}}),
     "two effects": (
         "odd_harmonics+logarithm halves_and_pairs+two_exponentials clear_layer+driver_droop",
         {},
@@ -202,7 +197,7 @@ AUDIT: dict[str, tuple[str, dict[str, Any]]] = {
 """Forms of each draw in turn, those of one draw joined by +; and what else differs."""
 
 
-def _audit(index: int, rng: np.random.Generator) -> Draw:
+def _audit(index: int, rng: Random) -> Draw:
     row, (names, changes) = list(AUDIT.items())[index % len(AUDIT)]
     turns = names.split() or [""]
     joined = turns[index // len(AUDIT) % len(turns)]
@@ -211,7 +206,7 @@ def _audit(index: int, rng: np.random.Generator) -> Draw:
     return replace(draw, about={"row": row, "says": "", **draw.about})
 
 
-TIERS: dict[str, Callable[[int, np.random.Generator], Draw]] = {
+TIERS: dict[str, Callable[[int, Random], Draw]] = {
     "A": lambda index, rng: Draw(
         _one(index), partner={"frames": 120} if index % 2 else None, role="fresh"
     ),

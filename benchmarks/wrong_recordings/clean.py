@@ -101,7 +101,6 @@ def _recordings(draws: int, shipped: int, seed: int, folder: Path) -> Iterator[t
         yield "Kinect v2", import_kinect(Path(real), folder / "real")
         for trial in sorted((Path(real) / "wall_trials_l3cx").glob("L3CX_*")):
             out = folder / trial.name
-            distances.main(
-                [str(trial), "--depth-unit-mm", "1", "--out", str(out)], standalone_mode=False
-            )
+            words = [str(trial), "--depth-unit-mm", "1", "--out", str(out)]
+            distances.main(words, standalone_mode=False)
             yield trial.name, out

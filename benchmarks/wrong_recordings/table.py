@@ -27,6 +27,16 @@ def of_depth(change: Callable[[np.ndarray], np.ndarray]) -> Fault:
     return to(depth=lambda parts, _: change(parts.depth))
 
 
+def of_pixels(share: float, change: Callable[[np.ndarray, Draw], np.ndarray]) -> Fault:
+    """The depth of a share of the pixels changed."""
+
+    def depth(parts: Parts, generator: Draw) -> np.ndarray:
+        chosen = generator.uniform(size=parts.depth.shape) < share
+        return np.where(chosen, change(parts.depth, generator), parts.depth)
+
+    return to(depth=depth)
+
+
 def of_images(change: Callable[[np.ndarray], np.ndarray]) -> Fault:
     """Depth and amplitude images changed alike."""
     return to(
@@ -99,6 +109,11 @@ def of_matrix(change: Callable[[np.ndarray, Draw], np.ndarray]) -> Fault:
 def either(factor: float, generator: Draw) -> float:
     """A factor, or one over it."""
     return factor if generator.uniform() < 0.5 else 1 / factor
+
+
+def of_focal(*wrong: int) -> Fault:
+    """Horizontal or vertical focal length, or both, off by a tenth."""
+    return of_matrix(lambda k, g: np.where(np.diag([*wrong, 0]), either(1.1, g), 1.0) * k)
 
 
 def tangential_last(camera: CameraIntrinsics, generator: Draw) -> tuple[float, ...]:
@@ -186,9 +201,8 @@ def swapped_walls(parts: Parts, generator: Draw) -> Parts:
     order = generator.permutation(len(parts.normal))
     chosen = np.isin(np.arange(len(order)), order[: max(len(order) // 10, 1)])
     turned = parts.normal @ drawn_rotation(60, generator).T
-    return parts.changed(
-        normal=where(chosen, turned, parts.normal), offset=parts.offset + 0.3 * chosen
-    )
+    normal = where(chosen, turned, parts.normal)
+    return parts.changed(normal=normal, offset=parts.offset + 0.3 * chosen)
 
 
 def another_target(parts: Parts, generator: Draw) -> Parts:
@@ -223,9 +237,8 @@ def mirrored(axis: int | None) -> Fault:
     def fault(parts: Parts, generator: Draw) -> Parts:
         sign = np.ones(3)
         sign[int(generator.integers(3)) if axis is None else axis] = -1
-        return parts.changed(
-            rotation=parts.rotation * sign[:, None] * sign, place=parts.place * sign
-        )
+        rotation = parts.rotation * sign[:, None] * sign
+        return parts.changed(rotation=rotation, place=parts.place * sign)
 
     return fault
 
@@ -296,23 +309,15 @@ TABLE: dict[str, Fault] = {
         depth=lambda p, g: p.depth * ray_directions(p.header["camera"]).numpy()[..., 2]
     ),
     "normals flipped": to(normal=lambda p, g: -p.normal, offset=lambda p, g: -p.offset),
-    "3 % of the pixels 0.7 m off": to(
-        depth=lambda p, g: p.depth + 0.7 * (g.uniform(size=p.depth.shape) < 0.03)
-    ),
-    "30 % garbage pixels": to(
-        depth=lambda p, g: np.where(
-            g.uniform(size=p.depth.shape) < 0.3, g.uniform(0.2, 4.0, p.depth.shape), p.depth
-        )
-    ),
+    "3 % of the pixels 0.7 m off": of_pixels(0.03, lambda depth, g: depth + 0.7),
+    "30 % garbage pixels": of_pixels(0.3, lambda depth, g: g.uniform(0.2, 4.0, depth.shape)),
     "quaternions as wxyz": of_rotation(lambda r: Rotation.from_quat(r.as_quat()[:, [3, 0, 1, 2]])),
     "poses inverted": to(poses=lambda p, g: np.linalg.inv(p.poses)),
     "left-handed world": mirrored(None),
     "rows shifted by one": lambda p, g: p.frames(slice(0, -1)).changed(poses=p.poses[1:]),
     "mask inverted": inverted_mask,
     "two cameras mixed": some(since(1 / 2), another_camera),
-    "focal length 10 % off": of_matrix(
-        lambda k, g: np.where(np.diag([1, 1, 0]), either(1.1, g), 1.0) * k
-    ),
+    "focal length 10 % off": of_focal(1, 1),
     "one pose 100 mm off": to(place=one_pose_off),
     "five frames": only(lambda count, g: np.sort(g.permutation(count)[:5])),
     "depth stuck at 1 m": of_depth(np.ones_like),
@@ -375,9 +380,7 @@ UNLISTED: dict[str, Fault] = {
     "distortion left out": of_camera(distortion=lambda camera, g: ()),
     "distortion of rectified images": of_camera(distortion=of_strong_lens),
     "principal point exchanged": of_matrix(lambda k, g: np.c_[k[:, :2], k[[1, 0, 2], 2]]),
-    "one focal length 10 % off": of_matrix(
-        lambda k, g: np.where(np.diag([1, 0, 0]), either(1.1, g), 1.0) * k
-    ),
+    "one focal length 10 % off": of_focal(1, 0),
     "counts of 16 bits that wrap": of_depth(wrapped_counts),
     "every second frame of another exposure": some(
         lambda count, _: np.arange(count) % 2 == 0, other_exposure
@@ -395,11 +398,7 @@ UNLISTED: dict[str, Fault] = {
         lambda count, g: g.uniform(size=count) < 0.5, other_tool(0.02, 2)
     ),
     "a robot 4 % too long": to(place=lambda p, g: either(1.04, g) * p.place),
-    "holes filled from the frame before": to(
-        depth=lambda p, g: np.where(
-            g.uniform(size=p.depth.shape) < 0.1, np.roll(p.depth, 1, axis=0), p.depth
-        )
-    ),
+    "holes filled from the frame before": of_pixels(0.1, lambda depth, g: np.roll(depth, 1, 0)),
     "a wall 60 mm behind": another_target,
     # The wall stands a metre from the origin of the world, and d has the sign of n . x = d.
     "planes as n . x = d": to(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, Random
 from benchmarks.renewed.signal_chain import Change, View, adding, demodulate, form
 from benchmarks.renewed.world import World
 
@@ -10,7 +10,7 @@ TAPS = np.arange(4)[:, None, None, None] * np.pi / 2
 
 
 @form("wiggling", "taps", 0.03, textbook=True)
-def odd_harmonics(rng: np.random.Generator, world: World) -> Change:
+def odd_harmonics(rng: Random, world: World) -> Change:
     """The correlation has third and fifth harmonics, of any phase."""
     third, fifth, share = *rng.uniform(0, 2 * np.pi, 2), rng.uniform(0.1, 0.4)
 
@@ -23,7 +23,7 @@ def odd_harmonics(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("wiggling", "taps", 0.5)
-def duty_cycle(rng: np.random.Generator, world: World) -> Change:
+def duty_cycle(rng: Random, world: World) -> Change:
     """A rectangular source, on for another share than half, against rectangular gates."""
     duty, odd = rng.uniform(0.38, 0.62), np.array([3, 5, 7, 9])
     size = np.sin(np.pi * odd * duty) * np.sin(np.pi * odd / 2) / odd**2 / np.sin(np.pi * duty)
@@ -39,7 +39,7 @@ def duty_cycle(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("wiggling", "path", 0.005)
-def phase_table(rng: np.random.Generator, world: World) -> Change:
+def phase_table(rng: Random, world: World) -> Change:
     """A bench table of the phase: unlike gains of the taps, and the bench's own irregularities."""
     knots = np.arange(16) * 2 * np.pi / 16
     table = np.cos(2 * knots + rng.uniform(0, 6)) + 0.6 * rng.standard_normal(16)
@@ -52,13 +52,13 @@ def phase_table(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("saturation", "taps", 0.5, textbook=True, exposure="random")
-def clipped(rng: np.random.Generator, world: World) -> Change:
+def clipped(rng: Random, world: World) -> Change:
     """Samples stop at a full well."""
     return lambda strength, view, taps: np.minimum(taps, taps.max() / (1 + strength))
 
 
 @form("saturation", "taps", 0.7, exposure="random")
-def soft_knee(rng: np.random.Generator, world: World) -> Change:
+def soft_knee(rng: Random, world: World) -> Change:
     """The well fills ever more slowly."""
     power = rng.uniform(2.0, 5.0)
 
@@ -70,7 +70,7 @@ def soft_knee(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("saturation", "taps", 0.5, exposure="random")
-def blooming(rng: np.random.Generator, world: World) -> Change:
+def blooming(rng: Random, world: World) -> Change:
     """Charge beyond a full well runs into the pixels above and below, into the same sample."""
     lost, length = rng.uniform(0.2, 0.5), rng.uniform(1.0, 4.0)
 
@@ -88,14 +88,14 @@ def blooming(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("amplitude", "path", 0.005, textbook=True)
-def dark_power_law(rng: np.random.Generator, world: World) -> Change:
+def dark_power_law(rng: Random, world: World) -> Change:
     """Dark pixels drift, by a power of the amplitude."""
     power, sign = rng.uniform(0.3, 0.8), rng.choice([-1.0, 1.0])
     return adding(lambda view: sign * (_shine(view) / 0.1) ** -power)
 
 
 @form("amplitude", "path", 0.008)
-def gain_switch(rng: np.random.Generator, world: World) -> Change:
+def gain_switch(rng: Random, world: World) -> Change:
     """The converter switches its gain at an amplitude; the two ranges differ by an offset."""
     at, soft, sign = rng.uniform(0.08, 0.35), rng.uniform(0.02, 0.08), rng.choice([-1.0, 1.0])
     return lambda strength, view, path: (
@@ -104,7 +104,7 @@ def gain_switch(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("amplitude", "path", 0.005)
-def amplitude_table(rng: np.random.Generator, world: World) -> Change:
+def amplitude_table(rng: Random, world: World) -> Change:
     """A bench table over the logarithm of the amplitude, up and down."""
     knots, table = np.linspace(-5.5, 0.5, 9), rng.standard_normal(9)
     return adding(lambda view: np.interp(np.log(_shine(view)), knots, table))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.renewed.forms.light import rendered
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, small_motions
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, Random, small_motions
 from benchmarks.renewed.signal_chain import Change, View, adding, form
 from benchmarks.renewed.world import World
 
@@ -13,7 +13,7 @@ CAMERA_WEIGHT = np.array([0.0, 0.0, -1.0])  # direction in the world
 
 
 @form("multipath", "light", 0.1)
-def above_floor(rng: np.random.Generator, world: World) -> Change:
+def above_floor(rng: Random, world: World) -> Change:
     """Light by way of a floor, mirrored there; its weight falls with the height above the floor."""
     middle = float(np.sqrt(world.design.near * world.design.far))
     floor, fall = -middle * rng.uniform(0.3, 0.8), middle * rng.uniform(0.15, 0.5)
@@ -30,13 +30,13 @@ def above_floor(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("multipath", "light", scaled=False, scene="closed", moving=False)
-def bright_room(rng: np.random.Generator, world: World) -> Change:
+def bright_room(rng: Random, world: World) -> Change:
     """All bounces in a closed room whose walls are as bright as the target."""
     return rendered(world, replace(world.surface.room, albedo=rng.uniform(0.6, 0.85)))
 
 
 @form("wiggling", "path", 0.01)
-def wiggle_of_dark(rng: np.random.Generator, world: World) -> Change:
+def wiggle_of_dark(rng: Random, world: World) -> Change:
     """Wiggling that fades as pixels get brighter: distance times amplitude."""
     start, fade = rng.uniform(0, 2 * np.pi), rng.uniform(0.15, 0.5)
     turn = 16 * np.pi * world.sensor.frequencies[-1] / SPEED_OF_LIGHT
@@ -49,7 +49,7 @@ def wiggle_of_dark(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("robot_kinematics", "poses", 0.01)
-def sagging_bracket(rng: np.random.Generator, world: World) -> Change:
+def sagging_bracket(rng: Random, world: World) -> Change:
     """The camera's bracket bends under its weight: its sag turns with the roll of the tool."""
     stiff = rng.uniform(0.5, 1.5, 2)
 
@@ -63,14 +63,14 @@ def sagging_bracket(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("distance", "path", 0.005)
-def knee(rng: np.random.Generator, world: World) -> Change:
+def knee(rng: Random, world: World) -> Change:
     """The error has a knee in distance."""
     at = rng.uniform(0.3, 0.7) * (world.design.near + world.design.far)
     return adding(lambda view: np.abs(view.distance - at))
 
 
 @form("pixel", "path", 0.005)
-def trefoil(rng: np.random.Generator, world: World) -> Change:
+def trefoil(rng: Random, world: World) -> Change:
     """The error over the image is a trefoil."""
     column, row = world.pixel_position
     wave = np.hypot(column, row) ** 3 * np.cos(3 * np.arctan2(row, column) + rng.uniform(0, 6))
@@ -78,6 +78,6 @@ def trefoil(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("amplitude", "path", 0.0005)
-def inverse_amplitude(rng: np.random.Generator, world: World) -> Change:
+def inverse_amplitude(rng: Random, world: World) -> Change:
     """The error goes with one over the amplitude."""
     return adding(lambda view: np.minimum(view.bright / view.amplitude, 50.0))

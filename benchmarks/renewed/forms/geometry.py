@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.renewed.geometry import Array, small_motions
+from benchmarks.renewed.geometry import Array, Random, small_motions
 from benchmarks.renewed.signal_chain import Change, View, adding, form
 from benchmarks.renewed.world import World
 
@@ -10,14 +10,14 @@ STEEP = float(np.deg2rad(35.0))
 
 
 @form("lens", "rays", 0.03, textbook=True, tilt=STEEP)
-def barrel(rng: np.random.Generator, world: World) -> Change:
+def barrel(rng: Random, world: World) -> Change:
     """The true radial distortion is another."""
     sign = rng.choice([-1.0, 1.0])
     return lambda strength, view, slopes: slopes * (1 + sign * strength * (slopes**2).sum(0))
 
 
 @form("lens", "rays", 0.01, tilt=STEEP)
-def focus(rng: np.random.Generator, world: World) -> Change:
+def focus(rng: Random, world: World) -> Change:
     """Refocused after the calibration: another focal length and principal point."""
     scale, shift = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1), rng.normal(0, 0.3, 2)
     return lambda strength, view, slopes: (
@@ -26,7 +26,7 @@ def focus(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("lens", "rays", 0.03, tilt=STEEP)
-def tilted_sensor(rng: np.random.Generator, world: World) -> Change:
+def tilted_sensor(rng: Random, world: World) -> Change:
     """The sensor does not stand square to the axis: a perspective change of the image."""
     along = rng.normal(0, 1, 2)
     return lambda strength, view, slopes: (
@@ -35,7 +35,7 @@ def tilted_sensor(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("target_shape", "relief", 0.005, textbook=True)
-def bow(rng: np.random.Generator, world: World) -> Change:
+def bow(rng: Random, world: World) -> Change:
     """A bowed sheet: a cylinder across some direction."""
     angle, size = rng.uniform(0, np.pi), _size(world)
 
@@ -43,7 +43,7 @@ def bow(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("target_shape", "relief", 0.005)
-def bumps(rng: np.random.Generator, world: World) -> Change:
+def bumps(rng: Random, world: World) -> Change:
     """A plastered wall: bumps and hollows of a hand's breadth."""
     size = _size(world)
     centres, widths = rng.uniform(-0.7, 0.7, (14, 2)) * size, rng.uniform(0.1, 0.25, 14) * size
@@ -59,7 +59,7 @@ def bumps(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("target_shape", "relief", 0.005)
-def panels(rng: np.random.Generator, world: World) -> Change:
+def panels(rng: Random, world: World) -> Change:
     """Two sheets that meet in a joint: a step and a kink."""
     angle, at, size = rng.uniform(0, np.pi), rng.uniform(-0.2, 0.2), _size(world)
     step, kink = rng.normal(0, 1, 2)
@@ -77,14 +77,14 @@ def _across(view: View, angle: float) -> Array:
 
 
 @form("target_registration", "plane", 0.005, textbook=True)
-def misplaced(rng: np.random.Generator, world: World) -> Change:
+def misplaced(rng: Random, world: World) -> Change:
     """The target stands turned and shifted against its survey."""
     turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.5)
     return _leaning(turn, shift)
 
 
 @form("target_registration", "plane", 0.005)
-def bumped(rng: np.random.Generator, world: World) -> Change:
+def bumped(rng: Random, world: World) -> Change:
     """Somebody bumped into the target during the recording."""
     turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.7)
     after = np.arange(world.frames) >= world.frames * rng.uniform(0.25, 0.75)
@@ -93,7 +93,7 @@ def bumped(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("target_registration", "plane", 0.005)
-def sinking(rng: np.random.Generator, world: World) -> Change:
+def sinking(rng: Random, world: World) -> Change:
     """The stand gives way slowly: the target leans more and more."""
     turn, when = rng.normal(0, 1, 2) / _size(world), world.way.seconds / world.way.seconds[-1]
     return _leaning(turn, 0.0, when[:, None])

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, Random
 from benchmarks.renewed.signal_chain import Change, View, adding, background, form
 from benchmarks.renewed.world import NOMINAL_US, World, heat
 
@@ -20,20 +20,20 @@ def _per_frame(values: Array) -> Change:
 
 
 @form("integration_time", "path", 0.01, textbook=True, **EXPOSED)
-def logarithm(rng: np.random.Generator, world: World) -> Change:
+def logarithm(rng: Random, world: World) -> Change:
     """The offset follows the logarithm of the exposure."""
     return _per_frame(rng.choice([-1.0, 1.0]) * np.log(world.conditions.exposure / NOMINAL_US))
 
 
 @form("integration_time", "path", 0.02, **EXPOSED)
-def driver_droop(rng: np.random.Generator, world: World) -> Change:
+def driver_droop(rng: Random, world: World) -> Change:
     """The driver's voltage droops within an exposure: the mean of an exponential over it."""
     share = world.conditions.exposure / rng.uniform(200.0, 1500.0)
     return _per_frame(rng.choice([-1.0, 1.0]) * (1 - (1 - np.exp(-share)) / share))
 
 
 @form("integration_time", "path", 0.01, **EXPOSED)
-def setting_table(rng: np.random.Generator, world: World) -> Change:
+def setting_table(rng: Random, world: World) -> Change:
     """Every setting has an offset of its own, in no order."""
     _, which = np.unique(world.conditions.exposure, return_inverse=True)
     offsets = rng.permutation(np.linspace(-1, 1, which.max() + 1))
@@ -41,7 +41,7 @@ def setting_table(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("warm_up", "path", 0.01, textbook=True, **STANDING)
-def two_exponentials(rng: np.random.Generator, world: World) -> Change:
+def two_exponentials(rng: Random, world: World) -> Change:
     """Driver and sensor warm up, each at its own rate, and cool down in pauses."""
     fast, slow, share = rng.uniform(60, 200), rng.uniform(500, 1500), rng.uniform(0.3, 0.7)
     powered = world.conditions.powered
@@ -51,7 +51,7 @@ def two_exponentials(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("warm_up", "path", 0.01, **STANDING)
-def line_with_pauses(rng: np.random.Generator, world: World) -> Change:
+def line_with_pauses(rng: Random, world: World) -> Change:
     """A straight rise to a plateau; a pause takes back a part of it at once."""
     t, pauses = world.way.seconds, world.way.pauses
     rise, back = max(t[-1] * rng.uniform(0.3, 0.7), 60.0), rng.uniform(0.2, 0.7)
@@ -65,7 +65,7 @@ def line_with_pauses(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("warm_up", "path", 0.01, **STANDING)
-def fan(rng: np.random.Generator, world: World) -> Change:
+def fan(rng: Random, world: World) -> Change:
     """The camera's fan comes on once it is warm: the drift ends in a step back."""
     t = world.way.seconds
     at, soft = t[-1] * rng.uniform(0.2, 0.6), rng.uniform(10.0, 60.0)
@@ -75,7 +75,7 @@ def fan(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("room_temperature", "path", 0.01, textbook=True, **ROOM)
-def lag(rng: np.random.Generator, world: World) -> Change:
+def lag(rng: Random, world: World) -> Change:
     """The electronics follow the room's temperature after a while."""
     t, room, constant = world.way.seconds, world.conditions.room, rng.uniform(60.0, 400.0)
     late = room.copy()
@@ -85,7 +85,7 @@ def lag(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("room_temperature", "path", 0.01, **ROOM)
-def bowl(rng: np.random.Generator, world: World) -> Change:
+def bowl(rng: Random, world: World) -> Change:
     """Compensated at one temperature; off it the error grows by the square."""
     room = world.conditions.room
     at = rng.uniform(room.min(), room.max())
@@ -93,7 +93,7 @@ def bowl(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("room_temperature", "path", 0.01, **ROOM)
-def coarse_sensor(rng: np.random.Generator, world: World) -> Change:
+def coarse_sensor(rng: Random, world: World) -> Change:
     """Compensated with a thermometer of whole steps: what is left is a saw-tooth over a slope."""
     room, step = world.conditions.room, rng.uniform(1.0, 2.5)
     left = 0.3 * (room - room.mean()) - np.round(room / step) * step + room
@@ -101,7 +101,7 @@ def coarse_sensor(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("ambient_light", "light", 0.05, textbook=True, **LAMPS)
-def false_correlation(rng: np.random.Generator, world: World) -> Change:
+def false_correlation(rng: Random, world: World) -> Change:
     """Background light correlates a little, for the taps of a pixel do not match."""
     turn, middle = np.exp(1j * rng.uniform(0, 2 * np.pi)), world.design.near + world.design.far
 
@@ -113,7 +113,7 @@ def false_correlation(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("ambient_light", "path", 0.05, **LAMPS)
-def bias_shift(rng: np.random.Generator, world: World) -> Change:
+def bias_shift(rng: Random, world: World) -> Change:
     """The background's charge delays the gates, by its share of all charge."""
     sign = rng.choice([-1.0, 1.0])
 
@@ -125,7 +125,7 @@ def bias_shift(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("ambient_light", "path", 0.01, **LAMPS)
-def drained(rng: np.random.Generator, world: World) -> Change:
+def drained(rng: Random, world: World) -> Change:
     """A circuit drains the background from every pixel; its delay follows the lamp's logarithm."""
     lamp = np.log1p(world.conditions.ambient / rng.uniform(0.05, 0.4))
     return _per_frame(rng.choice([-1.0, 1.0]) * (lamp - lamp.mean()))

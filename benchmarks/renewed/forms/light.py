@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, inverse
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, Random, inverse
 from benchmarks.renewed.rendering import Room, indirect, smooth
 from benchmarks.renewed.signal_chain import UNERODED, Change, View, coarse_points, form, see
 from benchmarks.renewed.world import World
@@ -12,30 +12,30 @@ from benchmarks.renewed.world import World
 SUBPIXELS = 12  # rays that stand for a footprint
 
 
-def _room(rng: np.random.Generator, world: World, low: float, high: float) -> Room:
+def _room(rng: Random, world: World, low: float, high: float) -> Room:
     return replace(world.surface.room, albedo=rng.uniform(low, high))
 
 
 @form("multipath", "light", textbook=True, scaled=False, scene="floor", moving=False)
-def rendered_floor(rng: np.random.Generator, world: World) -> Change:
+def rendered_floor(rng: Random, world: World) -> Change:
     """A bright floor before the target: all bounces between the two."""
     return rendered(world, _room(rng, world, 0.1, 0.8))
 
 
 @form("multipath", "light", scaled=False, scene="corner", moving=False)
-def rendered_corner(rng: np.random.Generator, world: World) -> Change:
+def rendered_corner(rng: Random, world: World) -> Change:
     """A floor and a side wall: all bounces."""
     return rendered(world, _room(rng, world, 0.08, 0.5))
 
 
 @form("multipath", "light", scaled=False, scene="corner", moving=False)
-def rendered_gloss(rng: np.random.Generator, world: World) -> Change:
+def rendered_gloss(rng: Random, world: World) -> Change:
     """The same with a glossy side wall, in which the target sees itself lit."""
     return rendered(world, replace(_room(rng, world, 0.03, 0.2), gloss=rng.uniform(0.1, 0.35)))
 
 
 @form("multipath", "light", scaled=False, scene="closed", moving=False)
-def rendered_closed(rng: np.random.Generator, world: World) -> Change:
+def rendered_closed(rng: Random, world: World) -> Change:
     """A bright room, closed on all sides."""
     return rendered(world, _room(rng, world, 0.1, 0.5))
 
@@ -66,7 +66,7 @@ def _within(points: Array, room: Room) -> Array:
 
 
 @form("multipath", "light", 0.02)
-def housing(rng: np.random.Generator, world: World) -> Change:
+def housing(rng: Random, world: World) -> Change:
     """The robot's bright flange sends light back to the target: there and back twice."""
 
     def change(strength: float, view: View, phasor: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ def housing(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("stray_light", "light", 0.05, textbook=True, target="checkerboard")
-def spread(rng: np.random.Generator, world: World) -> Change:
+def spread(rng: Random, world: World) -> Change:
     """Lens flare: the image spread by an exponential about every pixel."""
     length = world.sensor.lens.width * rng.uniform(0.05, 0.25)
 
@@ -94,7 +94,7 @@ def spread(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("stray_light", "light", 0.05, target="checkerboard")
-def ghost(rng: np.random.Generator, world: World) -> Change:
+def ghost(rng: Random, world: World) -> Change:
     """A reflection between lens and sensor: the image upside down, smaller and out of focus."""
     size = rng.uniform(0.5, 1.0)
     column, row = world.pixel_position
@@ -112,19 +112,19 @@ def ghost(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("stray_light", "light", 0.05, target="checkerboard")
-def veil(rng: np.random.Generator, world: World) -> Change:
+def veil(rng: Random, world: World) -> Change:
     """A dirty cover glass: every pixel sees a share of the mean of the image."""
     return lambda strength, _, phasor: phasor + strength * phasor.mean((1, 2), keepdims=True)
 
 
 @form("mixed_pixels", "light", textbook=True, scaled=False, scene="board", mask=UNERODED)
-def defocus(rng: np.random.Generator, world: World) -> Change:
+def defocus(rng: Random, world: World) -> Change:
     """Out of focus: the footprint is a round blur that reaches into the neighbours'."""
     return _footprint(world, rng.uniform(0.4, 0.9) * rng.standard_normal((SUBPIXELS, 2)))
 
 
 @form("mixed_pixels", "light", scaled=False, scene="board", mask=UNERODED)
-def aperture(rng: np.random.Generator, world: World) -> Change:
+def aperture(rng: Random, world: World) -> Change:
     """Every pixel sees a square footprint, at a board's edge half of it behind the board."""
     grid = (np.arange(4) - 1.5) / 4
     return _footprint(world, np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2))
@@ -148,7 +148,7 @@ def _footprint(world: World, offsets: Array) -> Change:
 
 
 @form("mixed_pixels", "light", 0.05, scene="board")
-def perforated(rng: np.random.Generator, world: World) -> Change:
+def perforated(rng: Random, world: World) -> Change:
     """A perforated sheet: through its holes a pixel sees the wall behind."""
     pitch = world.surface.square * rng.uniform(0.7, 1.4)
 

@@ -2,7 +2,14 @@
 
 import numpy as np
 
-from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, directions, inverse, small_motions
+from benchmarks.renewed.geometry import (
+    SPEED_OF_LIGHT,
+    Array,
+    Random,
+    directions,
+    inverse,
+    small_motions,
+)
 from benchmarks.renewed.signal_chain import Change, View, form
 from benchmarks.renewed.world import NOMINAL_US, World
 
@@ -10,7 +17,7 @@ STEP_S = 0.01  # for speeds by differences
 
 
 @form("robot_kinematics", "poses", 0.005, textbook=True)
-def scale(rng: np.random.Generator, world: World) -> Change:
+def scale(rng: Random, world: World) -> Change:
     """Links longer than the controller believes: positions are scaled about the base."""
     sign = rng.choice([-1.0, 1.0])
 
@@ -23,7 +30,7 @@ def scale(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("robot_kinematics", "poses", 0.01)
-def elbow(rng: np.random.Generator, world: World) -> Change:
+def elbow(rng: Random, world: World) -> Change:
     """The elbow's encoder is eccentric: all behind it turns about it, with the elbow's angle."""
     length, start = 0.62 * _reach(world), rng.uniform(0, 2 * np.pi)
 
@@ -44,7 +51,7 @@ def elbow(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("robot_kinematics", "poses", 0.005)
-def backlash(rng: np.random.Generator, world: World) -> Change:
+def backlash(rng: Random, world: World) -> Change:
     """Gears with play: the arm stays behind, on the side from which it came."""
     size = rng.normal(0, 1, 3)
 
@@ -67,21 +74,21 @@ def _reach(world: World) -> float:
 
 
 @form("timestamp_offset", "poses", 0.02, textbook=True, moving=True)
-def offset_clock(rng: np.random.Generator, world: World) -> Change:
+def offset_clock(rng: Random, world: World) -> Change:
     """The camera's clock is late by a constant."""
     sign = rng.choice([-1.0, 1.0])
     return lambda strength, view, poses: world.world_from_tool(sign * strength)
 
 
 @form("timestamp_offset", "poses", 0.02, moving=True)
-def running_clock(rng: np.random.Generator, world: World) -> Change:
+def running_clock(rng: Random, world: World) -> Change:
     """The camera's clock runs fast or slow: an offset that grows."""
     share = world.way.seconds / world.way.seconds[-1] * rng.choice([-1.0, 1.0])
     return lambda strength, view, poses: world.world_from_tool(strength * share)
 
 
 @form("timestamp_offset", "poses", 0.02, moving=True, exposure="random")
-def start_of_exposure(rng: np.random.Generator, world: World) -> Change:
+def start_of_exposure(rng: Random, world: World) -> Change:
     """Stamps tell when a frame was asked for, which is the earlier the longer it is exposed."""
     share = world.conditions.exposure / NOMINAL_US
     return lambda strength, view, poses: world.world_from_tool(strength * share)
@@ -99,13 +106,13 @@ def speed(view: View) -> Array:
 
 
 @form("motion", "taps", 0.01, textbook=True, moving=True)
-def one_by_one(rng: np.random.Generator, world: World) -> Change:
+def one_by_one(rng: Random, world: World) -> Change:
     """The four samples are taken one after the other."""
     return _at_times(np.array([-1.5, -0.5, 0.5, 1.5]))
 
 
 @form("motion", "taps", 0.02, moving=True)
-def in_pairs(rng: np.random.Generator, world: World) -> Change:
+def in_pairs(rng: Random, world: World) -> Change:
     """Two exposures, each for two opposite samples."""
     return _at_times(np.array([-0.5, 0.5, -0.5, 0.5]))
 
@@ -123,7 +130,7 @@ def _at_times(times: Array) -> Change:
 
 
 @form("motion", "path", 0.05, moving=True)
-def rolling(rng: np.random.Generator, world: World) -> Change:
+def rolling(rng: Random, world: World) -> Change:
     """Rows are read one after the other."""
     rows = np.linspace(-0.5, 0.5, world.sensor.lens.height)[:, None] * rng.choice([-1.0, 1.0])
     return lambda strength, view, path: path + strength * rows * speed(view)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from benchmarks.renewed.geometry import Random
 from benchmarks.renewed.signal_chain import Change, adding, form
 from benchmarks.renewed.world import World
 
@@ -11,13 +12,13 @@ def _shape(world: World) -> tuple[int, int]:
 
 
 @form("fixed_pattern", "path", 0.005, textbook=True)
-def every_pixel(rng: np.random.Generator, world: World) -> Change:
+def every_pixel(rng: Random, world: World) -> Change:
     """Every pixel has a delay of its own."""
     return adding(rng.standard_normal(_shape(world)))
 
 
 @form("fixed_pattern", "path", 0.02)
-def hot_pixels(rng: np.random.Generator, world: World) -> Change:
+def hot_pixels(rng: Random, world: World) -> Change:
     """Few pixels, in clusters, are far off."""
     shape = _shape(world)
     seeds = rng.uniform(size=shape) < rng.uniform(0.01, 0.04)
@@ -26,7 +27,7 @@ def hot_pixels(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("fixed_pattern", "path", 0.005)
-def blocks(rng: np.random.Generator, world: World) -> Change:
+def blocks(rng: Random, world: World) -> Change:
     """Pixels are read out in blocks, each by a circuit of its own."""
     height, width = _shape(world)
     size = int(rng.integers(4, 9))
@@ -35,14 +36,14 @@ def blocks(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("row_column_pattern", "path", 0.005, textbook=True)
-def free_columns(rng: np.random.Generator, world: World) -> Change:
+def free_columns(rng: Random, world: World) -> Change:
     """Every column has an offset of its own, and rows a smaller one."""
     height, width = _shape(world)
     return adding(rng.standard_normal(width) + 0.4 * rng.standard_normal(height)[:, None])
 
 
 @form("row_column_pattern", "path", 0.005)
-def halves_and_pairs(rng: np.random.Generator, world: World) -> Change:
+def halves_and_pairs(rng: Random, world: World) -> Change:
     """Odd and even rows by two converters, and a step where the two halves of the array meet."""
     height, width = _shape(world)
     rows = (np.arange(height) % 2 - 0.5) * rng.uniform(0.5, 2.0)
@@ -51,7 +52,7 @@ def halves_and_pairs(rng: np.random.Generator, world: World) -> Change:
 
 
 @form("row_column_pattern", "path", 0.005)
-def clock_beat(rng: np.random.Generator, world: World) -> Change:
+def clock_beat(rng: Random, world: World) -> Change:
     """The row clock beats with the modulation: a wave down the image that stands still."""
     height, width = _shape(world)
     period = rng.uniform(3.0, 9.0)
