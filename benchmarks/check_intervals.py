@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks.sealed.scores import share, table
+from benchmarks.sealed.scores import Limits, share, table
 from benchmarks.timing import write
 from benchmarks.wrong_recordings.clean import drawn_simulator
 from tofcorr.data.recording import Recording
@@ -113,9 +113,7 @@ def recorded(later: Values, folder: Path, frames: int, drift: float) -> Dataset:
     return Dataset((Recording.open(folder),))
 
 
-def _line(
-    wall: Wall, frames: int, drift_mm: float, offset: float, interval: tuple[float, float]
-) -> Values:
+def _line(wall: Wall, frames: int, drift_mm: float, offset: float, interval: Limits) -> Values:
     """Return what was found with a wall and a number of frames; offset and interval in metres."""
     low, high = (1e3 * end for end in interval)
     return {

@@ -18,7 +18,7 @@ import torch
 
 from benchmarks.estimation import model_options
 from benchmarks.scene import camera_of
-from benchmarks.timing import JSON, machine, spread, timed, write
+from benchmarks.timing import JSON, Seconds, machine, spread, timed, write
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.c import export_c, load_c
 from tofcorr.correction.export.pt2 import export_pt2, load_pt2
@@ -60,9 +60,8 @@ def numpy_corrector(
     domain, amplitude_range = state.domain, state.domain.amplitude
     assert amplitude_range is not None
     offset = state.model().error.pixel_error().detach().numpy().astype(np.float32)
-    c1, c2, c3, i1, i2 = (np.float32(x) for x in COEFFICIENTS[1:6])
-    near, far = (np.float32(x) for x in domain.radial_distance)
-    weak, strong = (np.float32(x) for x in amplitude_range)
+    c1, c2, c3, i1, i2 = np.array(COEFFICIENTS[1:6], np.float32)
+    near, far, weak, strong = np.array([*domain.radial_distance, *amplitude_range], np.float32)
     d_mid, d_half = np.float32((near + far) / 2), np.float32((far - near) / 2)
     a_mid, a_half = np.float32((weak + strong) / 2), np.float32((strong - weak) / 2)
 
@@ -76,9 +75,7 @@ def numpy_corrector(
     return correct
 
 
-def compare(
-    height: int, width: int, repeats: int, folder: Path, num_frames: int
-) -> dict[str, list[float]]:
+def compare(height: int, width: int, repeats: int, folder: Path, num_frames: int) -> Seconds:
     """Return seconds a frame of each job, round after round, so that all see the same machine.
 
     Args:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+Seconds = dict[str, list[float]]
 JSON = click.option("--json", "out", type=click.Path(path_type=Path), help="File for all figures.")
 
 
@@ -22,7 +23,7 @@ def timed(
     warm_up: int = 1,
     in_a_row: int = 1,
     clock: Callable[[], float] = time.perf_counter,
-) -> dict[str, list[float]]:
+) -> Seconds:
     """Return seconds of each job, taken in turn round after round: all see the same machine.
 
     Args:
@@ -33,7 +34,7 @@ def timed(
             which other jobs gave back.
         clock: Seconds, of the wall or of the processor.
     """
-    seconds: dict[str, list[float]] = {name: [] for name in jobs}
+    seconds: Seconds = {name: [] for name in jobs}
     for _ in range(warm_up + repeats):
         for name, job in jobs.items():
             for _ in range(in_a_row > 1):

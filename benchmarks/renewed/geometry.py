@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Random = np.random.Generator
@@ -11,14 +12,9 @@ SPEED_OF_LIGHT = 299_792_458.0  # m/s
 
 
 def rotations(vectors: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    axis = vectors / np.where(angle > 0, angle, 1.0)
-    x, y, z = np.moveaxis(axis, -1, 0)
-    o = np.zeros_like(x)
-    cross = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*x.shape, 3, 3)
-    angle = angle[..., None]
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
+    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return matrices.reshape(*vectors.shape, 3)
 
 
 def transforms(rotation: Array, translation: Array) -> Array:

@@ -287,14 +287,8 @@ def _noise(rng: Random, taps: Array, world: World) -> Array:
 
 def _smooth(values: Array, kernel: Array) -> Array:
     """Convolve the last two axes; the border is mirrored."""
-    kernel, half = kernel / kernel.sum(), len(kernel) // 2
     for axis in (-1, -2):
-        width = [(0, 0)] * values.ndim
-        width[axis] = (half, half)
-        padded = np.pad(values, width, mode="reflect")
-        n = values.shape[axis]
-        shifted = [np.take(padded, np.arange(i, i + n), axis=axis) for i in range(len(kernel))]
-        values = np.tensordot(kernel, np.stack(shifted), axes=1)
+        values = ndimage.convolve1d(values, kernel / kernel.sum(), axis, mode="mirror")
     return values
 
 

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from benchmarks.renewed.geometry import (
     SPEED_OF_LIGHT,
@@ -21,6 +22,7 @@ from benchmarks.renewed.geometry import (
 from benchmarks.renewed.ranges import RANGES, Range, draw
 from benchmarks.renewed.rendering import Room
 
+Wanted = Mapping[str, Any]
 CONTRAST = 0.55  # modulated share of the returned light
 READ_NOISE = 30.0  # electrons
 NOMINAL_US = 800.0  # exposure
@@ -40,17 +42,15 @@ class BaseErrors:
     of_pixel: tuple[float, ...]  # of column, row, column^2, row^2, each in (-1, 1)
     of_amplitude: tuple[float, ...]  # of u, u^2 with u the amplitude over a bright one
 
-    def terms(self, distance: Array, amplitude: Array) -> dict[str, Array]:
+    def terms(self, distance: Array, amplitude: Array) -> dict[str, Any]:
         """Errors in metres by term; `amplitude` (N, H, W) is over that of a bright pixel."""
         v = np.clip((distance - self.middle) / self.half, -2.3, 2.3)
         column, row = image_grid(*distance.shape[1:])
-        c0, c1, c2, c3 = self.of_distance
         a, b, aa, bb = self.of_pixel
-        i1, i2 = self.of_amplitude
         return {
-            "distance": c0 + v * (c1 + v * (c2 + v * c3)),
+            "distance": polyval(v, self.of_distance),
             "pixel": a * column + b * row + aa * column**2 + bb * row**2,
-            "amplitude": amplitude * (i1 + amplitude * i2),
+            "amplitude": polyval(amplitude, (0.0, *self.of_amplitude)),
         }
 
     def at(self, distance: Array, amplitude: Array) -> Array:
@@ -187,7 +187,7 @@ class World:
         return self.world_from_target @ there @ inverse(self.tool_from_camera)
 
 
-def draw_world(rng: Random, wanted: Mapping[str, Any] | None = None) -> World:
+def draw_world(rng: Random, wanted: Wanted | None = None) -> World:
     """Draw a camera, a robot, a target and a design; `wanted` fixes some of the design."""
     near = draw("near_m", rng)
     far = min(near * draw("farthest_times", rng), RANGES["farthest_m"])
@@ -282,22 +282,19 @@ def _draw_lens(rng: Random) -> Camera:
 
 
 def _electrons(noise: float, frequencies: tuple[float, ...]) -> float:
-    """Amplitude at which the depth of one frame has this noise, by bisection on its logarithm."""
-    low, high = 1.0, 1e9
+    """Amplitude A at which the depth of one frame has this noise.
+
+    A tap holds A / CONTRAST + READ_NOISE^2 electrons, and as much variance.
+    """
     scale = SPEED_OF_LIGHT / (4 * np.pi * np.linalg.norm(frequencies))
-    for _ in range(60):
-        amplitude = np.sqrt(low * high)
-        tap = amplitude / CONTRAST + READ_NOISE**2
-        weak = scale * np.sqrt(tap / 2) / amplitude > noise
-        low, high = (amplitude, high) if weak else (low, amplitude)
-    return float(np.sqrt(low * high))
+    square, linear = 2 * (noise / scale) ** 2, 1 / CONTRAST
+    return float((linear + np.sqrt(linear**2 + 4 * square * READ_NOISE**2)) / (2 * square))
 
 
-def _draw_design(
-    rng: Random, pixels: int, near: float, far: float, wanted: Mapping[str, Any]
-) -> Design:
+def _draw_design(rng: Random, pixels: int, near: float, far: float, wanted: Wanted) -> Design:
     """Draw a design; `wanted` fixes what an effect cannot do without."""
     frames = min(draw("frames", rng), max(15, int(RANGES["most_pixels"] / pixels)))
+    finest = 1e-3 * RANGES["least_ransac_mm"]
     layout = {
         "frames": frames,
         "near": near,
@@ -310,9 +307,7 @@ def _draw_design(
         "scene": draw("scenes", rng),
         "target": draw("targets", rng),
         "mask": draw("masks", rng),
-        "ransac": max(
-            draw("ransac_share", rng) * np.sqrt(near * far), 1e-3 * RANGES["least_ransac_mm"]
-        ),
+        "ransac": max(draw("ransac_share", rng) * np.sqrt(near * far), finest),
         "exposure": draw("exposures", rng),
     }
     optional = ("integration_time_us", "body_temperature_c", "room_temperature_c", "ambient")

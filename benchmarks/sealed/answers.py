@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.renewed.geometry import Random
 from benchmarks.renewed.recording import read
 from benchmarks.sealed.oracle import Oracle, ask
 
@@ -31,9 +32,7 @@ def digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def seal(
-    rng: np.random.Generator, out: Path, answer: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-) -> str:
+def seal(rng: Random, out: Path, answer: Entry, arrays: Mapping[str, np.ndarray]) -> str:
     """Write an answer, of a recording `id`, and its arrays; return the hash of all of them."""
     folder, hashes = out / "answers" / answer["id"], {}
     salt = rng.bytes(16).hex()  # so that the hash cannot be guessed from a list of answers

@@ -12,7 +12,9 @@ from sklearn.metrics import f1_score, roc_auc_score
 from benchmarks.sealed.answers import Outcome
 
 Case = TypeVar("Case")
+Values = Sequence[float]
 Limits = tuple[float, float]
+Targets = Mapping[str, Limits]
 ANY = (-math.inf, math.inf)  # no target
 
 LEAST_MM = 2.0  # smaller effects are not asked for
@@ -93,16 +95,14 @@ def at_most(limit: float) -> Limits:
     return -math.inf, limit
 
 
-def mean_score(tier: str, what: str, values: Sequence[float], target: Limits) -> Score:
+def mean_score(tier: str, what: str, values: Values, target: Limits) -> Score:
     """A mean with normal limits."""
     mean = float(np.mean(values)) if values else math.nan
     half = float(norm.ppf(0.975) * np.std(values) / math.sqrt(len(values))) if values else math.nan
     return Score(tier, what, mean, (mean - half, mean + half), len(values), target)
 
 
-def quantile_score(
-    tier: str, what: str, values: Sequence[float], q: float, target: Limits = ANY
-) -> Score:
+def quantile_score(tier: str, what: str, values: Values, q: float, target: Limits) -> Score:
     """A quantile with 95 % limits from order statistics (binomial)."""
     if not values:
         return Score(tier, what, math.nan, (math.nan, math.nan), 0, target)
@@ -113,9 +113,7 @@ def quantile_score(
     return Score(tier, what, float(np.quantile(ordered, q)), limits, n, target)
 
 
-def area_score(
-    tier: str, what: str, positives: Sequence[float], negatives: Sequence[float], target: Limits
-) -> Score:
+def area_score(tier: str, what: str, positives: Values, negatives: Values, target: Limits) -> Score:
     """Area under the ROC curve, with Hanley and McNeil's standard error (1982)."""
     m, n = len(positives), len(negatives)
     if not m or not n:
@@ -202,9 +200,7 @@ def names_something_new(cases: Iterable[Outcome]) -> Callable[[Outcome], bool]:
     return lambda one: bool(set(one.said.effects) - one.truths - own)
 
 
-def figures(
-    title: str, cases: Sequence[Outcome], targets: Mapping[str, Limits] | None = None
-) -> list[Score]:
+def figures(title: str, cases: Sequence[Outcome], targets: Targets | None = None) -> list[Score]:
     """What is said of cases: of effects that an oracle finds, and where nothing is missing."""
     find = [one for one in cases if one.must_find]
     nulls = [one for one in cases if not one.truths]
@@ -223,8 +219,7 @@ def figures(
         "called unknown though nothing is there": map(unknown, nulls),
         "detected though nothing is there": map(detected, nulls),
     }
-    wanted = targets or {}
-    sizes = [float(len(one.said.sets[0])) for one in find if one.said.sets]
+    wanted, sizes = targets or {}, [float(len(one.said.sets[0])) for one in find if one.said.sets]
     scores = [share_score(title, k, some, wanted.get(k, ANY)) for k, some in judged.items()]
     size = "size of the set"
     return [*scores, mean_score(title, size, sizes, wanted.get(size, ANY))]

@@ -43,6 +43,7 @@ from benchmarks.sealed.scores import (
 )
 from benchmarks.withheld.tiers import TEXTBOOK
 
+Hooks = Sequence[Hook]
 TERMS = ("distance", "pixel", "amplitude")
 FORMS = tuple(TEXTBOOK.values())
 NOISE_FACTORS = (1.0, 0.5, 2.0, 0.0)  # of the simulator's noise over the camera's
@@ -94,15 +95,10 @@ class Pair:
         return not self.terms and not self.shared
 
 
-def _two(index: int, rng: Random) -> tuple[Form, Form]:
-    while True:
-        one, other = turn(0, FORMS, index), FORMS[rng.integers(len(FORMS))]
-        if agree((one, other)):
-            return one, other
-
-
 def _shared(index: int, rng: Random) -> Pair:
-    one, other = _two(index, rng)
+    one, other = turn(0, FORMS, index), FORMS[rng.integers(len(FORMS))]
+    while not agree((one, other)):
+        other = FORMS[rng.integers(len(FORMS))]
     return Pair((one,), (other,), terms=TERMS, noise=1.0)
 
 
@@ -200,12 +196,10 @@ def _at_tool(world: World, slip: Array) -> World:
     return replace(world, way=replace(way, camera_at=lambda late: way.camera_at(late) @ moved))
 
 
-def _simulated(
-    rng: Random, world: World, shared: Sequence[Hook], pair: Pair, slip: Array
-) -> Recorded:
+def _simulated(rng: Random, world: World, shared: Hooks, pair: Pair, slip: Array) -> Recorded:
     """The simulator's recording."""
-    there = session_again(rng, world) if pair.other_poses else _at_tool(world, slip)
-    there = _simulator(there, pair)
+    session = session_again(rng, world) if pair.other_poses else _at_tool(world, slip)
+    there = _simulator(session, pair)
     recorded, truth = record(rng, there, in_world(there, shared))
     expected = truth.expected * depth_over_range(there)
     depth = expected + pair.noise * (recorded.depth - expected)
@@ -221,7 +215,7 @@ def _dropped(rng: Random, one: Recorded, chance: float) -> tuple[Recorded, float
     return replace(one, depth=depth), missing
 
 
-def _truth(world: World, hooks: Sequence[Hook], simulator: World, shared: Sequence[Hook]) -> Entry:
+def _truth(world: World, hooks: Hooks, simulator: World, shared: Hooks) -> Entry:
     """The gap as given, mm, and the share of each cause; both worlds stand at the true poses."""
     terms, effects, used = [], [], np.ones(1, dtype=bool)
     for one, own in ((world, hooks), (simulator, in_world(simulator, shared))):
@@ -235,7 +229,7 @@ def _truth(world: World, hooks: Sequence[Hook], simulator: World, shared: Sequen
         parts[name] = parts.get(name, 0.0) + (effects[0] - effects[1])[used]
     constant = sum(part.mean() for part in parts.values())
     parts = {name: part - part.mean() for name, part in parts.items()}
-    parts["distance"] = parts["distance"] + constant
+    parts["distance"] += constant
     total = sum(parts.values(), np.zeros(1))
     square = float(np.sum(total**2))
     shares = {name: float(np.sum(part * total)) / square for name, part in parts.items() if square}
@@ -243,9 +237,7 @@ def _truth(world: World, hooks: Sequence[Hook], simulator: World, shared: Sequen
     return {"as_given_mm": size, "shares": shares if size > 1e-3 else {}}
 
 
-def _held_out(
-    rng: Random, world: World, hooks: Sequence[Hook]
-) -> tuple[Recorded, dict[str, Array]]:
+def _held_out(rng: Random, world: World, hooks: Hooks) -> tuple[Recorded, dict[str, Array]]:
     """Ideal frames of another session, and what the camera would measure there, metres."""
     session = session_again(rng, world, **STATIONS)
     own = in_world(session, hooks)
@@ -291,15 +283,15 @@ def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> dict[str, 
     ]
     deviation = drawn.depth - predicted.depth
     both = np.isfinite(deviation) & np.isfinite(true)
-    noise = [1e3 * float(np.sqrt(np.mean(x[both] ** 2))) for x in (deviation, sigma)]
+    noise, true_noise = (1e3 * float(np.sqrt(np.mean(x[both] ** 2))) for x in (deviation, sigma))
     on_target = np.load(out / "degraded" / name / "mask.npy") > 0
     return {
         "gap_mm": gap,
         "error_of_square": error,
         "own_mm": gap_of(left, load(out, name, "sigma"), real.columns["pose_id"])[0],
         "oracle_mm": gap_of(oracle_error(real, ideal, fields), sigma, stations)[0],
-        "noise_mm": noise[0],
-        "true_noise_mm": noise[1],
+        "noise_mm": noise,
+        "true_noise_mm": true_noise,
         "missing": float(np.mean(~drawn.valid[on_target])),
         "true_missing": float(np.mean(~np.isfinite(true[on_target]))),
     }

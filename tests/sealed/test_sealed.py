@@ -179,7 +179,7 @@ def test_shares_areas_quantiles_and_f1_by_hand() -> None:
     area = area_score("D", "x", [2.0, 1.0, 1.0], [0.0, 1.0], ANY)
     assert area.value == pytest.approx((1 + 1 + 0.5 + 1 + 0.5 + 0) / 6 + 0.0, abs=0.2)
     rng = np.random.default_rng(0)
-    draws = [quantile_score("A", "", rng.uniform(size=60).tolist(), 0.5) for _ in range(200)]
+    draws = [quantile_score("A", "", rng.uniform(size=60).tolist(), 0.5, ANY) for _ in range(200)]
     assert np.mean([one.interval[0] <= 0.5 <= one.interval[1] for one in draws]) > 0.9
     cases = [
         outcome("B", {"a": 1.0, "b": 1.0}, report(["a"], [["a"]])),
