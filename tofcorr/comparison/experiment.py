@@ -136,10 +136,7 @@ class Experiment:
 
 
 def held_out_experiment(
-    name: str,
-    dataset: Dataset,
-    options: ComparisonOptions,
-    inspection: Inspection | None = None,
+    name: str, dataset: Dataset, options: ComparisonOptions, inspection: Inspection | None = None
 ) -> Experiment:
     """Fit all models to the training frames of every split, and measure the frames held out.
 
@@ -207,10 +204,7 @@ class ModelFitter:
     """
 
     def __init__(
-        self,
-        dataset: Dataset,
-        options: ComparisonOptions,
-        left_out: Collection[int] = (),
+        self, dataset: Dataset, options: ComparisonOptions, left_out: Collection[int] = ()
     ) -> None:
         self._dataset, self._options = dataset, options
         used = np.setdiff1d(np.arange(dataset.num_frames), list(left_out))

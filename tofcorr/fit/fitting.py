@@ -420,10 +420,7 @@ def _without_noise_shift(
 
 
 def _expected_moments(
-    problem: Problem,
-    core: Core,
-    weights: PixelWeights | None,
-    noise: DistanceNoise,
+    problem: Problem, core: Core, weights: PixelWeights | None, noise: DistanceNoise
 ) -> ImageMoments:
     """Return what the noise adds to the moments, estimated from some frames and pixels.
 

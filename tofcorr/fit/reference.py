@@ -283,10 +283,7 @@ _RANDOM = torch.tensor([0, 0, 1] + [2] * BOWS + [3] * (SHAPES - BOWS))
 
 
 def estimate_reference(
-    dataset: Dataset,
-    frames: np.ndarray,
-    fit: Fit,
-    noise: tuple[float, float, float] | None,
+    dataset: Dataset, frames: np.ndarray, fit: Fit, noise: tuple[float, float, float] | None
 ) -> Reference | None:
     """Return how far the camera may be from what a fitted model says, frame by frame.
 
@@ -339,10 +336,7 @@ def estimate_reference(
 
 
 def _solved(
-    with_offset: GroupSums,
-    classes: Tensor,
-    noise: tuple[float, float, float] | None,
-    of_walls: int,
+    with_offset: GroupSums, classes: Tensor, noise: tuple[float, float, float] | None, of_walls: int
 ) -> Reference:
     """Return the reference, without views, from the sums of each pose.
 

@@ -208,11 +208,7 @@ def _sees_wall(
 
 
 def draw_pool(
-    dataset: Dataset,
-    frames: np.ndarray,
-    fit: Fit,
-    generator: np.random.Generator,
-    size: int = 300,
+    dataset: Dataset, frames: np.ndarray, fit: Fit, generator: np.random.Generator, size: int = 300
 ) -> PosePool | None:
     """Draw poses that look at the same wall, tilted, rolled and at other distances.
 

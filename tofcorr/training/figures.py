@@ -32,21 +32,18 @@ _SCALE = np.array(
 
 
 def profile(
-    x: np.ndarray,
-    error: np.ndarray,
-    ends: tuple[float, float] | None = None,
-    bins: int = 30,
-    fewest: int = 30,
+    x: np.ndarray, error: np.ndarray, ends: tuple[float, float] | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return middles of bins of a covariate, and mean and standard deviation of the error in them.
+
+    There are 30 bins; those of fewer than 30 pixels are left out: their mean is mostly noise.
 
     Args:
         x: The covariate, shape (M,).
         error: The error of each pixel, shape (M,); NaN is left out.
         ends: Range of the covariate; None: see `ends_of`.
-        bins: How many.
-        fewest: Bins of fewer pixels are left out: their mean is mostly noise.
     """
+    bins = 30
     edges = np.linspace(*(ends or ends_of(x)), bins + 1)
     number = np.digitize(x, edges) - 1
     inside = (number >= 0) & (number < bins) & np.isfinite(error)
@@ -54,7 +51,7 @@ def profile(
         np.bincount(number[inside], weights, bins)
         for weights in (None, error[inside], error[inside] ** 2)
     )
-    enough = count >= fewest
+    enough = count >= 30
     mean = total[enough] / count[enough]
     spread = np.sqrt(np.maximum(square[enough] / count[enough] - mean**2, 0))
     return ((edges[1:] + edges[:-1]) / 2)[enough], mean, spread
@@ -102,24 +99,22 @@ def coloured(image: np.ndarray, limit: float) -> np.ndarray:
     return shown.round().astype(np.uint8)
 
 
-def error_picture(
-    images: Images, titles: Sequence[str], least_width: int = 600
-) -> tuple[np.ndarray, str]:
+def error_picture(images: Images, titles: Sequence[str]) -> tuple[np.ndarray, str]:
     """Return errors before, after, and after once more on a finer scale, and what it shows.
 
     Args:
         images: The errors.
         titles: One a frame.
-        least_width: Smaller pictures are enlarged by a whole factor, pixels.
 
     Returns:
-        One row a frame, (H, W, 3), uint8; and the words, in Markdown.
+        One row a frame, (H, W, 3), uint8; and the words, in Markdown. Pictures narrower than 600
+        pixels are enlarged by a whole factor.
     """
     columns = columns_of_errors(images)
     first, second, third = (coloured(column, limit) for column, limit in columns)
     free = np.full((len(first), gap_rows(first.shape[1]), 3), 255, dtype=np.uint8)
     picture = np.concatenate([first, free, second, free, third], axis=1)
-    factor = -(-least_width // picture.shape[1])
+    factor = -(-600 // picture.shape[1])
     rows = "\n".join(f"{n}. {title.replace(chr(10), ', ')}" for n, title in enumerate(titles, 1))
     words = (
         f"Errors along the ray: blue too near, red too far, grey not used. Left: before, up to "

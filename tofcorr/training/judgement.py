@@ -156,10 +156,8 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
     fitted, held_out, bare = (math.nan if one is None else one for one in found)
     error, measured = fitted if math.isnan(held_out) else held_out, _measured(errors, noise)
     if fit.solution.stopped == "not_finite":
-        yield (
-            DO_NOT_USE,
-            f"{fit.solution.message} Choose a smaller model, or see `tofcorr inspect`.",
-        )
+        smaller = "Choose a smaller model, or see `tofcorr inspect`."
+        yield DO_NOT_USE, f"{fit.solution.message} {smaller}"
     # Shorter distances have smaller noise, so that unknown walls move nearer. No camera's error
     # grows by a third of the distance.
     if fit.walls is not None and fit.gain < 2 / 3:

@@ -133,25 +133,19 @@ def event_writer(folder: Path | str) -> Iterator["SummaryWriter"]:
             raise error
 
 
-def _write_figures(
-    writer: "SummaryWriter", calibration: Calibration, least_steps: int = 300
-) -> None:
+def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
     """Write curves over each covariate, distributions, and error images of some frames.
 
     None of it is drawn by Matplotlib, which takes longer than a short fit. `plot_profile` of a
     `TrainingResult`, and its neighbours, draw the same with labelled axes.
-
-    Args:
-        writer: Of TensorBoard's files.
-        calibration: The fitted model and its errors.
-        least_steps: TensorBoard counts steps in whole numbers, so a covariate is multiplied by the
-            power of ten that the tag names, until its range has so many: bins stay apart.
     """
     sample = sample_pixels(calibration.data, calibration.stages, calibration.frames)
     tested = np.isin(sample.frame, calibration.test)
     for covariate, x in sample.covariates.items():
         low, high = ends = ends_of(x)
-        power = max(math.ceil(math.log10(least_steps / max(high - low, sys.float_info.epsilon))), 0)
+        # TensorBoard counts steps in whole numbers, so a covariate is multiplied by the power of
+        # ten that the tag names, until its range has 300 of them: bins stay apart.
+        power = max(math.ceil(math.log10(300 / max(high - low, sys.float_info.epsilon))), 0)
         name = covariate.split(" [")[0].replace(" ", "_")
         name += f"_x{10**power}" if power else ""
         shown = {stage: (x, error) for stage, error in sample.errors_mm.items()}

@@ -48,12 +48,8 @@ def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
     """Return how well a fit knows the hand-eye transform; None if it was not estimated."""
     if not fit.solution.parameters.hand_eye_is_free:
         return None
-    undetermined = [
-        direction.in_words()
-        for direction in fit.observability.undetermined
-        if set(direction.shares) & set(HAND_EYE_SYMBOLS)
-    ]
-    known = _in_units(hand_eye_errors(fit), "se") | {"undetermined": undetermined}
+    free, known = fit.observability.undetermined, _in_units(hand_eye_errors(fit), "se")
+    known["undetermined"] = [x.in_words() for x in free if {*x.shares} & {*HAND_EYE_SYMBOLS}]
     return HandEyeAccuracy.model_validate(known)
 
 
@@ -103,9 +99,8 @@ def correction_curves(fit: Fit, points: int = 21) -> dict[str, list[dict[str, fl
 
 def _curve(fit: Fit, distance: Tensor, amplitude: Tensor) -> list[dict[str, float]]:
     parameters, error = fit.solution.parameters, fit.model.error
-    row, column = (
-        torch.full_like(distance, (size - 1) / 2) for size in (error.height, error.width)
-    )
+    sizes = error.height, error.width
+    row, column = (torch.full_like(distance, (size - 1) / 2) for size in sizes)
     conditions = torch.zeros(len(distance), len(CONDITIONS)).to(distance)
     # Condition terms come last; they are zero at the mean conditions.
     known = len(error.image_symbols())

@@ -173,10 +173,7 @@ def _reflectivity_ratio(
 
 
 def sample_reflectivity(
-    batch: FrameBatch,
-    rays: Tensor,
-    tool_from_camera: Tensor,
-    per_frame: int,
+    batch: FrameBatch, rays: Tensor, tool_from_camera: Tensor, per_frame: int
 ) -> tuple[Tensor, Tensor]:
     """Return the reflectivity of some pixels up to a factor: A D^2 over the cosine of incidence.
 
