@@ -193,11 +193,8 @@ def finer_forms(seen: MisfitPixels) -> Probes:
 def probes(seen: MisfitPixels) -> Probes:
     """Return the other probes that a recording allows."""
     (x, y, square), bright, error = seen.on_image, seen.brightness, seen.error
-    distance, facing, amplitude = (
-        seen.linear.distance,
-        -seen.linear.gain,
-        seen.linear.pixels.amplitude,
-    )
+    distance, facing = seen.linear.distance, -seen.linear.gain
+    amplitude = seen.linear.pixels.amplitude
     (s, t), when = seen.on_wall.unbind(dim=1), _standard(seen.frame.to(torch.float64))
     one, none, u = torch.ones_like(x), torch.zeros_like(x), _standard(distance)
     # Amplitude ratios are cut, so that single dark pixels do not decide.
@@ -352,6 +349,5 @@ def _prior(seen: MisfitPixels, fit: Fit, unknowns: int) -> NormalEquations:
     if prior is None:
         return none
     share = float(seen.weight.sum() / fit.moments.gram[:, -1, -1].sum())
-    return none.plus(
-        replace(prior, variance=share * prior.variance).equations(fit.solution.parameters)
-    )
+    held = replace(prior, variance=share * prior.variance)
+    return none.plus(held.equations(fit.solution.parameters))

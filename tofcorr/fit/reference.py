@@ -420,6 +420,7 @@ def _without_unknowns(sums: GroupSums, start: Variances, of: Classes) -> Tensor:
 REFERENCE_FILE = "reference.json"
 """Its name in a run folder."""
 
+_ADVICE = "train again, or remove the file to check without it."
 _FORMAT = {"format": "tofcorr-reference", "version": 2}
 
 
@@ -444,21 +445,19 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
     if not path.is_file():
         return None
     values: dict[str, Any] = {}
+    coefficients = state.coefficients.tolist()
     try:
         values |= json.loads(path.read_text(encoding="utf-8"))
         digest = values.pop("sha256")
         wrong = {
             "it was changed after it was written": digest != _digest(values),
             "it is of another version": any(values.pop(k) != v for k, v in _FORMAT.items()),
-            "it is of another calibration": values.pop("coefficients")
-            != state.coefficients.tolist(),
+            "it is of another calibration": values.pop("coefficients") != coefficients,
         }
     except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         wrong = {f"it cannot be read ({error})": True}
     for reason in (reason for reason, holds in wrong.items() if holds):
-        raise CalibrationDataError(
-            f"{path}: {reason}; train again, or remove the file to check without it."
-        )
+        raise CalibrationDataError(f"{path}: {reason}; {_ADVICE}")
     found = Reference.from_mapping(values, str(path), CalibrationDataError)
     size = num_unknowns(state)
     widths = {"mean": size, "covariance": size, "covariance_within": size}
@@ -467,7 +466,7 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
         if numbers is not None and numbers.shape[-1] != width:
             raise CalibrationDataError(
                 f"{path}: '{name}' has shape {tuple(numbers.shape)}, expected {width} numbers in "
-                "a row; train again, or remove the file to check without it."
+                f"a row; {_ADVICE}"
             )
     return found
 

@@ -146,9 +146,8 @@ def walls_alone(
             pose, wall = world_from_camera[frame], int((numbers < of_frame[frame]).sum())
             used = batch.valid[k].flatten().nonzero()[:, 0]
             pixels = pixels_of_image(batch, k, used)
-            corrected = (
-                rays[used] * (pixels.radial_distance - model.error.error_at(pixels))[:, None]
-            )
+            distance = pixels.radial_distance - model.error.error_at(pixels)
+            corrected = rays[used] * distance[:, None]
             own = torch.cat([corrected, torch.ones_like(corrected[:, :1])], dim=1)
             points[wall] += pose @ (own.T @ own) @ pose.T
             viewpoint[wall] += pose[:3, 3] / int((index == wall).sum())

@@ -326,10 +326,8 @@ class Look:
         seen = self.frames[self.scene.known]
         conditions = by_conditions(self.data.conditions(seen).numpy())
         circular = by_phase(self.linear, self.recording.modulation_frequency)
-        along = [conditions[:, None], circular]
-        return self.linear.with_columns(
-            np.concatenate([self.linear.cosine[..., None] * one for one in along], axis=-1)
-        )
+        along = [self.linear.cosine[..., None] * one for one in (conditions[:, None], circular)]
+        return self.linear.with_columns(np.concatenate(along, axis=-1))
 
     @cached_property
     def shape(self) -> dict[str, Estimate] | None:

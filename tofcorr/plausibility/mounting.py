@@ -66,9 +66,8 @@ def remounting(look: Look) -> Iterator[Finding]:
         unseen = f"some poses are of another frame of the robot ({_FEWEST_FOR_PARTS} are needed)"
         if poses < _FEWEST_FOR_STEP:
             unseen = f"the camera moved on the tool ({_FEWEST_FOR_STEP} are needed) or {unseen}"
-        yield note(
-            f"{poses} distinct poses are too few to see whether {unseen}.", check="remounting"
-        )
+        few = f"{poses} distinct poses are too few to see whether {unseen}."
+        yield note(few, check="remounting")
 
 
 def _moved(found: Parts, where: str, cause: str) -> Finding:
@@ -100,10 +99,9 @@ class Mounting:
         weight = np.sqrt(problem.weight.max(1))
         scale = weight / max(float(np.median(weight)), TINY) / np.sqrt(count)
         twist = np.concatenate([problem.cosine[..., None], problem.rigid], axis=-1)
+        across = scale[:, None, None] * problem.plane_directions
         columns, residual, step = (
-            np.einsum("f,fpa,fpk->fak", scale, problem.plane_directions, part, optimize=True)[
-                chosen
-            ]
+            np.einsum("fpa,fpk->fak", across, part, optimize=True)[chosen]
             for part in (problem.columns, problem.residual[..., None], twist)
         )
         kept = _agreeing(columns, residual)

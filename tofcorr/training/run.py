@@ -182,8 +182,7 @@ class TrainingResult:
 
         The frames range from the best corrected to the worst.
         """
-        chosen = frames_to_show(self.calibration)
-        return residual_figure(*error_images(self.calibration, chosen))
+        return residual_figure(*error_images(self.calibration, frames_to_show(self.calibration)))
 
     def plot_points(self, frame: int) -> "Figure":
         """Draw the points of one frame on its plane at each stage, their distance stretched.
