@@ -1,16 +1,16 @@
-"""What the commands of all importers share: options, progress, and the report on the terminal.
+"""What the commands of all importers share: options, and the report on the terminal.
 
 Heavy packages are imported inside the functions, so that `--help` answers at once.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from tofcorr.errors import ConfigError
-from tofcorr.progress import through
+from tofcorr.files import NewPath
 
 if TYPE_CHECKING:
     from tofcorr.importing.images import DepthCoding
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from tofcorr.importing.robot_images import PosedOptions
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-Item = TypeVar("Item")
 
 
 class NumberList(click.ParamType):
@@ -63,6 +62,7 @@ def option(flag: str, text: str, *names: str, **more: Any) -> Callable[[Command]
     return click.option(flag, *names, show_default="default" in more, help=text, **more)
 
 
+recording_out_option = option("--out", "Recording to write.", required=True, type=NewPath())
 depth_kind_option = option(
     "--depth-kind", "z: along the optical axis; radial: along the viewing ray.",
     default="z", type=click.Choice(["z", "radial"]),
@@ -177,11 +177,6 @@ def take_posed_options(given: dict[str, Any], camera_frame: str = "") -> "PosedO
 def _command_name() -> str:
     """Return what messages call the command that is run."""
     return f"tofcorr import {click.get_current_context().info_name}"
-
-
-def progress_bar(items: Iterable[Item], step: str) -> Iterable[Item]:
-    """Show a progress bar on standard error, if that is a terminal."""
-    return through(items, step, "view")
 
 
 def print_report(report: Mapping[str, Any], out: Path) -> None:

@@ -26,11 +26,9 @@ from tofcorr.importing.robot_images import ImagesOfPlanes, PosedOptions, RobotIm
 from tofcorr.importing.run import (
     Frame,
     PreparedImport,
-    Progress,
     Refused,
     Sieve,
     camera_mapping,
-    no_progress,
     run_import,
 )
 from tofcorr.importing.timing import Lag, estimate_lag, far_lags, find_stops, pair, refine_lag
@@ -38,6 +36,7 @@ from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
 from tofcorr.importing.walls.hand_eye import distances, exact
 from tofcorr.importing.walls.image_planes import ImagePlane, plane_masks, seen_planes
 from tofcorr.plausibility.mistakes import FAR_BETTER, IN_IMAGES, IN_POSES
+from tofcorr.progress import through
 
 _LAG_OF_STOPS = 0.02
 """A refined lag that differs by more than this from the first (seconds) changes which images are
@@ -88,23 +87,20 @@ class Chosen:
     paired_by: str
 
 
-def import_posed(
-    source: RobotImages, out: Path, options: PosedOptions, progress: Progress = no_progress
-) -> dict[str, Any]:
+def import_posed(source: RobotImages, out: Path, options: PosedOptions) -> dict[str, Any]:
     """Turn depth images and robot poses into a recording of walls; return its `import.json`.
 
     Args:
         source: Images and poses.
         out: The recording to write; it must not exist yet.
         options: How to pair, choose and look for walls.
-        progress: Shows how far a step has come.
 
     Raises:
         CalibrationDataError: Images and poses do not belong together, a unit must be wrong, no
             wall is found, or `out` exists or cannot be written.
     """
     prepare = PosedImport(source, options).prepare
-    return run_import(source.origin, options, prepare, out, progress)
+    return run_import(source.origin, options, prepare, out)
 
 
 class PosedImport:
@@ -138,12 +134,12 @@ class PosedImport:
         lag = self._first_lag()
         chosen = self._choose(lag)
         _refuse_impossible_poses(chosen.world_from_tool, self._track.source)
-        found, warnings = self._walls(chosen, sieve)
+        found, warnings = self._walls(chosen)
         if lag is not None and options.lag_s == "auto":
-            refined = self._refined(lag, chosen.moving, found, sieve)
+            refined = self._refined(lag, chosen.moving, found)
             if options.moving == "keep" or abs(refined.seconds - lag.seconds) > _LAG_OF_STOPS:
                 chosen = self._choose(refined)
-                found, warnings = self._walls(chosen, sieve)
+                found, warnings = self._walls(chosen)
             lag = refined
             warnings = [*_lag_warnings(lag), *warnings]
         sieve.refused |= chosen.refused | found.left_out
@@ -219,9 +215,9 @@ class PosedImport:
             paired_by=by,
         )
 
-    def _walls(self, chosen: Chosen, sieve: Sieve) -> tuple[FoundWalls, list[str]]:
+    def _walls(self, chosen: Chosen) -> tuple[FoundWalls, list[str]]:
         """Find walls, and say where they do not fit; refuse what a mistake explains."""
-        numbers = sieve.progress(chosen.images.tolist(), "finding walls")
+        numbers = through(chosen.images.tolist(), "finding walls", "view")
         planes = [self._images.planes(k) for k in numbers]
         try:
             found = self._walls_of(planes, chosen.images, chosen.world_from_tool)
@@ -365,18 +361,16 @@ class PosedImport:
                     f"{shift:+d}: was an image or a pose dropped before '{first}'?"
                 )
 
-    def _refined(
-        self, lag: Lag, moving: np.ndarray, found: FoundWalls, sieve: Sieve, most: int = 200
-    ) -> Lag:
-        """Refine the lag on images that were taken while the tool moved, `most` of them.
+    def _refined(self, lag: Lag, moving: np.ndarray, found: FoundWalls) -> Lag:
+        """Refine the lag on images that were taken while the tool moved, 200 of them.
 
         At 0.1 m/s and 10 mm a plane, the mean of 200 tells 1 to 2 ms, a fifth of what matters.
         """
         assert self._times is not None
         hand_eye, walls = torch.from_numpy(found.tool_from_camera), torch.from_numpy(found.walls)
         times, points, on = [], [], []
-        step = max(1, -(-len(moving) // most))
-        for k in sieve.progress(moving[::step].tolist(), "refining the lag"):
+        step = max(1, -(-len(moving) // 200))
+        for k in through(moving[::step].tolist(), "refining the lag", "view"):
             pose = torch.from_numpy(self._track.at(self._times[k : k + 1] - lag.seconds))
             if not bool(pose.isfinite().all()) or not self._images.planes(k):
                 continue

@@ -144,8 +144,7 @@ class ImagesOfPlanes:
             before = few
             return k
 
-        every = sieve.progress(range(len(names)), "looking at images")
-        readable = sieve.apply(read, every, names.__getitem__)
+        readable = sieve.apply(read, range(len(names)), names.__getitem__, "looking at images")
         return np.isin(np.arange(len(names)), readable), median, change
 
     def read(self, number: int) -> DepthImage:

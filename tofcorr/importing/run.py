@@ -7,7 +7,7 @@ at a time. Writing and reporting are the same for all (`run_import`).
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,13 +20,12 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.files import staged_folder
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
+from tofcorr.progress import through
 
 FILE_NAME = "import.json"
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-Progress = Callable[[Iterable[Item], str], Iterable[Item]]
-"""Wraps an iterable to show how far a step (named by the text) has come."""
 Frame = tuple[FrameRow, np.ndarray, np.ndarray | None, np.ndarray | None]
 """Row, depth, amplitude and mask of one frame, as `RecordingWriter.append` takes them."""
 Refused = dict[str, str]
@@ -37,41 +36,40 @@ class RefusedViewError(CalibrationDataError):
     """One view cannot be used; the message says why, and the import goes on without it."""
 
 
-def no_progress(items: Iterable[Item], _: str) -> Iterable[Item]:
-    """Show nothing."""
-    return items
-
-
 class Sieve:
     """Applies the steps of an import to its views and collects the refusals.
 
     Args:
         source: What the views are read from, for messages.
-        progress: Shows how far a step has come.
 
     Attributes:
         refused: The views refused so far, with reasons.
     """
 
-    def __init__(self, source: str, progress: Progress = no_progress) -> None:
-        self._source, self.progress = source, progress
+    def __init__(self, source: str) -> None:
+        self._source = source
         self.refused: Refused = {}
 
     def apply(
-        self, step: Callable[[Item], Result], views: Iterable[Item], name: Callable[[Item], str]
+        self,
+        step: Callable[[Item], Result],
+        views: Sequence[Item],
+        name: Callable[[Item], str],
+        doing: str,
     ) -> list[Result]:
-        """Apply `step` to each view and leave out those that it refuses.
+        """Apply `step` to each view, show how many have passed, and leave out those it refuses.
 
         Args:
             step: Raises `RefusedViewError` for a view that cannot be used.
             views: The views.
             name: Returns the name of a view, for its refusal.
+            doing: What the step does, in a word or two.
 
         Raises:
             CalibrationDataError: No view is left.
         """
         results = []
-        for view in views:
+        for view in through(views, doing, "view"):
             try:
                 results.append(step(view))
             except RefusedViewError as refusal:
@@ -111,7 +109,6 @@ def run_import(
     options: Options,
     prepare: Callable[[Sieve], PreparedImport],
     out: Path,
-    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Turn the images of a source into a recording, and return the content of its `import.json`.
 
@@ -120,14 +117,13 @@ def run_import(
         options: How they are read, for the report.
         prepare: Reads the views and finds out everything but the frames themselves.
         out: The recording to write; it must not exist yet.
-        progress: Shows how far a step has come.
 
     Raises:
         CalibrationDataError: No view can be used, the source contradicts itself, or `out` exists
             or cannot be written.
     """
     with staged_folder(out) as folder:
-        sieve = Sieve(source, progress)
+        sieve = Sieve(source)
         prepared = prepare(sieve)
         report = {
             "format": "tofcorr-import",
@@ -141,9 +137,9 @@ def run_import(
             "warnings": prepared.warnings,
         }
         inner = folder / "recording"
-        numbers = progress(range(len(prepared.views)), "writing")
+        written = through(prepared.frames, "writing", "view", len(prepared.views))
         with prepared.writer(inner) as writer:
-            for _, (row, depth, amplitude, mask) in zip(numbers, prepared.frames, strict=True):
+            for row, depth, amplitude, mask in written:
                 writer.append(depth, row=row, amplitude=amplitude, mask=mask)
         for path in inner.iterdir():
             path.rename(folder / path.name)
@@ -159,8 +155,7 @@ def report_text(report: Mapping[str, Any]) -> str:
 
 def camera_mapping(camera: CameraIntrinsics, source: str) -> dict[str, Any]:
     """Return what `import.json` says of the camera intrinsics."""
-    size = {"source": source, "width": camera.width, "height": camera.height}
-    return size | {"K": camera.matrix, "distortion": camera.distortion}
+    return {"source": source, **camera.section()}
 
 
 def _measured(value: Any) -> Any:  # noqa: ANN401 - of plain values

@@ -5,19 +5,18 @@ from typing import Any
 
 import click
 
-from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
     option,
     posed_options,
     print_report,
-    progress_bar,
+    recording_out_option,
     take_posed_options,
 )
 
 
 @click.command(name="bop")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
+@recording_out_option
 @option("--amplitude", "Names of 16-bit amplitude images, such as 'gray/*.png'; left out: none.")
 @option("--intrinsics", "For HDF5 without cam_K: a file, or a shipped name.")
 @posed_options
@@ -31,4 +30,4 @@ def command(scene: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cli
     from tofcorr.importing.bop.scene import import_scene
 
     options = take_posed_options(given)
-    print_report(import_scene(scene, out, options, **given, progress=progress_bar), out)
+    print_report(import_scene(scene, out, options, **given), out)

@@ -20,7 +20,6 @@ from tofcorr.importing.numbers import any_numbers, finite_numbers, read_text
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.posed import import_posed
 from tofcorr.importing.robot_images import PosedOptions, RobotImages
-from tofcorr.importing.run import Progress, no_progress
 
 _FILE_NAME = "scene_camera.json"
 _POSE_KEYS = ("cam2world_matrix", "cam2world", "cam_pose")
@@ -35,7 +34,6 @@ def import_scene(
     *,
     amplitude: str | None = None,
     intrinsics: str | None = None,
-    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Turn a scene in BOP's layout, or a folder of HDF5 files, into a recording.
 
@@ -45,7 +43,6 @@ def import_scene(
         options: How to choose images and look for walls.
         amplitude: Names of amplitude images; BOP alone.
         intrinsics: A file or a shipped name; HDF5 alone.
-        progress: Shows how far a step has come.
 
     Raises:
         CalibrationDataError: The scene lacks something, such as poses; the message says what.
@@ -65,7 +62,7 @@ def import_scene(
         coding = DepthCoding(unit_mm=unit_mm)
         source = open_folder(scene, "depth/*.png", lens, coding, track, amplitude_pattern=amplitude)
     source = replace(source, tool_from_camera=np.eye(4))
-    return import_posed(source, out, options, progress)
+    return import_posed(source, out, options)
 
 
 def read_scene_camera(path: Path) -> tuple[GivenIntrinsics, float, PoseTrack]:

@@ -10,13 +10,12 @@ from typing import Any
 
 import click
 
-from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
     depth_kind_option,
     intrinsics_options,
     option,
     print_report,
-    progress_bar,
+    recording_out_option,
     take_intrinsics,
 )
 
@@ -49,7 +48,7 @@ _MARGIN = "How far the mask extends beyond the outermost inner corners; 1: edge 
 
 @click.command(name="checkerboard")
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
+@recording_out_option
 @option("--depth", "Names of the depth images.", "depth_pattern", default="{view}_depth.png")
 @option("--infrared", "Names of the infrared images.", "infrared_pattern", default="{view}_ir.png")
 @option("--board", _BOARD, required=True, type=BoardType())
@@ -74,4 +73,4 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     given["square_length"] = given.pop("square_mm") / 1000
     given["depth_unit"] = given.pop("depth_unit_mm") / 1000
     options = CheckerboardOptions.from_mapping(given, "tofcorr import checkerboard")
-    print_report(import_checkerboard(folder, out, options, intrinsics, progress_bar), out)
+    print_report(import_checkerboard(folder, out, options, intrinsics), out)

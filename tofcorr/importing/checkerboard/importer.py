@@ -44,12 +44,10 @@ from tofcorr.importing.intrinsics import GivenIntrinsics
 from tofcorr.importing.run import (
     Frame,
     PreparedImport,
-    Progress,
     Refused,
     RefusedViewError,
     Sieve,
     camera_mapping,
-    no_progress,
     run_import,
 )
 from tofcorr.options import Options
@@ -155,7 +153,6 @@ def import_checkerboard(
     out: Path,
     options: CheckerboardOptions,
     intrinsics: GivenIntrinsics | None,
-    progress: Progress = no_progress,
     *,
     coding: DepthCoding | None = None,
     amplitude_pattern: str | None = None,
@@ -170,7 +167,6 @@ def import_checkerboard(
         out: The recording to write; it must not exist yet.
         options: How to read the images.
         intrinsics: The camera intrinsics; None: calibrate them from the board.
-        progress: Shows how far a step has come.
         coding: How depth is to be read, where the infrared images may be previews; None: as
             `options` say, and infrared counts are the amplitudes.
         amplitude_pattern: With `coding`, names of the amplitude images; None: there are none.
@@ -183,7 +179,7 @@ def import_checkerboard(
         coding = DepthCoding(unit_mm=1000 * options.depth_unit, invalid=())
         amplitude_pattern = options.infrared_pattern
     prepare = BoardImport(folder, options, intrinsics, coding, amplitude_pattern).prepare
-    return run_import(str(folder), options, prepare, out, progress)
+    return run_import(str(folder), options, prepare, out)
 
 
 class BoardImport:
@@ -213,12 +209,13 @@ class BoardImport:
         options = self._options
         sieve.refused |= self._alone
         detect = partial(self._detect, refused=sieve.refused)
-        sieve.apply(detect, sieve.progress(list(self._files), "finding boards"), str)
+        sieve.apply(detect, list(self._files), str, "finding boards")
         about_camera, warnings = self._calibrate()
         self._rays = ray_directions(self._camera).numpy()
-        views = sieve.apply(self._place, sieve.progress(list(self._corners), "placing boards"), str)
+        views = sieve.apply(self._place, list(self._corners), str, "placing boards")
         ratio = typical_ratio(views)
-        views = sieve.apply(partial(refuse_mixed_up, ratio=ratio), views, lambda view: view.name)
+        refuse = partial(refuse_mixed_up, ratio=ratio)
+        views = sieve.apply(refuse, views, lambda view: view.name, "comparing boards")
         posed = [(self._corners[view.name], view.pose, view.error) for view in views]
         degeneracy = study_degeneracy(posed, self._board, self._camera, options.depth_kind)
         warnings += agreement_warnings(views, ratio, options.depth_kind)

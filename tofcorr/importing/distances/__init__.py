@@ -5,14 +5,13 @@ from typing import Any
 
 import click
 
-from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
     NumberList,
     option,
     pose_format_option,
     posed_options,
     print_report,
-    progress_bar,
+    recording_out_option,
     take_posed_options,
 )
 
@@ -22,7 +21,7 @@ _COUNTS = "Millimetres per count; left out: 1 for numbers typically above 20, el
 
 @click.command(name="distances")
 @click.argument("sources", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
+@recording_out_option
 @option("--poses", _POSES, type=click.Path(path_type=Path), multiple=True)
 @pose_format_option
 @option("--wall", "Name of each wall; left out: the source's.", "names", multiple=True)
@@ -47,4 +46,4 @@ def command(sources: tuple[Path, ...], out: Path, **given: Any) -> None:  # noqa
     options = take_posed_options(given)
     lens = sensor_lens(zones, given.pop("fov_deg"))
     images = open_distances(sources, zones, lens, **given)
-    print_report(import_posed(images, out, options, progress_bar), out)
+    print_report(import_posed(images, out, options), out)

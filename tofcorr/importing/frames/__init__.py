@@ -6,7 +6,6 @@ from typing import Any
 import click
 
 from tofcorr.errors import ConfigError
-from tofcorr.files import NewPath
 from tofcorr.importing.checkerboard import BoardType
 from tofcorr.importing.command_line import (
     coding_options,
@@ -15,7 +14,7 @@ from tofcorr.importing.command_line import (
     pose_format_option,
     posed_options,
     print_report,
-    progress_bar,
+    recording_out_option,
     take_coding,
     take_intrinsics,
     take_posed_options,
@@ -31,7 +30,7 @@ _TIMES = "List of 'time name' lines, where the images' names are no times."
 
 @click.command(name="frames")
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
+@recording_out_option
 @option("--depth", _DEPTH, "depth_pattern", required=True)
 @option("--amplitude", _AMPLITUDE, "amplitude_pattern")
 @option("--grey", _GREY, "grey_pattern")
@@ -72,7 +71,7 @@ def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any
     coding, track = take_coding(given), read_poses(given["poses"], given["pose_format"])
     more = {key: given[key] for key in ("amplitude_pattern", "times")}
     source = open_folder(folder, given["depth_pattern"], intrinsics, coding, track, **more)
-    return import_posed(source, out, options, progress_bar)
+    return import_posed(source, out, options)
 
 
 def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any]:
@@ -95,4 +94,4 @@ def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, An
     }
     options = CheckerboardOptions.from_mapping(mapping, "tofcorr import frames")
     lens, images = take_intrinsics(given), {"coding": coding, "amplitude_pattern": amplitude}
-    return import_checkerboard(folder, out, options, lens, progress_bar, **images)
+    return import_checkerboard(folder, out, options, lens, **images)

@@ -9,13 +9,12 @@ from typing import Any
 
 import click
 
-from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
     coding_options,
     option,
     posed_options,
     print_report,
-    progress_bar,
+    recording_out_option,
     take_coding,
     take_posed_options,
 )
@@ -23,7 +22,7 @@ from tofcorr.importing.command_line import (
 
 @click.command(name="rosbag")
 @click.argument("bag", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
+@recording_out_option
 @option("--depth", "Topic of the depth images.", "depth_topic", required=True)
 @option("--amplitude", "Topic of the amplitude (infrared) images, 16 bits.", "amplitude_topic")
 @option("--camera-info", "Topic of the intrinsics; left out: beside the images.")
@@ -45,5 +44,5 @@ def command(bag: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click
     topics = {key: given.pop(key) for key in ("amplitude_topic", "camera_info", "intrinsics")}
     with open_bag(bag, depth, coding, **frames, **topics) as images:
         options = take_posed_options(given, images.camera_frame)
-        report = import_posed(images, out, options, progress_bar)
+        report = import_posed(images, out, options)
     print_report(report, out)
