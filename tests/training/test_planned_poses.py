@@ -127,5 +127,5 @@ def test_a_start_that_is_no_pose_is_refused(
     monkeypatch.setattr(sys, "argv", [*arguments, "--start", "0,0,0,1,1,0,0"])
     with pytest.raises(SystemExit, match="2"):
         main()
-    assert "no unit quaternion" in capsys.readouterr().err
+    assert "--start: the quaternion x y z w has length 1.414" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

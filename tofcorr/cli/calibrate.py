@@ -9,6 +9,7 @@ from tofcorr.cli.shared import (
     FOLDER,
     config_options,
     force_option,
+    option,
     out_option,
     recording_option,
     run_option,
@@ -23,18 +24,21 @@ _TRAINING = "training.calibration:TrainingOptions"
 _EVALUATION = "comparison.options:EvaluationOptions"
 _SELECTION = "comparison.options:SelectionOptions"
 
+_PLANES = (
+    "Whether the recorded planes were measured (known) or are a start for the fit (unknown); auto: "
+    "as recording.yaml says."
+)
+_WALL = (
+    "What is known of the wall: nothing; that all frames show the same one and the robot's poses "
+    "are right; or its recorded plane."
+)
+_DRIFTED = "Offset or departure from a plane above which the camera counts as drifted."
+
 
 @click.command()
 @click.argument("recordings", nargs=-1, required=True, type=FOLDER)
-@click.option("--out", type=NewPath(), help="HTML page with pictures to write.")
-@click.option(
-    "--planes",
-    type=click.Choice(["auto", "known", "unknown"]),
-    default="auto",
-    show_default=True,
-    help="Whether the recorded planes were measured (known) or are a start for the fit (unknown); "
-    "auto: as recording.yaml says.",
-)
+@option("--out", "HTML page with pictures to write.", type=NewPath())
+@option("--planes", _PLANES, default="auto", type=click.Choice(["auto", "known", "unknown"]))
 def inspect_command(recordings: tuple[Path, ...], out: Path | None, planes: Any) -> None:  # noqa: ANN401
     """Look at recordings as an experienced user would, and say what is odd, with numbers.
 
@@ -54,9 +58,9 @@ def inspect_command(recordings: tuple[Path, ...], out: Path | None, planes: Any)
 @config_options(_TRAINING, "train", "The model and the training", "solver.max_iterations=30", "ea")
 @recording_option("Folder of a recording; may be given several times.", many=True)
 @out_option("Folder of the run, made anew.")
-@click.option("--resume", type=FOLDER, help="An interrupted run; the fit goes on where it stood.")
+@option("--resume", "An interrupted run; the fit goes on where it stood.", type=FOLDER)
 @force_option
-@click.option("--no-figures", is_flag=True, help="Draw no figures for TensorBoard.")
+@option("--no-figures", "Draw no figures for TensorBoard.", is_flag=True)
 def train_command(
     options: "TrainingOptions",
     recordings: tuple[Path, ...],
@@ -83,7 +87,7 @@ def train_command(
 @config_options(_EVALUATION, "evaluate", "The models and how they are compared", "seed=1", "paper")
 @recording_option("Images: one row of the tables; may be given several times.", many=True)
 @out_option("Folder of the report; must be new.")
-@click.option("--device", default=None, help="Where to compute; overrides the configuration.")
+@option("--device", "Where to compute; overrides the configuration.")
 @force_option
 def evaluate_command(
     options: "EvaluationOptions",
@@ -130,22 +134,9 @@ def select_command(
 @click.command()
 @run_option
 @recording_option("A few frames of any wall.", many=True)
-@click.option(
-    "--wall",
-    type=click.Choice(["per_image", "one", "recorded"]),
-    default="per_image",
-    show_default=True,
-    help="What is known of the wall: nothing; that all frames show the same one and the robot's "
-    "poses are right; or its recorded plane.",
-)
-@click.option(
-    "--threshold-mm",
-    type=float,
-    default=5.0,
-    show_default=True,
-    help="Offset or departure from a plane above which the camera counts as drifted.",
-)
-@click.option("--out", type=ReplacedFile(), help="JSON file to write.")
+@option("--wall", _WALL, default="per_image", type=click.Choice(["per_image", "one", "recorded"]))
+@option("--threshold-mm", _DRIFTED, default=5.0)
+@option("--out", "JSON file to write.", type=ReplacedFile())
 @force_option
 def check_command(run: Path, recordings: tuple[Path, ...], **given: Any) -> None:  # noqa: ANN401
     """Measure a calibration again on a few frames and say how far the camera has drifted.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tofcorr.cli.shared import FOLDER, out_option, recording_option, run_option
+from tofcorr.cli.shared import FOLDER, option, out_option, recording_option, run_option
 from tofcorr.correction.export.registry import FORMATS
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.files import NewPath, ReplacedFile
@@ -19,16 +19,15 @@ if TYPE_CHECKING:
     from tofcorr.correction.metadata import CorrectorMetadata
     from tofcorr.data.recording import Recording
 
+_CLOUDS = "Folder of point clouds, made anew: frame_000_before.ply, frame_000_after.ply, ..."
+_FORMATS = " ".join(f"{one.name} ({one.ending}): {one.summary}." for one in FORMATS.values())
+
 
 @click.command()
-@click.option("--model", required=True, type=FOLDER, help="The corrector.ts of a run.")
+@option("--model", "The corrector.ts of a run.", required=True, type=FOLDER)
 @recording_option("Folder of the recording to correct.")
-@click.option("--out", type=NewPath(), help="Folder of the corrected recording, made anew.")
-@click.option(
-    "--ply",
-    type=NewPath(),
-    help="Folder of point clouds, made anew: frame_000_before.ply, frame_000_after.ply, ...",
-)
+@option("--out", "Folder of the corrected recording, made anew.", type=NewPath())
+@option("--ply", _CLOUDS, type=NewPath())
 def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Path | None) -> None:
     """Write a recording anew with corrected depth, its point clouds, or both.
 
@@ -112,16 +111,9 @@ def _last_line(error: Exception) -> str:
 
 @click.command()
 @run_option
-@click.option(
-    *("--format", "name"),
-    required=True,
-    type=click.Choice(list(FORMATS)),
-    help=" ".join(f"{one.name} ({one.ending}): {one.summary}." for one in FORMATS.values()),
-)
+@option("--format", _FORMATS, "name", required=True, type=click.Choice(list(FORMATS)))
 @out_option("File to write; an older one is replaced.", ReplacedFile())
-@click.option(
-    "--device", default="cpu", show_default=True, help="What pt2 is compiled for: cpu or cuda."
-)
+@option("--device", "What pt2 is compiled for: cpu or cuda.", default="cpu")
 def export_command(run: Path, name: str, out: Path, device: str) -> None:
     """Write the corrector of a run, or the camera's pose, once it agrees with the calibration.
 

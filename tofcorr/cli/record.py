@@ -9,7 +9,7 @@ import click
 
 from tofcorr.cli.shared import LazyGroup, config_options, out_option
 from tofcorr.files import ReplacedFile
-from tofcorr.importing.command_line import NumberList, intrinsics_options, take_intrinsics
+from tofcorr.importing.command_line import NumberList, intrinsics_options, option, take_intrinsics
 from tofcorr.importing.registry import IMPORTERS
 
 if TYPE_CHECKING:
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 _TRAINING = "training.calibration:TrainingOptions"
 _POSE = {"type": NumberList(7), "metavar": "X,Y,Z,QX,QY,QZ,QW"}
+_PAIR = {"nargs": 2, "type": float}
+_DISTANCES = "Distances to the wall at which the camera will be used, metres."
+_START = "The tool's pose where the camera looks squarely at the wall; else poses are relative."
+_GUESS = "A guess of the camera's pose on the tool; else the tool's axes are the camera's."
 
 
 @click.command()
@@ -27,37 +31,16 @@ _POSE = {"type": NumberList(7), "metavar": "X,Y,Z,QX,QY,QZ,QW"}
     _TRAINING, "train", "The model that will be trained", "solver.max_iterations=30", "ea"
 )
 @intrinsics_options
-@click.option("--size", nargs=2, type=int, required=True, metavar="W H", help="Image size, pixels.")
-@click.option(
-    "--distance",
-    nargs=2,
-    type=float,
-    required=True,
-    metavar="NEAR FAR",
-    help="Distances to the wall at which the camera will be used, metres.",
-)
-@click.option("--number", default=24, show_default=True, type=click.IntRange(1, 200))
-@click.option("--tilt", "tilt_deg", default=35.0, show_default=True, help="Largest tilt, degrees.")
-@click.option("--roll", "roll_deg", default=90.0, show_default=True, help="Largest roll, degrees.")
-@click.option(
-    *("--wall", "wall_size"),
-    nargs=2,
-    type=float,
-    metavar="W H",
-    help="Size of the free wall, metres; else large.",
-)
-@click.option("--checkerboard", is_flag=True, help="The wall carries a pattern of dark and bright.")
-@click.option(
-    "--start",
-    **_POSE,
-    help="The tool's pose where the camera looks squarely at the wall; else poses are relative.",
-)
-@click.option("--start-distance", type=float, help="To the wall there, metres; else the middle.")
-@click.option(
-    "--hand-eye",
-    **_POSE,
-    help="A guess of the camera's pose on the tool; else the tool's axes are the camera's.",
-)
+@option("--size", "Image size, pixels.", nargs=2, type=int, required=True, metavar="W H")
+@option("--distance", _DISTANCES, **_PAIR, required=True, metavar="NEAR FAR")
+@option("--number", "How many poses.", default=24, type=click.IntRange(1, 200))
+@option("--tilt", "Largest tilt, degrees.", "tilt_deg", default=35.0)
+@option("--roll", "Largest roll, degrees.", "roll_deg", default=90.0)
+@option("--wall", "Size of the free wall, metres; else large.", "wall_size", **_PAIR, metavar="W H")
+@option("--checkerboard", "The wall carries a pattern of dark and bright.", is_flag=True)
+@option("--start", _START, **_POSE)
+@option("--start-distance", "To the wall there, metres; else the middle.", type=float)
+@option("--hand-eye", _GUESS, **_POSE)
 @out_option("CSV file of poses; an older one is replaced.", ReplacedFile())
 def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None:  # noqa: ANN401
     """Write tool poses that determine the hand-eye transform and the model best.
@@ -93,18 +76,11 @@ def _transform(values: tuple[float, ...] | None, key: str) -> "np.ndarray | None
     if values is None:
         return None
     import numpy as np
-    from scipy.spatial.transform import Rotation
 
-    from tofcorr.data.table import UNIT_LENGTH_TOLERANCE
-    from tofcorr.errors import ConfigError
+    from tofcorr.importing.pose_files import rigid_transforms
 
-    if abs(float(np.linalg.norm(values[3:])) - 1) > UNIT_LENGTH_TOLERANCE:
-        named = f"--{key.replace('_', '-')}"
-        raise ConfigError(f"{named}: the last four numbers are no unit quaternion x y z w.")
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
-    transform[:3, 3] = values[:3]
-    return transform
+    row = np.array([values])
+    return rigid_transforms(row[:, :3], row[:, 3:], lambda _: f"--{key.replace('_', '-')}")[0]
 
 
 def _table(plan: "PosePlan", start: "np.ndarray") -> str:

@@ -10,6 +10,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from tofcorr.files import NewPath
+from tofcorr.importing.command_line import option
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 FOLDER = click.Path(path_type=Path)
@@ -57,13 +58,8 @@ def _log_every_step(context: click.Context, option: click.Parameter, asked: bool
         log_to_stderr()
 
 
-_VERBOSE = click.option(
-    "--verbose",
-    is_flag=True,
-    expose_value=False,
-    callback=_log_every_step,
-    help="Log every step to standard error, in place of progress bars.",
-)
+_LOGGED = "Log every step to standard error, in place of progress bars."
+_VERBOSE = option("--verbose", _LOGGED, is_flag=True, expose_value=False, callback=_log_every_step)
 
 
 class ConfigName(click.ParamType):
@@ -84,29 +80,24 @@ class ConfigName(click.ParamType):
         return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
-force_option = click.option(
-    "--force",
-    is_flag=True,
-    help="Go on although `tofcorr inspect` finds that the recording cannot be what it says.",
-)
+_FORCED = "Go on although `tofcorr inspect` finds that the recording cannot be what it says."
+force_option = option("--force", _FORCED, is_flag=True)
 """The option of every command that looks at a recording first; the command receives a bool."""
 
 
-run_option = click.option(
-    "--run", required=True, type=FOLDER, help="Folder that tofcorr train made."
-)
+run_option = option("--run", "Folder that tofcorr train made.", required=True, type=FOLDER)
 """The option of every command that uses a calibration; the command receives a path."""
 
 
 def out_option(text: str, kind: click.ParamType | None = None) -> Callable[[Command], Command]:
     """Add `--out`, a name that is new unless another kind is given; the command receives a path."""
-    return click.option("--out", required=True, type=kind or NewPath(), help=text)
+    return option("--out", text, required=True, type=kind or NewPath())
 
 
 def recording_option(text: str, *, many: bool = False) -> Callable[[Command], Command]:
     """Add `--recording`; the command receives `recording_path`, or, of many, `recordings`."""
-    named = ("--recording", "recordings" if many else "recording_path")
-    return click.option(*named, required=True, multiple=many, type=FOLDER, help=text)
+    named = "recordings" if many else "recording_path"
+    return option("--recording", text, named, required=True, multiple=many, type=FOLDER)
 
 
 def config_options(
@@ -122,9 +113,7 @@ def config_options(
         default: Name of the configuration used without `--config`; None: it must be given.
     """
     # For click a default of None is a value given, so --config would no longer be required.
-    need: dict[str, Any] = (
-        {"required": True} if default is None else {"default": default, "show_default": True}
-    )
+    need = {"required": True} if default is None else {"default": default}
     known = f"{what}: a shipped name (see: tofcorr configs) or a YAML file."
     changed = f"Change one option, such as --set {example}; may be repeated."
     module, _, name = options.partition(":")
@@ -137,10 +126,8 @@ def config_options(
             kind = getattr(import_module(f"tofcorr.{module}"), name)
             return command(resolve_options(kind, config, changes), **given)
 
-        option = click.option("--config", type=ConfigName(folder), help=known, **need)
-        change = ("--set", "changes")
-        return option(
-            click.option(*change, multiple=True, metavar="KEY=VALUE", help=changed)(resolved)
-        )
+        named = option("--config", known, type=ConfigName(folder), **need)
+        change = option("--set", changed, "changes", multiple=True, metavar="KEY=VALUE")
+        return named(change(resolved))
 
     return decorated

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tofcorr.cli.shared import config_options, force_option, out_option, recording_option
+from tofcorr.cli.shared import config_options, force_option, option, out_option, recording_option
 
 if TYPE_CHECKING:
     from tofcorr.diagnosis.options import DiagnosisOptions
@@ -14,12 +14,21 @@ if TYPE_CHECKING:
 _SIMULATOR = "simulation.options:SimulatorOptions"
 _DIAGNOSIS = "diagnosis.options:DiagnosisOptions"
 
+_SENSOR = (
+    "The camera: a shipped name such as kinect_v2, the report of a diagnosis, or its sensor.yaml."
+)
+_LIGHT = "What amplitude.npy of the ideal recording holds: the camera's units, or a share 0 to 1."
+_SIM = (
+    "Simulator under diagnosis: YAML file or shipped name of the built-in one, or a recording that "
+    "any other one rendered; without it a simulator is fitted to the recording."
+)
+
 
 @click.command()
 @config_options(_SIMULATOR, "simulate", "Camera, scene and robot", "robot.tilt_deg=20")
 @out_option("Folder of the recording, made anew.")
-@click.option("--seed", type=click.IntRange(min=0), help="Instead of the seed in the file.")
-@click.option("--frames", type=click.IntRange(min=1), help="Take only so many frames.")
+@option("--seed", "Instead of the seed in the file.", type=click.IntRange(min=0))
+@option("--frames", "Take only so many frames.", type=click.IntRange(min=1))
 def simulate_command(
     options: "SimulatorOptions", out: Path, seed: int | None, frames: int | None
 ) -> None:
@@ -37,23 +46,12 @@ def simulate_command(
 
 
 @click.command()
-@click.option(
-    "--sensor",
-    required=True,
-    help="The camera: a shipped name such as kinect_v2, or the report of a diagnosis, or its "
-    "sensor.yaml.",
-)
+@option("--sensor", _SENSOR, required=True)
 @recording_option("Folder of the ideal recording, rendered with the camera's intrinsics.")
 @out_option("Folder of the degraded recording, made anew.")
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of all random draws."
-)
-@click.option(
-    "--amplitude-is",
-    type=click.Choice(["amplitude", "reflectivity"]),
-    default="amplitude",
-    show_default=True,
-    help="What amplitude.npy of the ideal recording holds: the camera's units, or a share 0 to 1.",
+@option("--seed", "Of all random draws.", default=0, type=click.IntRange(min=0))
+@option(
+    "--amplitude-is", _LIGHT, default="amplitude", type=click.Choice(["amplitude", "reflectivity"])
 )
 def degrade_command(sensor: str, recording_path: Path, out: Path, **given: Any) -> None:  # noqa: ANN401
     """Write what a real camera would have measured where an ideal one recorded.
@@ -79,12 +77,7 @@ def degrade_command(sensor: str, recording_path: Path, out: Path, **given: Any) 
 
 @click.command()
 @recording_option("Folder of the real recording.")
-@click.option(
-    "--sim",
-    "simulator",
-    help="Simulator under diagnosis: YAML file or shipped name of the built-in one, or a recording "
-    "that any other one rendered; without it a simulator is fitted to the recording.",
-)
+@option("--sim", _SIM, "simulator")
 @config_options(
     _DIAGNOSIS, "diagnose", "Base model, tests and catalogue", "tests.level=0.01", "default"
 )
