@@ -44,8 +44,8 @@ class ImageArray:
     per_frame: tuple[int, ...] = ()
     required: bool = False
     low: float = -inf
-    high: float
-    expected: str
+    high: float = LARGEST_NUMBER
+    expected: str = f"expected at most {LARGEST_NUMBER:g}"
 
     def file(self, folder: Path) -> Path:
         """Return its file in the folder of a recording."""
@@ -88,20 +88,9 @@ IMAGE_ARRAYS = {
     array.name: array
     for array in (
         ImageArray(name="depth", required=True, high=LARGEST_DISTANCE, expected=_DISTANCE),
-        ImageArray(
-            name="amplitude",
-            low=0,
-            high=LARGEST_NUMBER,
-            expected=f"expected 0 to {LARGEST_NUMBER:g}",
-        ),
+        ImageArray(name="amplitude", low=0, expected=f"expected 0 to {LARGEST_NUMBER:g}"),
         ImageArray(name="mask", dtype=np.uint8, low=0, high=1, expected="expected 0 or 1"),
-        ImageArray(
-            name="raw",
-            per_frame=(4,),
-            low=-LARGEST_NUMBER,
-            high=LARGEST_NUMBER,
-            expected=f"expected at most {LARGEST_NUMBER:g}",
-        ),
+        ImageArray(name="raw", per_frame=(4,), low=-LARGEST_NUMBER),
         ImageArray(name="true_depth", high=LARGEST_DISTANCE, expected=_DISTANCE),
     )
 }

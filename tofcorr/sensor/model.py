@@ -205,7 +205,8 @@ class SensorModel(DescribedModule):
         Beyond them the error at the range's edge is used. Without an amplitude only the distance
         counts.
         """
-        return self.base.covers(true_depth * self.eye.radial_of_depth.to(true_depth), amplitude)
+        radial = true_depth * self.eye.radial_of_depth.to(true_depth)
+        return self.base.limits.holds(radial, amplitude)
 
     def frame_shift(self, count: int, **conditions: Condition) -> Tensor:
         """Return what effects of whole frames (warm-up, temperature) add, shape (B,), metres.

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv1d
 
 from tofcorr.correction.model import signal_error
-from tofcorr.error_terms.base import Domain, Interval
+from tofcorr.error_terms.base import EVERYTHING, Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.noise import NoiseModel
@@ -17,7 +17,6 @@ from tofcorr.sensor.sensor_file import ErrorSection
 # How often the measured distance is put into its own error. Each time the deviation is multiplied
 # by the slope of the error, 0.05 at most: after 3 times 6e-6 of the error is left. Derived.
 _ITERATIONS = 3
-_ANY = Interval(-math.inf, math.inf)
 
 
 class BaseError(nn.Module):
@@ -77,22 +76,13 @@ class BaseError(nn.Module):
         fixed = self.model.pixel_error()
         if conditions is not None and len(self.model.condition_terms):
             fixed = fixed + self.model.condition_error(conditions)[..., None, None]
-        held = amplitude.clamp(*(self.limits.amplitude or _ANY))
+        held = amplitude.clamp(*(self.limits.amplitude or EVERYTHING))
+        bounds = self.limits.normalised_amplitude or EVERYTHING
         error = torch.zeros_like(true)
         for _ in range(1 + _ITERATIONS if self.reads_measured else 1):
             distance = (true + error).clamp(*self.limits.radial_distance)
-            bounds = self.limits.normalised_amplitude or _ANY
             error = fixed + signal_error(self.model, distance, held, bounds)
         return error.expand(true.shape)
-
-    def covers(self, distance: Tensor, amplitude: Tensor | None) -> Tensor:
-        """Return where distance, and amplitude if given, are within their measured ranges, bool."""
-        near, far = self.limits.radial_distance
-        inside = (distance >= near) & (distance <= far)
-        if amplitude is None:
-            return inside
-        dark, bright = self.limits.amplitude or _ANY
-        return inside & (amplitude >= dark) & (amplitude <= bright)
 
 
 def error_model_of(section: ErrorSection, domain: Domain) -> ErrorModel:

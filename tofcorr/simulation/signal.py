@@ -18,7 +18,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from tofcorr.geometry.rays import phase_from_radial_distance, unambiguous_range
+from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Count, NonNegativeNumber, Number, Options, PositiveNumber
 
 
@@ -317,30 +317,6 @@ def harmonic_tensors(harmonics: Sequence[Harmonic]) -> tuple[Tensor, Tensor]:
     angle = torch.tensor(phases, dtype=torch.float64)
     phasors = torch.tensor(shares, dtype=torch.float64) * torch.exp(1j * angle)
     return torch.tensor(orders, dtype=torch.float64), phasors
-
-
-def signal_phasors(
-    orders: Tensor,
-    relative: Tensor,
-    amplitude: Tensor,
-    optical_distance: Tensor,
-    modulation_frequency: float,
-) -> Tensor:
-    """Return the phasor of each harmonic in each pixel.
-
-    Args:
-        orders: Shape (M,).
-        relative: Phasors relative to that of the fundamental, shape (M,), complex.
-        amplitude: Of the fundamental, shape (H, W).
-        optical_distance: Radial distance and delays, shape (H, W), metres.
-        modulation_frequency: Hz.
-
-    Returns:
-        amplitude relative_m exp(1j m phase), shape (M, H, W), complex128.
-    """
-    phase = phase_from_radial_distance(optical_distance, modulation_frequency)
-    turned = torch.exp(1j * (orders[:, None, None] * phase))
-    return relative[:, None, None] * amplitude * turned
 
 
 def correlation_samples(

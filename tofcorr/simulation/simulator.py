@@ -38,7 +38,6 @@ from tofcorr.simulation.signal import (
     distance_from_phase,
     harmonic_tensors,
     read_out,
-    signal_phasors,
 )
 
 Reflectivity = Literal["pattern", "from_recording"]
@@ -136,10 +135,8 @@ class SensorPipeline:
 
     def _signal(self, state: FrameState) -> None:
         state.orders, relative = self._harmonics
-        distance = state.radial_distance + state.delay
-        signal = signal_phasors(
-            state.orders, relative, state.amplitude, distance, state.modulation_frequency
-        )
+        turned = state.path_phasor(state.radial_distance + state.delay)
+        signal = relative[:, None, None] * state.amplitude * turned
         # Pixels without return are dark. A NaN would spread when an effect blurs the signal.
         state.signal = signal.masked_fill(signal.isnan(), 0.0)
 
