@@ -20,6 +20,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from pickle import UnpicklingError
+from tokenize import TokenError
 from typing import Any
 
 import click
@@ -282,9 +284,12 @@ def _remove(path: Path) -> None:
 
 _RECORD = "extra/tofcorr_seal"
 
-# What zipfile and the decompressors raise on a damaged archive.
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError)
-_UNREADABLE += (zipfile.BadZipFile, zlib.error, lzma.LZMAError, TypeError, MemoryError)
+UNREADABLE = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, RuntimeError),
+    *(SyntaxError, TokenError, MemoryError, ArithmeticError, UnpicklingError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
+)
+"""What NumPy, torch, zipfile, and the parsers of their headers raise on damaged bytes."""
 
 # Attribute of a folder in a zip archive, as DOS had it. torch takes what is marked so for empty and
 # leaves the memory of its numbers as it was; zipfile reads it.
@@ -331,7 +336,7 @@ def refuse_damaged(path: Path, what: str) -> None:
         raise CalibrationDataError(f"{path}: there is no such file; expected {what}.") from None
     except IsADirectoryError:
         raise CalibrationDataError(f"{path}: is a folder; expected {what}, a file.") from None
-    except _UNREADABLE:
+    except UNREADABLE:
         if not zipfile.is_zipfile(path):
             raise CalibrationDataError(f"{path}: is not {what}, or is cut short.") from None
         raise CalibrationDataError(f"{path}: is damaged; expected {what}.") from None

@@ -1,24 +1,19 @@
 """The corrector as a look-up table, for programs that have NumPy and nothing else."""
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from tofcorr.correction.metadata import LutMetadata
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files import UNREADABLE
 
 FORMAT = "tofcorr-lut"
-_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError)
-# What NumPy and zipfile raise on a damaged archive; its arrays' headers add the last lines.
-_UNREADABLE += (SyntaxError, TokenError, MemoryError, NotImplementedError, zlib.error)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +83,7 @@ def read_lut(path: Path | str) -> LookupTable:
             arrays = {n: np.asarray(file[n]) for n in ("offset", "table", "radial_of_z")}
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
-    except (*_UNREADABLE, zipfile.BadZipFile):
+    except UNREADABLE:
         raise CalibrationDataError(
             f"{path}: is not a look-up table that tofcorr export wrote."
         ) from None

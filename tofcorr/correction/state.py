@@ -2,7 +2,6 @@
 
 import io
 import math
-import pickle
 import platform
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -17,7 +16,7 @@ from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError, TofcorrError
-from tofcorr.files import refuse_damaged, sealed, staged_file
+from tofcorr.files import UNREADABLE, refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
 from tofcorr.options import LARGEST_NUMBER, FiniteNumber, Options, PositiveNumber, one_line
 from tofcorr.version import __version__
@@ -27,8 +26,6 @@ STATE_FILE = "state.pt"
 
 _FORMAT = "tofcorr-state"
 _WHAT = "a calibration that tofcorr train wrote"
-_UNREADABLE = (OSError, RuntimeError, EOFError, pickle.UnpicklingError)
-_UNREADABLE += (ValueError, LookupError, TypeError, AttributeError)
 
 _Three = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
 
@@ -280,7 +277,7 @@ def read_values(path: Path, form: str) -> dict[str, Any] | None:
     """
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
-    except _UNREADABLE:
+    except UNREADABLE:
         return None
     if not isinstance(values, dict) or str(values.get("format")) != form:
         return None

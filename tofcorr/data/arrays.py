@@ -1,6 +1,5 @@
 """The `.npy` files of a recording: which there are, read in chunks, checked, and written."""
 
-import tokenize
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files import UNREADABLE
 from tofcorr.options import LARGEST_NUMBER
 
 # Size of a chunk of frames, bytes. Set by hand: large enough for fast reads, small for any memory.
@@ -18,11 +18,6 @@ _CHUNK_BYTES = 16_000_000
 LARGEST_DISTANCE = 1e6
 """Largest distance and coordinate that is accepted, metres. Chosen: beyond any camera's range in
 any unit; drivers write larger numbers, such as the largest of float32, for "no return"."""
-# All errors that NumPy raises on a damaged header: its own ValueError and those of its parser.
-_UNREADABLE = (
-    *(ValueError, OSError, EOFError, SyntaxError, tokenize.TokenError, TypeError, KeyError),
-    *(AttributeError, IndexError, OverflowError, RecursionError, MemoryError),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +110,7 @@ def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
             array = np.lib.format.open_memmap(path, mode="r")
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         reason = " ".join(str(error).split())[:200]
         raise CalibrationDataError(f"{path}: not a readable .npy file ({reason}).") from None
     if array.dtype != np.dtype(dtype):

@@ -4,13 +4,13 @@ import re
 import reprlib
 from collections.abc import Callable
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from tofcorr import options
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files import UNREADABLE
 from tofcorr.options import one_line
 
 _LARGEST = 2**28
@@ -78,11 +78,10 @@ def load_numbers(path: Path, refused: Callable[[str], Exception]) -> np.ndarray:
         refused: Makes an error of what is wrong: the file cannot be read, is damaged, or holds
             something else; a text of one line.
     """
-    unreadable = (OSError, EOFError, SyntaxError, TokenError, ArithmeticError, MemoryError)
     try:
         # Mapped, a header that promises more than the file holds is refused before memory is taken.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (*unreadable, ValueError) as error:
+    except UNREADABLE as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
         raise refused(f"not a readable NPY array ({first[:150]})") from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
