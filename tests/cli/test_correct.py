@@ -100,9 +100,13 @@ def test_the_batch_size_does_not_change_the_result(tmp_path: Path, source: Path)
     recording = Recording.open(source)
     corrector = ConstantCorrector("{}")
     steps: list[int] = []
+
+    def counted(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        steps.append(len(depth))
+        return corrector(depth, amplitude)
+
     for name, pixels in {"one": 1, "three": 3 * 35, "all": 10**6}.items():
-        how = {"chunk_pixels": pixels, "progress": steps.append}
-        write_corrected(corrector, recording, tmp_path / name, **how)
+        write_corrected(counted, recording, tmp_path / name, chunk_pixels=pixels)
     assert steps == [1, 1, 1, 1, 1, 1, 3, 3, 6]
     for other in ("three", "all"):
         for name in ("depth.npy", "mask.npy", "amplitude.npy", "frames.csv", "recording.yaml"):

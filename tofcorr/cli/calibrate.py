@@ -115,11 +115,7 @@ def evaluate_command(
 @recording_option("Folder of a recording; several are taken together.", many=True)
 @out_option("New folder.")
 @force_option
-def select_command(
-    options: "SelectionOptions",
-    recordings: tuple[Path, ...],
-    **given: Any,  # noqa: ANN401
-) -> None:
+def select_command(options: "SelectionOptions", recordings: tuple[Path, ...], **given: Any) -> None:  # noqa: ANN401
     """Compare models on images, distances and targets that they were not fitted to.
 
     Names the simplest model within one standard error of the best, and those that do not differ

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,6 @@ from tofcorr.cli.shared import FOLDER, option, out_option, recording_option, run
 from tofcorr.correction.export.registry import FORMATS
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.files import NewPath, ReplacedFile
-from tofcorr.progress import bar
 
 if TYPE_CHECKING:
     from tofcorr.correction.metadata import CorrectorMetadata
@@ -49,8 +48,8 @@ def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Pa
     corrector, metadata = load_corrector(model)
     _refuse_another_camera(metadata, recording, model)
     if out is not None:
-        with _progress(recording, model) as advance:
-            share = write_corrected(corrector, recording, out, progress=advance)
+        with _refused_by(model):
+            share = write_corrected(corrector, recording, out)
         if recording.raw is not None:
             left_out = "raw.npy was left out: it would disagree with the corrected depth."
             click.echo(left_out, err=True)
@@ -59,21 +58,20 @@ def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Pa
             "return lie in the calibrated range."
         )
     if ply is not None:
-        with _progress(recording, model) as advance:
-            write_point_clouds(corrector, recording, ply, progress=advance)
+        with _refused_by(model):
+            write_point_clouds(corrector, recording, ply)
         click.echo(f"{ply}: point clouds of {recording.num_frames} frames, before and after.")
 
 
 @contextmanager
-def _progress(recording: "Recording", model: Path) -> Iterator[Callable[[int], object]]:
-    """Show progress over the frames; turn the corrector's own refusals into one sentence."""
+def _refused_by(model: Path) -> Iterator[None]:
+    """Turn the corrector's own refusals into one sentence."""
     import torch
 
-    with bar(recording.num_frames, "correcting") as advance:
-        try:
-            yield advance
-        except (RuntimeError, torch.jit.Error) as error:
-            raise CalibrationDataError(f"{model}: {_last_line(error)}") from None
+    try:
+        yield
+    except (RuntimeError, torch.jit.Error) as error:
+        raise CalibrationDataError(f"{model}: {_last_line(error)}") from None
 
 
 def _refuse_another_camera(

@@ -100,10 +100,6 @@ def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
             )
 
 
-_HEADER_KEY = {
-    "modulation_frequency": "modulation_frequency_hz",
-    "saturation_amplitude": "saturation_amplitude",
-}
 # Successive frames count as one pose if no entry of pose or plane differs from the first of them by
 # more than this, metres or no unit. Chosen: a robot that stands still reports its joints to about
 # 0.05 mm and 0.05 mrad.
@@ -252,8 +248,9 @@ class Recording:
     def _where(self, name: str) -> str:
         if name in COLUMN_OF:
             return f"{self.path / TABLE_FILE}: column '{COLUMN_OF[name]}'"
-        if name in _HEADER_KEY:
-            return f"{self.path / HEADER_FILE}: '{_HEADER_KEY[name]}'"
+        key = f"{name}_hz" if name == "modulation_frequency" else name
+        if key in Header.model_fields:
+            return f"{self.path / HEADER_FILE}: '{key}'"
         return f"{self.path}: {name}.npy"
 
     def _check_images(self, *, contents: bool) -> None:

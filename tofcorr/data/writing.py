@@ -33,6 +33,7 @@ from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.geometry.se3 import refuse_unless_rigid
 from tofcorr.options import dump_yaml
+from tofcorr.progress import bar
 
 
 class RecordingWriter:
@@ -279,7 +280,6 @@ def write_corrected(
     path: Path | str,
     *,
     chunk_pixels: int = 2_000_000,
-    progress: Callable[[int], object] = lambda frames: None,
 ) -> float:
     """Write a copy of `recording` with corrected depth, in memory bounded by `chunk_pixels`.
 
@@ -291,7 +291,6 @@ def write_corrected(
         recording: The recording to correct.
         path: The folder to write; it must not exist yet.
         chunk_pixels: Pixels corrected at once, but at least one frame.
-        progress: Called with the number of frames written since the last call.
 
     Returns:
         The share of the pixels on the target with a return that are in the calibrated range.
@@ -309,17 +308,10 @@ def write_corrected(
                 writer.append(frame, amplitude=strength, mask=kept[i])
             num_returns += int((_returned(depth) & on_target).sum())
             num_valid += int(kept.sum())
-            progress(len(depth))
     return num_valid / max(1, num_returns)
 
 
-def write_point_clouds(
-    corrector: Corrector,
-    recording: Recording,
-    path: Path | str,
-    *,
-    progress: Callable[[int], object] = lambda frames: None,
-) -> None:
+def write_point_clouds(corrector: Corrector, recording: Recording, path: Path | str) -> None:
     """Write `frame_000_before.ply` and `frame_000_after.ply` for each frame of a recording.
 
     A pixel without a return is not a point. Points have `amplitude` where it was recorded; after
@@ -329,7 +321,6 @@ def write_point_clouds(
         corrector: What corrects.
         recording: What to correct.
         path: The folder, which must not exist yet.
-        progress: Called with the number of frames that were just written.
 
     Raises:
         CalibrationDataError: `path` exists, the disk refuses, or `recording` is broken.
@@ -345,27 +336,27 @@ def write_point_clouds(
             _write_points(Path(f"{name}_before.ply"), depth[0], directions, more)
             more["valid"] = kept[0].astype(np.uint8)
             _write_points(Path(f"{name}_after.ply"), corrected[0], directions, more)
-            progress(1)
 
 
 def _frames(
     corrector: Corrector, recording: Recording, at_once: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the frames of a recording in order, so many at once.
+    """Yield the frames of a recording in order, so many at once, and show how many have passed.
 
     Yields:
         Depth as recorded; amplitude as recorded, or None; where a pixel looks at the target;
         corrected depth; where the correction is valid on the target: each of shape (B, H, W).
     """
-    for start in range(0, recording.num_frames, at_once):
-        chunk = np.arange(start, min(start + at_once, recording.num_frames))
-        depth = read_frames(recording.depth, chunk)
-        amplitude = recording.read("amplitude", chunk)
-        mask = recording.read("mask", chunk)
-        on_target = np.ones(depth.shape, dtype=bool) if mask is None else mask == 1
-        given = np.full_like(depth, np.nan) if amplitude is None else amplitude
-        corrected, valid = corrector(torch.from_numpy(depth), torch.from_numpy(given))
-        yield depth, amplitude, on_target, corrected.numpy(), on_target & valid.numpy()
+    with bar(recording.num_frames, "correcting") as advance:
+        for start in range(0, recording.num_frames, at_once):
+            chunk = np.arange(start, min(start + at_once, recording.num_frames))
+            depth = read_frames(recording.depth, chunk)
+            amplitude, mask = (recording.read(name, chunk) for name in ("amplitude", "mask"))
+            on_target = np.ones(depth.shape, dtype=bool) if mask is None else mask == 1
+            given = np.full_like(depth, np.nan) if amplitude is None else amplitude
+            corrected, valid = corrector(torch.from_numpy(depth), torch.from_numpy(given))
+            yield depth, amplitude, on_target, corrected.numpy(), on_target & valid.numpy()
+            advance(len(chunk))
 
 
 def _returned(depth: np.ndarray) -> np.ndarray:
