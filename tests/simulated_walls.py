@@ -18,7 +18,7 @@ from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.robot import draw_plan
-from tofcorr.simulation.simulator import append_measurement, row_of, simulate, take_frames
+from tofcorr.simulation.simulator import append_frame, simulate, take_frames
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import TrainingOptions
 
@@ -132,7 +132,8 @@ def taken(
     generator: torch.Generator,
 ) -> Dataset:
     """Simulate a recording at given poses, with the robot's repeatability and sensor noise."""
-    options = wall_options(seed, tuple((target, 1) for target in targets))
+    shots = tuple((target, 1) for target in targets)
+    options = wall_options(seed, shots, conditions={"recorded": ()})
     plan = draw_plan(options, torch.Generator().manual_seed(seed))
     robot = options.robot
     scale = torch.tensor([robot.repeatability_mm] * 3 + [robot.repeatability_mrad] * 3) / 1e3
@@ -151,6 +152,5 @@ def taken(
         modulation_frequency=options.sensor.modulation_frequency_hz,
     ) as writer:
         for state in take_frames(options, frames, generator):
-            row = row_of(state, recorded=())
-            append_measurement(writer, state, "radial", write_raw=False, row=row)
+            append_frame(writer, state, options)
     return Dataset((Recording.open(folder),))

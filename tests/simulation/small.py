@@ -3,10 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.robot import draw_plan
-from tofcorr.simulation.simulator import seeded, take_frames
+from tofcorr.simulation.simulator import take_frames
 
 CAMERA = {
     "width": 16,
@@ -38,7 +40,7 @@ def small(**sections: Any) -> SimulatorOptions:
 
 def planned(options: SimulatorOptions) -> list[FrameState]:
     """Return the frames of a recording before they are simulated."""
-    return draw_plan(options, seeded(options))
+    return draw_plan(options, torch.Generator().manual_seed(options.seed))
 
 
 def expected_frames(options: SimulatorOptions) -> list[FrameState]:

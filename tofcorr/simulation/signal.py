@@ -20,6 +20,7 @@ from torch import Tensor
 
 from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Count, NonNegativeNumber, Number, Options, PositiveNumber
+from tofcorr.simulation.hooks import FrameState
 
 
 class Curve:
@@ -89,34 +90,19 @@ class LightOptions(Options):
     vignetting_exponent: NonNegativeNumber = 4.0
 
 
-def amplitude_per_reflectivity(
-    options: LightOptions,
-    radial_distance: Tensor,
-    incidence_cosine: Tensor,
-    ray_directions: Tensor,
-    integration_time: float | None,
-) -> Tensor:
-    """Return the amplitude in electrons for a wall of reflectivity 1.
+def amplitude_per_reflectivity(options: LightOptions, state: FrameState) -> Tensor:
+    """Return the amplitude in electrons for a wall of reflectivity 1, shape (H, W).
 
     A source beside the camera lights a Lambertian wall in proportion to cos(incidence) /
     distance^2. The way back adds no factor: a pixel sees a larger patch in proportion to
-    distance^2, which cancels the fall-off of the light from each point.
-
-    Args:
-        options: Source, lens and sensitivity.
-        radial_distance: Shape (H, W), metres.
-        incidence_cosine: Shape (H, W).
-        ray_directions: Unit viewing rays in the camera frame, shape (H, W, 3).
-        integration_time: Seconds; None if unknown.
-
-    Returns:
-        Shape (H, W), electrons.
+    distance^2, which cancels the fall-off of the light from each point. An unknown integration time
+    is taken as the reference.
     """
-    vignetting = ray_directions[..., 2] ** options.vignetting_exponent
-    seconds = options.reference_integration_time_us * 1e-6
-    exposure = 1.0 if integration_time is None else integration_time / seconds
+    vignetting = state.ray_directions[..., 2] ** options.vignetting_exponent
+    reference = options.reference_integration_time_us * 1e-6
+    exposure = (state.recorded("integration_time") or reference) / reference
     electrons = options.electrons_at_1m * exposure * options.demodulation_contrast
-    return electrons * vignetting * incidence_cosine / radial_distance**2
+    return electrons * vignetting * state.incidence_cosine / state.radial_distance**2
 
 
 # Delays of a pixel's signal: by its place on the chip, its charge, and the clock.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.recording import DepthKind, Recording
+from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry import se3
@@ -110,13 +110,7 @@ class SensorPipeline:
 
     def _light(self, state: FrameState) -> None:
         light, electrons_per_count = self._sensor.light, state.electrons_per_count
-        full = amplitude_per_reflectivity(
-            light,
-            state.radial_distance,
-            state.incidence_cosine,
-            state.ray_directions,
-            state.recorded("integration_time"),
-        )
+        full = amplitude_per_reflectivity(light, state)
         if state.amplitude_recorded is None:
             target = target_named(self._scene.targets, state.target)
             state.reflectivity = seen_reflectivity(target, state.target_xy, self._scene.subsamples)
@@ -193,12 +187,11 @@ def simulate(
         CalibrationDataError: The recording cannot be written.
     """
     options = resolve_options(SimulatorOptions, config)
-    generator = seeded(options) if generator is None else generator
+    generator = generator or torch.Generator().manual_seed(options.seed)
     seed, mount = generator.initial_seed(), options.hand_eye
     plan = draw_plan(options, generator, num_frames=num_frames)
     guess = hand_eye_guess(mount, generator)
     states = take_frames(options, plan, generator if noise else None)
-    recorded = options.conditions.recorded
     writing = RecordingWriter(
         out,
         camera=options.camera.intrinsics(),
@@ -208,8 +201,7 @@ def simulate(
     )
     with writing as writer:
         for state in through(states, "simulating", total=len(plan)):
-            row = row_of(state, recorded)
-            append_measurement(writer, state, options.depth_kind, options.write_raw, row)
+            append_frame(writer, state, options)
         truth = {"tool_from_camera": mount.tool_from_camera().tolist(), "seed": seed}
         writer.add_truth("truth", truth)
         writer.add_truth("options", options.to_mapping())
@@ -239,42 +231,27 @@ def take_frames(
         yield pipeline.run(replace(planned, generator=generator, world_from_tool=reached))
 
 
-def seeded(options: SimulatorOptions) -> torch.Generator:
-    """Return a generator that starts from the options' seed."""
-    return torch.Generator().manual_seed(options.seed)
-
-
-def row_of(state: FrameState, recorded: Sequence[str]) -> FrameRow:
-    """Return what the recording says of a frame; `recorded` names the optional columns it has."""
+def append_frame(writer: RecordingWriter, state: FrameState, options: SimulatorOptions) -> None:
+    """Append what the camera measured and recorded, and its true distance and pose to `truth/`."""
+    recorded, facts, depth = options.conditions.recorded, state.facts, state.measured_distance
+    if options.depth_kind == "z":
+        depth = z_depth_from_radial_distance(depth, ray_directions(state.camera))
     known: dict[str, Any] = {
         name: state.recorded(name) for name in CONDITIONS if name in (*recorded, "timestamp")
     }
-    return FrameRow(
+    row = FrameRow(
         **known,
-        world_from_tool=state.facts.world_from_tool[-1].numpy(),
-        normal_world=state.facts.normal_world[-1].numpy(),
-        offset=float(state.facts.offset[-1]),
+        world_from_tool=facts.world_from_tool[-1].numpy(),
+        normal_world=facts.normal_world[-1].numpy(),
+        offset=float(facts.offset[-1]),
         target=state.target,
         pose_id=state.pose_id if "pose_id" in recorded else None,
     )
-
-
-def append_measurement(
-    writer: RecordingWriter,
-    state: FrameState,
-    depth_kind: DepthKind,
-    write_raw: bool,
-    row: FrameRow,
-) -> None:
-    """Append the measurement of the camera, and its true distance and pose to `truth/`."""
-    depth = state.measured_distance
-    if depth_kind == "z":
-        depth = z_depth_from_radial_distance(depth, ray_directions(state.camera))
     writer.append(
         depth.numpy(),
         row=row,
         amplitude=state.measured_amplitude.nan_to_num(0.0).numpy(),
-        raw=state.raw.numpy() if write_raw else None,
+        raw=state.raw.numpy() if options.write_raw else None,
         truth={
             "radial_distance": state.radial_distance.numpy().astype(np.float32),
             "world_from_tool": state.world_from_tool.numpy(),
