@@ -119,7 +119,8 @@ class WarmUp(ConditionTerm):
 Condition = float | Tensor | None
 """One number for all frames, or one for each: shape (...) of depth (..., H, W); None: unknown."""
 
-_NAME_OF = {condition(name).column: name for name in CONDITIONS}
+NAME_OF = {condition(name).column: name for name in CONDITIONS}
+"""The attribute of `Conditions` by the column of `frames.csv`."""
 
 
 def in_si_units(
@@ -141,10 +142,8 @@ def in_si_units(
     """
     known = {}
     for column, value in given.items():
-        if column not in _NAME_OF:
-            raise FrameError(
-                f"'{column}' is no condition of a frame. Known: {', '.join(_NAME_OF)}."
-            )
+        if column not in NAME_OF:
+            raise FrameError(f"'{column}' is no condition of a frame. Known: {', '.join(NAME_OF)}.")
         if value is None:
             continue
         number = torch.as_tensor(value, device=device).to(dtype)
@@ -153,7 +152,7 @@ def in_si_units(
                 f"{column}: expected one number, or one for each frame, shape {list(frames)}; got "
                 f"shape {list(number.shape)}."
             )
-        name = _NAME_OF[column]
+        name = NAME_OF[column]
         known[name] = number * condition(name).si_per_unit
     return known
 

@@ -6,9 +6,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, field_validator
 
-from tofcorr.conditions import CONDITIONS, condition
+from tofcorr.conditions import condition
 from tofcorr.data.recording import DepthKind, Number, PositiveNumber, RigidTransform
 from tofcorr.error_terms.base import Domain, Interval
+from tofcorr.error_terms.condition_terms import NAME_OF
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation.noise import NoiseModel
 from tofcorr.files import staged_file
@@ -64,8 +65,10 @@ class ConditionRange(Options):
     high: Number
     mean: Number
 
-
-_PARTS = tuple(ConditionRange.model_fields)
+    def in_si_units(self, column: str) -> tuple[float, float, float]:
+        """Return the three in the unit of `Conditions`."""
+        unit = condition(NAME_OF[column]).si_per_unit
+        return self.low * unit, self.high * unit, self.mean * unit
 
 
 class ValiditySection(Options):
@@ -86,10 +89,9 @@ class ValiditySection(Options):
     @field_validator("conditions")
     @classmethod
     def _known(cls, given: dict[str, ConditionRange]) -> dict[str, ConditionRange]:
-        known = [condition(name).column for name in CONDITIONS]
         for column in given:
-            if column not in known:
-                raise ValueError(f"'{column}' is no condition; known: {', '.join(known)}")
+            if column not in NAME_OF:
+                raise ValueError(f"'{column}' is no condition; known: {', '.join(NAME_OF)}")
         return given
 
 
@@ -162,14 +164,7 @@ class SensorFile(Options):
             normalised_amplitude=validity.normalised_amplitude
             and Interval(*validity.normalised_amplitude),
             modulation_frequency=self.modulation_frequency_hz,
-            conditions={
-                name: tuple(  # type: ignore[misc]
-                    getattr(validity.conditions[column], part) * condition(name).si_per_unit
-                    for part in _PARTS
-                )
-                for name, column in ((name, condition(name).column) for name in CONDITIONS)
-                if column in validity.conditions
-            },
+            conditions={NAME_OF[c]: own.in_si_units(c) for c, own in validity.conditions.items()},
         )
 
 
@@ -178,7 +173,7 @@ def validity_of(domain: Domain) -> ValiditySection:
     conditions = {}
     for name, numbers in domain.conditions.items():
         values = map(condition(name).in_file, numbers)
-        conditions[condition(name).column] = dict(zip(_PARTS, values, strict=True))
+        conditions[condition(name).column] = dict(zip(("low", "high", "mean"), values, strict=True))
     return ValiditySection(
         radial_distance_m=domain.radial_distance,
         amplitude=domain.amplitude,
