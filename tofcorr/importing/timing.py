@@ -56,11 +56,8 @@ class Lag:
 
     def to_mapping(self) -> dict[str, float]:
         """Return what `import.json` says of the lag."""
-        return {
-            "seconds": round(self.seconds, 5),
-            "standard_error": round(self.standard_error, 5),
-            "correlation": round(self.correlation, 3),
-        }
+        digits = {"seconds": 5, "standard_error": 5, "correlation": 3}
+        return {name: round(getattr(self, name), most) for name, most in digits.items()}
 
 
 def pair(

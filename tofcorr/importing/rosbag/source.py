@@ -5,6 +5,7 @@ Everything that the package `rosbags` raises on a damaged file becomes one sente
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -134,7 +135,7 @@ class TopicMessages:
         topic: The topic.
 
     Attributes:
-        topic: Its name.
+        bag, topic: As given.
         stamps: Times in the messages' headers, shape (N,), seconds; of receipt where headers hold
             none.
         stamped: Whether headers hold times.
@@ -142,7 +143,7 @@ class TopicMessages:
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        self._bag, self.topic, self.frame_id = bag, topic, ""
+        self.bag, self.topic, self.frame_id = bag, topic, ""
         self._iterator: Iterator[tuple[int, Any]] | None = None
         self._next, self._received = 0, list[int]()
         stamps: list[float] = []
@@ -164,14 +165,14 @@ class TopicMessages:
         # To read and drop 20 messages is as quick as a seek on a disk.
         if self._iterator is None or not 0 <= number - self._next <= 20:
             time = self._received[number]
-            self._iterator = self._bag.messages(self.topic, start=time)
+            self._iterator = self.bag.messages(self.topic, start=time)
             # Several messages may have been received in one nanosecond.
             self._next = self._received.index(time)
         message = next((one for _, one in islice(self._iterator, number - self._next, None)), None)
         self._next = number + 1
         if message is None:
             raise CalibrationDataError(
-                f"{self._bag.path}: message {number} of {self.topic} is gone. Was the bag changed?"
+                f"{self.bag.path}: message {number} of {self.topic} is gone. Was the bag changed?"
             )
         if hasattr(message, "encoding"):
             return _plain(message, self.topic)
@@ -262,18 +263,19 @@ def open_bag(
             if amplitude_topic is not None:
                 # Of its own, so that two topics can be read in turn.
                 amplitude = TopicMessages(opened.enter_context(_opened(path)), amplitude_topic)
-            images = _images(depth, amplitude, given, coding, track, str(path), warnings)
+            if not depth.stamped:
+                said = f"The headers of {depth.topic} hold no time stamps"
+                warnings.append(f"{said}; the times of receipt are used.")
+            of_bag = partial(RobotImages, intrinsics=given, track=track, warnings=warnings)
+            images = _images(depth, amplitude, coding, of_bag)
         yield images
 
 
 def _images(
     depth: TopicMessages,
     amplitude: TopicMessages | None,
-    intrinsics: GivenIntrinsics,
     coding: DepthCoding,
-    track: PoseTrack,
-    origin: str,
-    warnings: list[str],
+    of_bag: partial[RobotImages],
 ) -> RobotImages:
     """Put the messages of depth, and of amplitude if there are any, in the order of their times."""
     order = np.argsort(depth.stamps, kind="stable")
@@ -285,8 +287,8 @@ def _images(
         gap = np.abs(depth.stamps - amplitude.stamps[partner])
         if (gap > _SAME_IMAGE).all():
             raise CalibrationDataError(
-                f"{origin}: no image of {amplitude.topic} is stamped within {_SAME_IMAGE:g} s of "
-                f"one of {depth.topic}; the nearest is {gap.min():.3f} s away."
+                f"{depth.bag.path}: no image of {amplitude.topic} is stamped within "
+                f"{_SAME_IMAGE:g} s of one of {depth.topic}; the nearest is {gap.min():.3f} s away."
             )
         reason = f"{amplitude.topic} has no image of its time"
         refused = {names[k]: reason for k in order if gap[k] > _SAME_IMAGE}
@@ -298,19 +300,12 @@ def _images(
             beside = amplitude.image(int(partner[place])), amplitude.topic
         return coded_image(coding, (depth.image(place), depth.topic), beside)
 
-    if not depth.stamped:
-        warnings.append(
-            f"The headers of {depth.topic} hold no time stamps; the times of receipt are used."
-        )
-    return RobotImages(
-        origin=origin,
+    return of_bag(
+        origin=str(depth.bag.path),
         names=[names[k] for k in order],
-        intrinsics=intrinsics,
         read=read,
-        track=track,
         times=depth.stamps[order],
         refused=refused,
-        warnings=warnings,
         camera_frame=depth.frame_id.lstrip("/"),
     )
 

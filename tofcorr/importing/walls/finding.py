@@ -84,7 +84,6 @@ def walls_of_planes(
     options: WallOptions,
     origin: str,
     targets: np.ndarray | None = None,
-    fewest: int = 4,
 ) -> FoundWalls:
     """Find the walls that the planes of images from known robot poses show.
 
@@ -97,15 +96,15 @@ def walls_of_planes(
         origin: Where the images come from, for messages.
         targets: The name of the one wall that each image shows, shape (N,); None: walls are looked
             for.
-        fewest: With fewer images nothing is found: the rotation of the hand-eye and a wall's normal
-            have five unknowns, and each image gives two; three images determine them, and the
-            fourth is the check.
 
     Raises:
         CalibrationDataError: There is no wall in the images.
     """
     seen = np.array([bool(own) for own in images])
     seeing = int(seen.sum())
+    # The rotation of the hand-eye and a wall's normal have five unknowns, and each image gives two:
+    # three images determine them, and the fourth is the check.
+    fewest = 4
     if seeing < fewest:
         raise CalibrationDataError(
             f"{origin}: {seeing} of {len(images)} images show anything flat on "
@@ -118,40 +117,27 @@ def walls_of_planes(
         labels = torch.from_numpy(np.searchsorted(given, targets))
     planes = seen_planes(images, torch.from_numpy(np.array(world_from_tool)), pixels, labels)
     joint = match_single_ray(planes) if pixels == 1 else match(planes, options.fewest_images)
-    if not bool((joint.wall >= 0).any()):
+    on_wall = joint.wall >= 0
+    if not bool(on_wall.any()):
         raise CalibrationDataError(
             f"{origin}: no hand-eye transform makes planes of {options.fewest_images} images one "
             "wall. Do the poses belong to the images, and are they world_from_tool in metres?"
         )
-    return _summarised(options, names, planes, joint, given)
-
-
-def _summarised(
-    options: WallOptions,
-    images: Sequence[str],
-    planes: SeenPlanes,
-    joint: Joint,
-    given: np.ndarray | None,
-) -> FoundWalls:
-    """Name the walls in order of their pixels, and say what was left out."""
-    if given is None:
-        on_wall = joint.wall >= 0
+    if given is None:  # The walls in the order of their pixels.
         support = torch.bincount(joint.wall[on_wall], planes.support[on_wall], len(joint.walls))
         joint = joint.reordered(support.argsort(descending=True, stable=True))
-    names = _names(joint, options.up) if given is None else [str(name) for name in given]
-    undecided = undetermined(planes, joint, names)
+    called = _names(joint, options.up) if given is None else [str(name) for name in given]
+    undecided = undetermined(planes, joint, called)
     if any("the tilt of floor" in direction for direction in undecided):
-        names = _names(joint, "unknown")
-        undecided = undetermined(planes, joint, names)
-    members = [joint.wall == k for k in range(len(names))]
-    views = sorted(
-        (joint.wall >= 0).nonzero()[:, 0].tolist(),
-        key=lambda k: (int(planes.image[k]), int(joint.wall[k])),
-    )
+        called = _names(joint, "unknown")
+        undecided = undetermined(planes, joint, called)
+    members = [joint.wall == k for k in range(len(called))]
+    views = on_wall.nonzero()[:, 0].tolist()
+    views.sort(key=lambda k: (int(planes.image[k]), int(joint.wall[k])))
     deviation, far = 1000 * joint.deviation, FoundWalls.OFF_WALL_MM
-    off = torch.where(joint.wall >= 0, deviation.clamp(max=far), far)
+    off = torch.where(on_wall, deviation.clamp(max=far), far)
     return FoundWalls(
-        names=names,
+        names=called,
         walls=joint.walls.numpy(),
         images=np.array([int(own.sum()) for own in members]),
         share=np.array([float(planes.support[own].mean()) for own in members]),
@@ -159,10 +145,10 @@ def _summarised(
         wall=joint.wall[views].numpy(),
         gradient=None if given is not None else planes.gradient[views].numpy(),
         tool_from_camera=joint.tool_from_camera.numpy(),
-        deviation_mm=float(deviation[joint.wall >= 0].square().mean().sqrt()),
+        deviation_mm=float(deviation[on_wall].square().mean().sqrt()),
         misfit_mm=float(off.square().mean().sqrt()),
         undetermined=undecided,
-        left_out=_left_out(images, planes, joint, options),
+        left_out=_left_out(names, planes, joint, options),
     )
 
 
