@@ -192,14 +192,13 @@ def simulate(
     plan = draw_plan(options, generator, num_frames=num_frames)
     guess = hand_eye_guess(mount, generator)
     states = take_frames(options, plan, generator if noise else None)
-    writing = RecordingWriter(
+    with RecordingWriter(
         out,
         camera=options.camera.intrinsics(),
         depth_kind=options.depth_kind,
         modulation_frequency=options.sensor.modulation_frequency_hz,
         tool_from_camera=guess.numpy(),
-    )
-    with writing as writer:
+    ) as writer:
         for state in through(states, "simulating", total=len(plan)):
             append_frame(writer, state, options)
         truth = {"tool_from_camera": mount.tool_from_camera().tolist(), "seed": seed}

@@ -17,6 +17,7 @@ from tofcorr.simulation.hooks import FrameFacts, FrameState
 # Brightness varies where its squared second differences exceed this many times the variance of its
 # noise. Chosen: four standard deviations.
 _VARIES = 16.0
+_OfImages = Callable[..., Tensor]
 # Largest number of pixels in one batch of images. Set by hand: bounds the memory to some 100 MB.
 _CHUNK_PIXELS = 500_000
 
@@ -115,7 +116,7 @@ class EffectInputs:
         """Return the fundamental's phasor in every chosen pixel, shape (M,), complex."""
         return torch.polar(self.known_amplitude, self.phase)
 
-    def from_signal(self, function: Callable[..., Tensor], *arguments: Hashable) -> Tensor:
+    def from_signal(self, function: _OfImages, *arguments: Hashable) -> Tensor:
         """Apply a function to images of the phasor, and return its value in the chosen pixels.
 
         Args:
@@ -140,7 +141,7 @@ class EffectInputs:
         return self.from_images(_bent_square, sigma) > _VARIES * self.amplitude_noise**2
 
     def from_images(
-        self, function: Callable[..., Tensor], *arguments: Hashable, of_frames: Tensor | None = None
+        self, function: _OfImages, *arguments: Hashable, of_frames: Tensor | None = None
     ) -> Tensor:
         """Apply a function to whole images and return its value in the chosen pixels, kept.
 
@@ -168,7 +169,7 @@ class EffectInputs:
             self._remembered[key] = torch.cat(values)
         return self._remembered[key]
 
-    def remembered(self, function: Callable[..., Tensor], *arguments: Hashable) -> Tensor:
+    def remembered(self, function: _OfImages, *arguments: Hashable) -> Tensor:
         """Return `function(self, *arguments)`, computed on the first call."""
         key = (function, *arguments)
         if key not in self._remembered:
@@ -189,14 +190,10 @@ def known(holder: "EffectInputs | FrameFacts", name: str) -> Any:  # noqa: ANN40
 
 
 def _from_signal(
-    amplitude: Tensor,
-    distance: Tensor,
-    frequency: float,
-    function: Callable[..., Tensor],
-    *arguments: Hashable,
+    amplitude: Tensor, distance: Tensor, frequency: float, function: _OfImages, *more: Hashable
 ) -> Tensor:
     signal = torch.polar(amplitude, phase_from_radial_distance(distance, frequency))
-    return function(signal, *arguments)
+    return function(signal, *more)
 
 
 def _bent_square(amplitude: Tensor, _distance: Tensor, sigma: float) -> Tensor:
