@@ -100,9 +100,7 @@ def wanted_by(forms: Sequence[Form]) -> dict[str, Any]:
 def agree(forms: Sequence[Form]) -> bool:
     """Whether the forms are of different effects, and one design is like all want it."""
     wanted = wanted_by(forms) | {"logged": None}
-    alike = all(
-        wanted[key] == one.wanted[key] for one in forms for key in one.wanted.keys() - {"logged"}
-    )
+    alike = all(wanted[k] == one.wanted[k] for one in forms for k in one.wanted.keys() - {"logged"})
     return alike and len({form.effect for form in forms}) == len(forms)
 
 

@@ -6,7 +6,7 @@ NumPy and plain text alone: nothing of the program under test takes part.
 import csv
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from benchmarks.renewed.signal_chain import Hook, Measured, field_of, mask_of, m
 from benchmarks.renewed.world import World
 
 WEAKEST = 3.0  # times its noise: a weaker amplitude is no return
-FAINT = 2e-4  # metres of noise, for the program needs some
+
 LEAST_NEAR_PIXELS = 6  # on the target in a frame; with fewer the frame has an empty mask
 
 
@@ -78,13 +78,6 @@ def pose_noise(rng: Random, world: World) -> Array:
     slip, shape = world.design.robot, (world.way.poses, 3)
     noise = small_motions(slip * rng.standard_normal(shape), slip * rng.standard_normal(shape))
     return noise[world.way.pose_id]
-
-
-def exactly(rng: Random, recorded: Recorded, truth: Truth) -> Recorded:
-    """The same recording by a perfect robot, with `FAINT` noise and without rounding."""
-    faint = truth.expected + FAINT * rng.standard_normal(truth.expected.shape)
-    depth = np.where(np.isnan(recorded.depth), np.nan, faint * depth_over_range(recorded.world))
-    return replace(recorded, depth=depth, stated_poses=recorded.world.world_from_tool())
 
 
 def depth_over_range(world: World) -> Array:
@@ -188,9 +181,7 @@ def read(folder: Path) -> Data:
     about = yaml.safe_load((folder / "recording.yaml").read_text())
     with (folder / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
-    columns = {
-        name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name != "target"
-    }
+    columns = {k: np.array([float(row[k]) for row in rows]) for k in rows[0] if k != "target"}
     depth, stored = np.load(folder / "depth.npy").astype(float), folder / "amplitude.npy"
     k = about["camera"].pop("K")
     focal, centre = (k[0][0], k[1][1]), (k[0][2], k[1][2])

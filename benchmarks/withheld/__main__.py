@@ -45,9 +45,7 @@ TARGETS: dict[str, dict[str, Limits]] = {
 
 def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]:
     """All figures of the tiers that are there, and them as text."""
-    main = {
-        tier: [one for one in outcomes if one.tier == tier and one.role == "main"] for tier in TIERS
-    }
+    main = {k: [one for one in outcomes if one.tier == k and one.role == "main"] for k in TIERS}
     again = {one.answer["main"]: one for one in outcomes if one.role in ("fresh", "cured")}
     scores: list[Score] = []
     for tier, cases in main.items():

@@ -89,11 +89,6 @@ class Pair:
     dropouts: tuple[float, float] = (0.0, 0.0)
     gain: float = 1.0
 
-    @property
-    def ideal(self) -> bool:
-        """Whether the simulator writes depth alone, without amplitude and conditions."""
-        return not self.terms and not self.shared
-
 
 def _shared(index: int, rng: Random) -> Pair:
     one, other = turn(0, FORMS, index), FORMS[rng.integers(len(FORMS))]
@@ -158,7 +153,8 @@ def write_pair(seed: int, kind: str, index: int, out: Path) -> Entry:
     arrays = {f"field_{effect}": field for effect, field in fields.items()}
     arrays |= {"expected": case.truth.expected, "sigma": case.noise}
     write_recording(out / "recordings" / names["id"], camera)
-    without = UNKNOWN_TO_IDEAL if pair.ideal else ()
+    # An ideal simulator writes depth alone, without amplitude and conditions.
+    without = () if pair.terms or pair.shared else UNKNOWN_TO_IDEAL
     write_recording(out / "recordings" / names["sim"], simulated, without)
     if kind == "ideal" and not world.design.moving:
         names["held_out"] = f"r{rng.integers(2**48):012x}"

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from import_graph import imported
+from sealed.perfect_robot import exactly
 
 from benchmarks import sealed
 from benchmarks.renewed import cases
 from benchmarks.renewed.cases import in_world, make_case, seeded, turn, write_case
 from benchmarks.renewed.forms import EFFECTS, INSIDE, OUTSIDE
 from benchmarks.renewed.geometry import Camera, inverse, small_motions
-from benchmarks.renewed.recording import exactly, read, record, write_recording
+from benchmarks.renewed.recording import read, record, write_recording
 from benchmarks.renewed.rendering import smooth
 from benchmarks.renewed.signal_chain import Form, Hook, demodulate, field_of, measure, scaled
 from benchmarks.renewed.world import World, draw_world, session_again

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from sealed.perfect_robot import exactly
 
 from benchmarks.renewed import __main__ as renewed
 from benchmarks.renewed.cases import make_case, write_case
 from benchmarks.renewed.geometry import inverse
 from benchmarks.renewed.real import FORMS, STRIDE, thinned, write_real
-from benchmarks.renewed.recording import Data, exactly, read, write_recording
+from benchmarks.renewed.recording import Data, read, write_recording
 from benchmarks.sealed import running
 from benchmarks.sealed.answers import (
     BrokenSealError,
