@@ -136,6 +136,8 @@ HEADERS: dict[str, Damage] = {
     r"recording\.yaml: 'planes': .*'recorded' or 'estim.*'guessed'": header(("planes", "guessed")),
     r"recording\.yaml: 'frames\.wrist' is not a known": header(("frames", {"wrist": "tool0"})),
     r"recording\.yaml: 'frames\.tool'": header(("frames", {"tool": ""})),
+    r"recording\.yaml: 'frames\.world'": header(("frames", {"world": " tool0"})),
+    r"recording\.yaml: 'frames\.camera'": header(("frames", {"camera": "two\nlines"})),
     r"recording\.yaml: 'frames'": header(("frames", ["base", "tool0"])),
 }
 TEXTS: dict[str, Damage] = {

@@ -53,10 +53,7 @@ PLAIN: dict[str, Any] = {
 }
 """A camera whose own errors the base model describes."""
 
-MOVING: dict[str, Any] = {
-    "robot": {"motion": "continuous"},
-    "conditions": {"frame_interval_s": 0.3},
-}
+MOVING = {"robot": {"motion": "continuous"}, "conditions": {"frame_interval_s": 0.3}}
 """A robot that never stops."""
 
 TIME: dict[str, Any] = {"name": "integration_time", "log_1": 0.006}

@@ -1,5 +1,6 @@
 """One example of every registered kind of error term, on two different calibrated ranges."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -21,9 +22,8 @@ DOMAIN = Domain(
     modulation_frequency=20e6,
     conditions=dict.fromkeys(CONDITIONS, (1.0, 4.0, 2.0)),
 )
-OTHER_DOMAIN = Domain(
-    height=5,
-    width=7,
+OTHER_DOMAIN = replace(
+    DOMAIN,
     radial_distance=Interval(0.9, 5.0),
     amplitude=Interval(100.0, 2000.0),
     normalised_amplitude=Interval(70.0, 4000.0),

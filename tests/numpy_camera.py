@@ -97,16 +97,10 @@ def record(
             variances.append(np.where(lost, np.nan, camera.sigma(light) ** 2))
             depth.append(np.where(lost, np.nan, true + noise + pattern))
             amplitudes.append(seen)
-            rows.append(
-                FrameRow(
-                    timestamp=float(len(rows)),
-                    world_from_tool=world_from_camera,
-                    normal_world=np.array([0.0, 0.0, 1.0]),
-                    offset=0.0,
-                    target="checkerboard" if pose % 2 else "white",
-                    pose_id=str(pose) if repeats > 1 else None,
-                )
-            )
+            target = "checkerboard" if pose % 2 else "white"
+            plane = {"normal_world": np.array([0.0, 0.0, 1.0]), "offset": 0.0, "target": target}
+            own = {"timestamp": float(len(rows)), "pose_id": str(pose) if repeats > 1 else None}
+            rows.append(FrameRow(world_from_tool=world_from_camera, **plane, **own))
     write_recording(
         folder,
         camera=CameraIntrinsics(width=WIDTH, height=HEIGHT, matrix=matrix, distortion=()),

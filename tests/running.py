@@ -1,7 +1,8 @@
-"""The command line, run in the process of the tests."""
+"""The command line, run in the process of the tests; and programs in processes of their own."""
 
+import subprocess
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Said(NamedTuple):
@@ -10,6 +11,13 @@ class Said(NamedTuple):
     code: int
     out: str
     err: str
+
+
+def printed(*words: object, **how: Any) -> str:
+    """Run a program in a process of its own, which must end well; return its standard output."""
+    done = subprocess.run([*map(str, words)], capture_output=True, text=True, check=False, **how)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 Program = Callable[..., Said]

@@ -10,10 +10,10 @@ import yaml
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
-from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry import se3
+from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.simulation.options import SimulatorOptions
@@ -43,16 +43,7 @@ QUIET = {
     "readout": {"electrons_per_count": 250.0, "converter_bits": 16},
 }
 WHITE_AND_CHECKERBOARD = (("white", 15), ("checkerboard", 15))
-EA = ErrorModelOptions.from_mapping(
-    {
-        "terms": [
-            {"kind": "distance_polynomial", "degree": 3},
-            {"kind": "pixel_polynomial", "degree": 2},
-            {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
-        ]
-    },
-    "EA",
-)
+EA = resolve_options(TrainingOptions, "ea").model
 
 
 def simulated_wall(

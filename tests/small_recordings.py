@@ -4,19 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cameras import camera
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
-from tofcorr.geometry.camera import CameraIntrinsics
 
 NUM_FRAMES = 6
-CAMERA = CameraIntrinsics(
-    width=7,
-    height=5,
-    matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
-    distortion=(-0.08, 0.02, 0.0005, -0.0004, 0.0),
-)
+CAMERA = camera((7, 5), (9.0, 9.5), (3.2, 1.9), -0.08, 0.02, 0.0005, -0.0004, 0.0)
 
 
 def rigid(generator: np.random.Generator) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from cameras import camera
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -17,15 +18,11 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, Parameters
 from tofcorr.geometry import se3
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
+from tofcorr.options import resolve_options
+from tofcorr.training.calibration import TrainingOptions
 
-CAMERA = CameraIntrinsics(
-    width=12,
-    height=9,
-    matrix=((15.0, 0.0, 5.8), (0.0, 15.5, 3.9), (0.0, 0.0, 1.0)),
-    distortion=(-0.08, 0.02, 0.0005, -0.0004, 0.0),
-)
+CAMERA = camera((12, 9), (15.0, 15.5), (5.8, 3.9), -0.08, 0.02, 0.0005, -0.0004, 0.0)
 DOMAIN = Domain(
     height=9,
     width=12,
@@ -33,26 +30,31 @@ DOMAIN = Domain(
     amplitude=Interval(50.0, 2500.0),
     normalised_amplitude=Interval(300.0, 1000.0),
 )
-E0 = {
-    "terms": [
-        {"kind": "distance_polynomial", "degree": 3},
-        {"kind": "pixel_polynomial", "degree": 1},
-    ]
-}
-EA, EB = (
-    {
-        "terms": [
-            {"kind": "distance_polynomial", "degree": 3},
-            {"kind": "pixel_polynomial", "degree": 2},
-            {"kind": "amplitude_polynomial", "variable": variable, "degree": 2},
-        ]
-    }
-    for variable in ("amplitude", "normalised_amplitude")
+E0, EA, EB = (
+    resolve_options(TrainingOptions, name).model.to_mapping() for name in ("e0", "ea", "eb")
 )
 
 
 def error_model(terms: dict) -> ErrorModel:
     return ErrorModel(ErrorModelOptions.from_mapping(terms, "test"), DOMAIN)
+
+
+def frame_batch(
+    distance: Tensor,
+    amplitude: Tensor | None,
+    normal: Tensor,
+    offset: Tensor,
+    valid: Tensor | None = None,
+) -> FrameBatch:
+    """Return frames of radial distances (B, H, W) before planes; without `valid`, all are."""
+    return FrameBatch(
+        indices=torch.arange(len(distance)),
+        radial_distance=distance,
+        amplitude=amplitude,
+        valid=torch.ones(distance.shape, dtype=torch.bool) if valid is None else valid,
+        normal_tool=normal,
+        offset_tool=offset,
+    )
 
 
 @dataclass(frozen=True)
@@ -138,14 +140,8 @@ def make_scene(
     valid = _uniform(generator, *measured.shape) >= invalid
     world_from_tool = camera_poses @ se3.inverse(tool_from_camera)
     normal_tool, offset_tool = plane_in_frame(wall_normal, wall_offset, world_from_tool)
-    batch = FrameBatch(
-        indices=torch.arange(num_frames),
-        radial_distance=torch.where(valid, measured, torch.nan),
-        amplitude=torch.where(valid, amplitude, torch.nan),
-        valid=valid,
-        normal_tool=normal_tool,
-        offset_tool=offset_tool,
-    )
+    measured, amplitude = (torch.where(valid, one, torch.nan) for one in (measured, amplitude))
+    batch = frame_batch(measured, amplitude, normal_tool, offset_tool, valid)
     return Scene(batch, model, Parameters(tool_from_camera, coefficients), world_from_tool)
 
 

@@ -70,25 +70,6 @@ def test_the_corrector_takes_the_conditions_by_their_columns() -> None:
     assert keywords == [condition(name).column for name in CONDITIONS]
 
 
-def test_the_corrector_converts_each_condition_to_its_unit() -> None:
-    class Error:
-        def set_conditions(self, values: torch.Tensor) -> bool:
-            self.values = values
-            return True
-
-    class Corrector:
-        mean_conditions = (0.0,) * len(CONDITIONS)
-        si_per_unit = tuple(condition(name).si_per_unit for name in CONDITIONS)
-        radial_of_z = torch.zeros(1)
-        error = Error()
-
-    corrector = Corrector()
-    given = {condition(name).column: 2.0 + i for i, name in enumerate(CONDITIONS)}
-    DepthCorrector.set_conditions(corrector, **given)  # type: ignore[arg-type]
-    expected = [(2.0 + i) * condition(name).si_per_unit for i, name in enumerate(CONDITIONS)]
-    assert corrector.error.values.tolist() == expected
-
-
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_a_keyword_in_its_unit_becomes_the_condition_in_its_place(name: str) -> None:
     each = condition(name)

@@ -1,13 +1,16 @@
 """What a user reads of an error is one line, whatever a file or a library put into it."""
 
+import errno
+
 import click
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from running import Program
 
 import tofcorr
 from tofcorr import errors
-from tofcorr.cli.main import group, main
+from tofcorr.cli.main import group
 from tofcorr.errors import CalibrationDataError, TofcorrError, printable
 from tofcorr.importing.run import RefusedViewError, report_text
 
@@ -42,19 +45,19 @@ def test_control_characters_are_shown_as_python_writes_them() -> None:
     assert str(TofcorrError("a\nb\t\x1b[31m\u2028\udcff")) == r"a\nb\t\x1b[31m\u2028\udcff"
 
 
-def test_the_terminal_shows_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    @click.command()
-    def refuse() -> None:
-        raise CalibrationDataError("scene_camera.json: image 0: got a\nb.")
+def test_the_terminal_shows_one_line(monkeypatch: pytest.MonkeyPatch, program: Program) -> None:
+    full = OSError(errno.ENOSPC, "No space left on device", "report.json")
+    for error, said in (
+        (CalibrationDataError("scene.json: got a\nb."), "scene.json: got a\\nb."),
+        (full, "report.json: No space left on device."),
+    ):
 
-    monkeypatch.setattr(group, "get_command", lambda context, name: refuse)
-    monkeypatch.setattr("sys.argv", ["tofcorr", "train"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    assert capsys.readouterr().err == "Error: scene_camera.json: image 0: got a\\nb.\n"
+        @click.command()
+        def refuse(error: Exception = error) -> None:
+            raise error
+
+        monkeypatch.setattr(group, "get_command", lambda context, name, one=refuse: one)
+        assert program("train") == (2, "", f"Error: {said}\n")
 
 
 def test_the_report_of_an_import_holds_null_for_what_could_not_be_measured() -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from examples.correctors import HEIGHT, WIDTH, save_corrector
 from filelock import FileLock
+from running import printed
 
 SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp"
 
@@ -29,22 +30,14 @@ def program(pytestconfig: pytest.Config) -> Path:
     name = hashlib.sha256("\0".join(made_of).encode()).hexdigest()
     build = pytestconfig.cache.mkdir("cpp_example") / name
     with FileLock(f"{build}.lock"):  # Another worker may be at it.
-        for step in (
-            ["-S", SOURCE, "-B", build, f"-DCMAKE_PREFIX_PATH={prefix}"],
-            ["--build", build],
-        ):
-            done = subprocess.run(["cmake", *step], capture_output=True, text=True, check=False)
-            assert done.returncode == 0, done.stdout + done.stderr
+        printed("cmake", "-S", SOURCE, "-B", build, f"-DCMAKE_PREFIX_PATH={prefix}")
+        printed("cmake", "--build", build)
     return build / "correct_frame"
 
 
 @pytest.fixture(scope="module")
 def corrector(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_corrector(tmp_path_factory.mktemp("corrector") / "corrector.ts")
-
-
-def run(program: Path, *arguments: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
 
 
 @pytest.mark.slow
@@ -59,13 +52,11 @@ def test_cpp_program_gives_the_very_bits_that_python_gives(
     frames["depth"][0, :2] = (np.nan, 0.0)
     for name, frame in frames.items():
         frame.tofile(tmp_path / f"{name}.raw")
-    done = run(program, corrector, *(tmp_path / f"{n}.raw" for n in (*frames, "out")))
-    assert done.returncode == 0, done.stderr
-
+    said = printed(program, corrector, *(tmp_path / f"{n}.raw" for n in (*frames, "out")))
     expected, valid = torch.jit.load(str(corrector))(*map(torch.from_numpy, frames.values()))
     found = np.fromfile(tmp_path / "out.raw", np.float32).reshape(HEIGHT, WIDTH)
     np.testing.assert_array_equal(found, expected.numpy())
-    assert done.stdout == f"{int(valid.sum())} of {HEIGHT * WIDTH} pixels valid\n"
+    assert said == f"{int(valid.sum())} of {HEIGHT * WIDTH} pixels valid\n"
 
 
 @pytest.mark.slow
@@ -74,7 +65,8 @@ def test_cpp_program_refuses_a_frame_of_another_size_in_one_line(
 ) -> None:
     np.zeros((HEIGHT, WIDTH - 1), np.float32).tofile(tmp_path / "small.raw")
     small = tmp_path / "small.raw"
-    done = run(program, corrector, small, small, tmp_path / "out.raw")
+    words = [program, corrector, small, small, tmp_path / "out.raw"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert f"expected {HEIGHT} x {WIDTH} float32 values" in done.stderr

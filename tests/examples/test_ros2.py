@@ -109,13 +109,6 @@ def test_depth_and_points_are_those_of_the_corrector(
     assert node.log["error"] == []
 
 
-def test_points_are_computed_only_for_those_who_listen(start: Callable[..., Any]) -> None:
-    node = start()
-    give(node, *frame())
-    assert len(published(node)) == 1
-    assert published(node, "points_corrected") == []
-
-
 @pytest.mark.parametrize(
     "made",
     [
@@ -145,6 +138,8 @@ def test_only_valid_pixels_remain_if_asked(start: Callable[..., Any], tmp_path: 
     assert not valid.all()
     kept = np.where(valid, corrected, np.float32(np.nan))
     np.testing.assert_array_equal(pixels(published(node)[0]), kept)
+    # Points are computed only for those who listen.
+    assert published(node, "points_corrected") == []
 
 
 def test_images_of_one_exposure_find_each_other_in_any_order(

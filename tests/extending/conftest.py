@@ -4,7 +4,6 @@ import copy
 import json
 import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import diagnosed_recordings
 import pytest
 import simulated_walls
 from docs.pages import ADDING, blocks
+from running import printed
 
 import tofcorr
 from tofcorr.options import dump_yaml
@@ -185,14 +185,6 @@ def extension(tmp_path_factory: pytest.TempPathFactory) -> Extension:
         add(root / "tofcorr", *own)
         pieces[page.stem] = "\n".join(text for text in shown if text not in own)
         assert pieces[page.stem], "the page shows no use"
-    done = subprocess.run(
-        [sys.executable, "-c", RUN_PIECES],
-        input=json.dumps(pieces),
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=root,
-        env=os.environ | {"PYTHONPATH": str(root)},
-    )
-    assert done.returncode == 0, done.stderr
-    return Extension(root, json.loads(done.stdout))
+    how = {"cwd": root, "env": os.environ | {"PYTHONPATH": str(root)}}
+    outcomes = printed(sys.executable, "-c", RUN_PIECES, input=json.dumps(pieces), **how)
+    return Extension(root, json.loads(outcomes))

@@ -1,5 +1,6 @@
 """Viewing rays of lenses so strong that the usual iterations do not find them."""
 
+import cameras
 import pytest
 import torch
 
@@ -8,23 +9,33 @@ from tofcorr.geometry.rays import lens_misses, ray_directions
 
 
 def _camera(focal: float, *distortion: float) -> CameraIntrinsics:
-    matrix = ((focal, 0.0, 31.5), (0.0, focal, 24.5), (0.0, 0.0, 1.0))
-    return CameraIntrinsics(width=64, height=50, matrix=matrix, distortion=distortion)
+    return cameras.camera((64, 50), (focal, focal), (31.5, 24.5), *distortion)
 
 
 @pytest.mark.parametrize(
-    ("focal", "k1", "k2"), [(30.0, 0.8, 0.3), (25.0, 3.0, 0.0), (60.0, -0.3, 0.0)]
+    ("focal", "distortion"),
+    [
+        (30.0, (0.8, 0.3, 0.0, 0.0)),
+        (25.0, (3.0, 0.0, 0.0, 0.0)),
+        (60.0, (-0.3, 0.0, 0.0, 0.0)),
+        (90.0, (-0.08, 0.02, 0.0005, -0.0004, 0.01)),
+    ],
 )
-def test_every_ray_is_imaged_on_its_pixel(focal: float, k1: float, k2: float) -> None:
+def test_opencvs_equations_image_every_ray_on_its_pixel(
+    focal: float, distortion: tuple[float, ...]
+) -> None:
     """A pincushion of k1 = 0.8 left a quarter of the rays up to 2 pixels from theirs."""
-    camera = _camera(focal, k1, k2, 0.0, 0.0)
-    rays = ray_directions(camera)
-    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-    square = x.square() + y.square()
-    radial = 1 + k1 * square + k2 * square.square()
+    camera = _camera(focal, *distortion)
+    x, y, z = ray_directions(camera).unbind(-1)
+    x, y = x / z, y / z
+    k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    down = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     v, u = torch.meshgrid(torch.arange(50).double(), torch.arange(64).double(), indexing="ij")
-    torch.testing.assert_close(focal * x * radial + 31.5, u, rtol=0.0, atol=1e-8)
-    torch.testing.assert_close(focal * y * radial + 24.5, v, rtol=0.0, atol=1e-8)
+    torch.testing.assert_close(focal * across + 31.5, u, rtol=0.0, atol=1e-8)
+    torch.testing.assert_close(focal * down + 24.5, v, rtol=0.0, atol=1e-8)
     assert float(lens_misses(camera).max()) < 1e-8
 
 

@@ -33,13 +33,8 @@ def test_counts_are_those_of_a_hand(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "one.py").write_text(SOURCE)
     (folder / "two.py").write_text("from some.one import circle\n\nprint(circle(1.0))\n")
-    assert census(folder) == {
-        "files": 2,
-        "statements": 2 + 3 + 2 + 1,
-        "numbers": 2 + 1,
-        "records": 1,
-        "single": 1,
-    }
+    expected = {"files": 2, "statements": 2 + 3 + 2 + 1, "numbers": 2 + 1}
+    assert census(folder) == expected | {"records": 1, "single": 1}
 
 
 def test_only_what_grew_is_refused() -> None:

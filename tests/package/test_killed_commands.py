@@ -122,8 +122,6 @@ COMMANDS: dict[str, Callable[[Path], object]] = {
     f"export {RUN} --format lut --out new.npz": read_lut,
     f"export {RUN} --format urdf --out new.urdf": ElementTree.parse,
     f"export {RUN} --format tf --out new.yaml": _yaml,
-    f"export {RUN} --format easy_handeye --out new.yaml": _yaml,
-    f"export {RUN} --format opencv --out new.yaml": _ends,
     f"export {RUN} --format c --out new.c": _ends,
     f"correct --model run/corrector.ts {RECORDING} --out new": Recording.open,
     f"correct --model run/corrector.ts {RECORDING} --ply new": _clouds,

@@ -140,8 +140,5 @@ def test_the_lazy_names_are_those_that_type_checkers_see() -> None:
     assert set(seen) | {"__version__"} == set(tofcorr.__all__)
     for name, module in seen.items():
         assert getattr(tofcorr, name) is getattr(sys.modules[str(module)], name)
-
-
-def test_an_unknown_name_is_no_attribute() -> None:
     with pytest.raises(AttributeError, match="module 'tofcorr' has no attribute 'Recordings'"):
         tofcorr.__getattr__("Recordings")

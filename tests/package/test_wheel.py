@@ -4,16 +4,13 @@ import json
 import os
 import shutil
 import site
-import subprocess
 import sys
 import venv
 import zipfile
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
-from importing.posed_scene import Drive
-from importing.rosbag import written_bags as bags
+from running import printed
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("tofcorr", "configs", "pyproject.toml", "setup.py", "MANIFEST.in", "README.md")
@@ -37,16 +34,8 @@ def run(python: Path | str, folder: Path, *arguments: str) -> str:
     With the repository in PYTHONPATH, its `tofcorr.egg-info` passed for an installed tofcorr, and
     pip installed nothing.
     """
-    done = subprocess.run(
-        [python, *arguments],
-        cwd=folder,
-        env={key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    clean = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    return printed(python, *arguments, cwd=folder, env=clean)
 
 
 @pytest.fixture(scope="module")
@@ -92,10 +81,8 @@ def test_the_wheel_holds_every_configuration_and_text_as_in_the_repository(wheel
     metadata = next(text for name, text in packed.items() if name.endswith("/METADATA")).decode()
     assert "\nLicense-Expression: Apache-2.0\n" in metadata
     assert "\nAuthor: The tofcorr authors\n" in metadata
-    assert {name.partition("/")[0] for name in packed} == {
-        "tofcorr",
-        f"{'-'.join(wheel.name.split('-')[:2])}.dist-info",
-    }
+    of_wheel = f"{'-'.join(wheel.name.split('-')[:2])}.dist-info"
+    assert {name.partition("/")[0] for name in packed} == {"tofcorr", of_wheel}
 
 
 def test_simulate_and_train_run_by_name_in_an_empty_folder(python: Path, tmp_path: Path) -> None:
@@ -113,23 +100,3 @@ def test_simulate_and_train_run_by_name_in_an_empty_folder(python: Path, tmp_pat
     assert report["iterations"] <= 30
     assert (tmp_path / "run" / "corrector.ts").is_file()
     assert "max_iterations: 30" in (tmp_path / "run" / "config.yaml").read_text("utf-8")
-
-
-@pytest.mark.slow
-def test_a_bag_becomes_a_joint_of_the_robot_in_four_commands(python: Path, tmp_path: Path) -> None:
-    recorded = Drive().record()
-    bag = bags.write_drive(recorded, tmp_path / "bag", "mcap")
-    commands = (
-        f"import rosbag {bag} --depth {bags.DEPTH} --amplitude {bags.INFRARED}"
-        f" --base-frame {bags.BASE} --tool-frame {bags.TOOL} --out wall",
-        "train --recording wall --config ea --out run",
-        "export --run run --format urdf --out camera.urdf.xacro",
-        "correct --model run/corrector.ts --recording wall --out corrected",
-    )
-    for command in commands:
-        run(python, tmp_path, "-m", "tofcorr", *command.split())
-    origin = ElementTree.parse(tmp_path / "camera.urdf.xacro").find(".//joint/origin")
-    assert origin is not None
-    place = [float(number) for number in origin.attrib["xyz"].split()]
-    assert place == pytest.approx(recorded.tool_from_camera[:3, 3].tolist(), abs=1e-3)
-    assert (tmp_path / "corrected" / "depth.npy").is_file()

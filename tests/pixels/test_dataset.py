@@ -18,11 +18,6 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 
 
-def test_no_recording_is_refused() -> None:
-    with pytest.raises(CalibrationDataError, match="There is no recording to calibrate"):
-        Dataset(())
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -40,6 +35,8 @@ def test_a_recording_of_another_setting_is_refused_with_both_values(
     one = Recording.open(write_small_recording(tmp_path / "one"))
     other = Recording.open(write_small_recording(tmp_path / "other", **change))
     assert Dataset((one, one)).num_frames == 2 * one.num_frames
+    with pytest.raises(CalibrationDataError, match="There is no recording to calibrate"):
+        Dataset(())
     with pytest.raises(CalibrationDataError, match=message):
         Dataset((one, other))
 

@@ -1,6 +1,5 @@
 """Processes started by `torchrun` fit what one process fits."""
 
-import json
 import os
 import socket
 import subprocess
@@ -51,14 +50,11 @@ def test_two_processes_fit_what_one_fits(tmp_path: Path) -> None:
     train(recording, "ea", out=tmp_path / "one")
     files = ("--recording", str(recording), "--out", str(tmp_path / "two"))
     start_both((TRAIN, "--config", "ea", "--set", "advice=0", *files))
-    one, two = (
-        json.loads((tmp_path / name / "report.json").read_text()) for name in ("one", "two")
-    )
-    for part in ("hand_eye", "error_mm"):
-        np.testing.assert_allclose(numbers_in(two[part]), numbers_in(one[part]), rtol=1e-9)
-    calibrations = [
-        yaml.safe_load((tmp_path / name / "calibration.yaml").read_text())
-        for name in ("one", "two")
-    ]
-    expected, found = (numbers_in(each["coefficients"]) for each in calibrations)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    for file, part in (
+        ("report.json", "hand_eye"),
+        ("report.json", "error_mm"),
+        ("calibration.yaml", "coefficients"),
+    ):
+        texts = ((tmp_path / name / file).read_text() for name in ("one", "two"))
+        one, two = (numbers_in(yaml.safe_load(text)[part]) for text in texts)
+        np.testing.assert_allclose(two, one, rtol=1e-9)

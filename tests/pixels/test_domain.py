@@ -5,34 +5,27 @@ from pathlib import Path
 import diagnosed_recordings
 import pytest
 import torch
+from cameras import camera
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.diagnosis.sums.base import domain_of
 from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
 
-
-@pytest.fixture
-def camera() -> CameraIntrinsics:
-    matrix = ((3.0, 0.0, 1.5), (0.0, 3.0, 1.0), (0.0, 0.0, 1.0))
-    return CameraIntrinsics(width=4, height=3, matrix=matrix)
+CAMERA = camera((4, 3), (3.0, 3.0), (1.5, 1.0))
 
 
-def test_a_range_leaves_the_share_asked_for_outside_at_each_end(camera: CameraIntrinsics) -> None:
+def test_a_range_leaves_a_share_outside_and_a_condition_is_known_of_every_frame() -> None:
     distance = torch.linspace(1.0, 2.0, 1001, dtype=torch.float64)
     unknown = torch.full((5, len(CONDITIONS)), torch.nan)
-    domain = domain_from(camera, distance, None, 20e6, unknown, outside_share=0.1)
+    domain = domain_from(CAMERA, distance, None, 20e6, unknown, outside_share=0.1)
     assert domain.radial_distance == pytest.approx((1.1, 1.9))
     assert (domain.amplitude, domain.normalised_amplitude) == (None, None)
     assert (domain.height, domain.width, domain.modulation_frequency) == (3, 4, 20e6)
-
-
-def test_a_condition_is_known_if_it_is_known_of_every_frame(camera: CameraIntrinsics) -> None:
     conditions = torch.full((3, len(CONDITIONS)), torch.nan, dtype=torch.float64)
     conditions[:, 0] = torch.tensor([0.0, 10.0, 50.0])
     conditions[:2, 1] = 1e-3
-    domain = domain_from(camera, torch.ones(9), torch.ones(9), None, conditions, outside_share=0.1)
+    domain = domain_from(CAMERA, torch.ones(9), torch.ones(9), None, conditions, outside_share=0.1)
     assert domain.conditions == {CONDITIONS[0]: (0.0, 50.0, 20.0)}
 
 

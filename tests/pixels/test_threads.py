@@ -53,11 +53,8 @@ def test_few_items_are_read_ahead() -> None:
     results.close()  # type: ignore[attr-defined]
 
 
-def test_a_failure_in_a_thread_is_that_of_the_caller() -> None:
+def test_failures_and_the_choice_of_gradients_are_the_callers() -> None:
     with pytest.raises(ZeroDivisionError):
         list(in_threads(lambda k: 1 / (k - 3), range(9), threads=2))
-
-
-def test_whether_gradients_are_kept_is_the_callers_choice() -> None:
     with torch.no_grad():
         assert not any(in_threads(lambda _: torch.is_grad_enabled(), range(4), threads=2))
