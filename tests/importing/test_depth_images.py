@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cameras import camera
 
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.images import (
     DepthCoding,
     DepthImage,
@@ -16,9 +16,7 @@ from tofcorr.importing.images import (
 )
 from tofcorr.importing.run import RefusedViewError
 
-CAMERA = CameraIntrinsics(
-    width=4, height=3, matrix=((5.0, 0.0, 1.5), (0.0, 5.0, 1.0), (0.0, 0.0, 1.0))
-)
+CAMERA = camera((4, 3), (5.0, 5.0), (1.5, 1.0))
 FITS, TURNED = np.ones((3, 4), np.float32), np.ones((4, 3), np.float32)
 
 

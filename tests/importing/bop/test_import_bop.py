@@ -47,9 +47,8 @@ def test_the_walls_speak_where_poses_are_not_those_of_the_camera(
 def test_a_scene_without_poses_with_two_cameras_or_none_is_refused(
     scene: Recorded, tmp_path: Path
 ) -> None:
-    few = scene.take(np.arange(3))
+    few, out = scene.take(np.arange(3)), tmp_path / "out"
     bare = scene_files.write_bop(few, tmp_path / "bare", poses=False)
-    out = tmp_path / "out"
     assert "no image has a pose of the camera" in run_import("bop", bare, out=out).text
     folder = scene_files.write_bop(few, tmp_path / "scene")
     path = folder / "scene_camera.json"
@@ -87,9 +86,8 @@ def test_files_of_blenderproc_give_the_same_poses_and_depth(
     recording = imported.done
     assert recording.depth_kind == ("z" if key == "depth" else "radial")
     images = [int(frame["view"]) for frame in imported.report["views"]]
-    np.testing.assert_allclose(
-        recording.frames.world_from_tool, scene.exact[images], rtol=0, atol=1e-6
-    )
+    poses = recording.frames.world_from_tool
+    np.testing.assert_allclose(poses, scene.exact[images], rtol=0, atol=1e-6)
     seen = scene.depth_mm[images] > 0
     np.testing.assert_array_equal(np.isfinite(recording.depth), seen)
     if key == "depth":

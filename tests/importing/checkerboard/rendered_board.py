@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import cameras
 import cv2
 import numpy as np
 from importing.posed_scene import unit_rays
@@ -13,12 +14,8 @@ from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.boards import Board
 
 BOARD = Board(columns=5, rows=7, square_length=0.03)
-CAMERA = CameraIntrinsics(
-    width=320,
-    height=240,
-    matrix=((290.0, 0.0, 158.3), (0.0, 288.0, 121.6), (0.0, 0.0, 1.0)),
-    distortion=(0.06, -0.12, 0.0008, -0.0005, 0.02),
-)
+LENS = (0.06, -0.12, 0.0008, -0.0005, 0.02)
+CAMERA = cameras.camera((320, 240), (290.0, 288.0), (158.3, 121.6), *LENS)
 # A Fibonacci lattice of points inside a pixel.
 _SAMPLES = 21
 _LATTICE_STEP = 13

@@ -40,16 +40,11 @@ def test_a_known_camera_is_recovered_within_its_stated_deviations(
     assert f"{slope:.1f} mm/m" in calibration_warning(camera, about)
 
 
-def test_too_few_views_are_refused() -> None:
+def test_too_few_views_and_views_without_tilt_are_refused() -> None:
     with pytest.raises(CalibrationDataError, match="3 views show the board; at least 5"):
         calibrate(noisy_corners(3), BOARD, SIZE)
-
-
-def test_views_without_tilt_do_not_determine_a_focal_length() -> None:
     generator = np.random.default_rng(5)
-    corners = [
-        project(placement(distance)) + generator.normal(0, 0.05, (35, 2))
-        for distance in np.linspace(0.5, 0.8, 6)
-    ]
+    views = [placement(distance) for distance in np.linspace(0.5, 0.8, 6)]
+    corners = [project(view) + generator.normal(0, 0.05, (35, 2)) for view in views]
     with pytest.raises(CalibrationDataError, match="tilt the board about both axes"):
         calibrate(corners, BOARD, SIZE)

@@ -3,14 +3,12 @@
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from importing.checkerboard.imported_board import (
     ERROR,
     PLACEMENTS,
     Run,
-    leftovers,
     read_image,
     report,
 )
@@ -57,16 +55,6 @@ def test_planes_depth_amplitude_mask_and_the_report_are_what_was_rendered(
         assert view["reprojection_rms_px"] < 0.15
 
 
-def test_no_return_is_nan(images: Path, run: Run, tmp_path: Path) -> None:
-    depth = read_image(images / "2_depth.png")
-    depth[:, :40] = 0
-    cv2.imwrite(str(images / "2_depth.png"), depth)
-    assert run(images)[0] == 0
-    recording = Recording.open(tmp_path / "recording")
-    assert np.isnan(recording.depth[2][:, :40]).all()
-    assert np.isfinite(recording.depth[2][:, 40:]).all()
-
-
 def test_the_camera_can_be_calibrated_from_the_boards(tmp_path: Path, run: Run) -> None:
     folder = tmp_path / "images"
     for i, where in enumerate(varied_placements(12, seed=21)):
@@ -75,19 +63,8 @@ def test_the_camera_can_be_calibrated_from_the_boards(tmp_path: Path, run: Run) 
     assert code == 0
     assert "The focal length calibrated from 12 views" in stderr
     about = report(tmp_path)["camera"]
-    found = np.array([about["K"][0][0], about["K"][1][1], about["K"][0][2], about["K"][1][2]])
     # Rendered corners carry a bias of some hundredths of a pixel that no deviation knows of.
-    np.testing.assert_allclose(found, [290.0, 288.0, 158.3, 121.6], atol=3.0)
-
-
-def test_nothing_is_overwritten(rendered: Path, run: Run, tmp_path: Path) -> None:
-    (tmp_path / "recording").mkdir()
-    (tmp_path / "recording" / "mine.txt").write_text("keep")
-    code, _, stderr = run(rendered)
-    assert code == 2
-    assert "exists already and is not overwritten" in stderr
-    assert (tmp_path / "recording" / "mine.txt").read_text() == "keep"
-    assert leftovers(tmp_path) == ["recording"]
+    np.testing.assert_allclose(about["K"], CAMERA.matrix, atol=3.0)
 
 
 @pytest.mark.parametrize(("kind", "declared"), [("radial", "z"), ("z", "radial")])

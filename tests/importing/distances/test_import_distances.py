@@ -4,21 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from importing.frames.imported import Imported, run_import
+from importing.frames.imported import run_import
 from importing.posed_scene import FRONT, Drive, Recorded
 from importing.scene_files import write_matrices
 from importing.walls.wall_trials import WALLS, read_trial
 
 
-def import_trials(real_data: Path, mount: str, out: Path) -> Imported:
-    trials = real_data / "wall_trials_l3cx"
-    named = [word for wall in WALLS for word in ("--wall", wall)]
-    folders = [trials / f"L3CX_{wall}_{mount}" for wall in WALLS]
-    return run_import("distances", *folders, *named, "--depth-unit-mm", 1, out=out)
-
-
 def test_real_trials_become_distances_beside_their_poses(real_data: Path, tmp_path: Path) -> None:
-    imported = import_trials(real_data, "P1", tmp_path / "out")
+    named = [word for wall in WALLS for word in ("--wall", wall)]
+    folders = [real_data / "wall_trials_l3cx" / f"L3CX_{wall}_P1" for wall in WALLS]
+    given = (*folders, *named, "--depth-unit-mm", 1)
+    imported = run_import("distances", *given, out=tmp_path / "out")
     recording = imported.done
     assert "a turn about the ray cannot" in imported.text
     assert recording.planes == "estimated"

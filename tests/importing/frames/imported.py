@@ -58,9 +58,8 @@ def run_import(door: str, *arguments: object, out: Path) -> Imported:
 def import_png(recorded: Recorded, folder: Path, *arguments: object) -> Imported:
     """Write PNG and TUM, and import them."""
     scene_files.write_png(recorded, folder)
-    poses = scene_files.write_tum(
-        recorded.pose_times, recorded.world_from_tool, folder / "poses.txt"
-    )
+    track = recorded.pose_times, recorded.world_from_tool
+    poses = scene_files.write_tum(*track, folder / "poses.txt")
     return import_written(recorded, folder, "png", poses, *arguments)
 
 

@@ -139,8 +139,7 @@ def test_boards_that_do_not_exist_are_refused(board: str, said: str, tmp_path: P
 
 
 def test_planes_come_from_poses_or_from_a_board_and_not_from_both(tmp_path: Path) -> None:
+    given = (tmp_path, "--depth", "*", *PINHOLE)
     for more in ((), ("--poses", "p.txt", "--board", "5x7")):
-        refused = run_import(
-            "frames", tmp_path, "--depth", "*", *PINHOLE, *more, out=tmp_path / "o"
-        )
+        refused = run_import("frames", *given, *more, out=tmp_path / "o")
         assert "say where the planes come from" in refused.text

@@ -57,6 +57,8 @@ def test_planes_are_estimated_stops_share_a_pose_id_and_masks_hold_the_frame_s_o
     assert masks.mean(axis=(1, 2)).min() > 0.03
     for view in set(images):
         assert masks[np.array(images) == view].sum(axis=0).max() == 1
+    assert abs(plain.report["lag"]["seconds"]) < 0.005
+    assert "late" not in plain.text
 
 
 @pytest.mark.parametrize("late", [0.08, pytest.param(-0.15, marks=pytest.mark.slow)])
@@ -69,11 +71,6 @@ def test_a_late_image_clock_is_found_within_10_ms_and_named(
     assert abs(imported.report["lag"]["seconds"] - late) < 0.010
     assert_start_is_near(imported, drive)
     assert ("late" if late > 0 else "early") in imported.text
-
-
-def test_clocks_that_agree_need_no_word(plain: Imported) -> None:
-    assert abs(plain.report["lag"]["seconds"]) < 0.005
-    assert "late" not in plain.text
 
 
 @pytest.mark.slow
@@ -119,9 +116,8 @@ def test_all_formats_of_images_and_poses_give_one_recording(
     ):
         folder = tmp_path / name
         scene_files.write_images(at_stops, folder, ending)
-        poses = write_poses(
-            at_stops.exact, folder / ("poses.yaml" if name == "moveit" else "poses")
-        )
+        file = folder / ("poses.yaml" if name == "moveit" else "poses")
+        poses = write_poses(at_stops.exact, file)
         imported[name] = import_written(at_stops, folder, ending, poses)
     paired = {name: one.report["paired_by"] for name, one in imported.items()}
     assert paired == {"png": "time", "npy": "name", "tiff": "order", "moveit": "order"}
@@ -139,9 +135,8 @@ def test_turned_images_and_swapped_bytes_are_undone_when_named_and_refused_when_
     ):
         folder = tmp_path / name
         scene_files.write_png(at_stops, folder, swap_bytes=swap_bytes, turn=turn)
-        poses = scene_files.write_tum(
-            at_stops.pose_times, at_stops.world_from_tool, folder / "poses.txt"
-        )
+        track = at_stops.pose_times, at_stops.world_from_tool
+        poses = scene_files.write_tum(*track, folder / "poses.txt")
         refused = import_written(at_stops, folder, "png", poses)
         assert refused.exit_code == 2
         assert f"Add {' '.join(arguments)}" in refused.text

@@ -18,14 +18,11 @@ def screw(times: np.ndarray) -> PoseTrack:
     return PoseTrack.checked(poses, "screw", times)
 
 
-def test_uniform_motion_is_interpolated_exactly_and_not_extrapolated() -> None:
+def test_motion_is_interpolated_up_to_a_gap_which_is_named() -> None:
     track = screw(np.arange(0.0, 2.05, 0.1))
     times = np.array([0.033, 0.15, 1.987])
     np.testing.assert_allclose(track.at(times), screw(times).world_from_tool, atol=1e-12)
     assert np.isnan(track.at(np.array([-0.01, 2.01]))).all()
-
-
-def test_an_image_far_from_every_pose_is_refused_with_the_gap() -> None:
     track = screw(np.array([0.0, 0.1, 0.2, 0.3, 1.3, 1.4, 1.5, 1.6]))
     times = np.array([0.15, 0.8, 9.0])
     images, _, refused, _ = pair(["a", "b", "c"], times, track, tolerance=0.2)
@@ -34,14 +31,11 @@ def test_an_image_far_from_every_pose_is_refused_with_the_gap() -> None:
     assert "after the last" in refused["c"]
 
 
-def test_a_list_of_stops_gives_each_image_the_nearest_pose() -> None:
+def test_images_are_paired_with_the_nearest_pose_or_by_name() -> None:
     track = screw(np.array([0.0, 3.0, 6.0]))
     _, found, refused, _ = pair(["a", "b", "c"], np.array([0.1, 2.9, 4.5]), track, tolerance=0.2)
     np.testing.assert_array_equal(found, track.world_from_tool[:2])
     assert list(refused) == ["c"]
-
-
-def test_names_pair_whatever_the_order_and_lists_without_them_must_be_as_long() -> None:
     poses = screw(np.arange(3.0)).world_from_tool
     track = PoseTrack.checked(poses, "list", names=["c.png", "a.png", "x.png"])
     images, found, _, _ = pair(["a", "b", "c"], None, track, tolerance=0.2)

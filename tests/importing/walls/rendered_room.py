@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cameras
 import numpy as np
 import torch
 from importing.posed_scene import (
@@ -231,5 +232,5 @@ def looking_straight(number: int, roll: float, generator: np.random.Generator) -
 
 def intrinsics(camera: Camera) -> CameraIntrinsics:
     """Return the camera as the package describes it."""
-    rows = tuple(tuple(row) for row in camera.matrix.tolist())
-    return CameraIntrinsics(width=camera.width, height=camera.height, matrix=rows)  # type: ignore[arg-type]
+    (focal, _, right), (_, _, down), _ = camera.matrix.tolist()
+    return cameras.camera((camera.width, camera.height), (focal, focal), (right, down))

@@ -109,13 +109,7 @@ def _rms_alone(dataset: Dataset, frames: np.ndarray, model: CalibrationModel) ->
     dataset, residuals = walls_alone(dataset, frames, model).put_into(dataset), []
     for batch in dataset.batches(frames):
         with torch.no_grad():
-            residual = model.residual(
-                batch.radial_distance,
-                batch.amplitude,
-                dataset.ray_directions(),
-                batch.normal_tool,
-                batch.offset_tool,
-                batch.conditions,
-            )
-        residuals.append(residual.flatten())
+            seen = (batch.radial_distance, batch.amplitude, dataset.ray_directions())
+            plane = (batch.normal_tool, batch.offset_tool)
+            residuals.append(model.residual(*seen, *plane, batch.conditions).flatten())
     return 1e3 * float(torch.cat(residuals).square().mean().sqrt())

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import synthetic_scene
 from importing.posed_scene import apart
 from importing.walls.rendered_room import (
     Camera,
@@ -22,35 +24,25 @@ from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 
-EA = {
-    "name": "EA",
-    "model": {
-        "terms": [
-            {"kind": "distance_polynomial", "degree": 3},
-            {"kind": "pixel_polynomial", "degree": 2},
-            {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
-        ]
-    },
-}
+EA = {"name": "EA", "model": synthetic_scene.EA}
 
 
-class Imported:
-    """A room with clutter, recorded and imported once for all tests of this file."""
+class Imported(NamedTuple):
+    """A room with clutter, recorded and imported."""
 
-    def __init__(self, folder: Path) -> None:
-        generator = np.random.default_rng(1)
-        self.room = Room(
-            camera=Camera(48, 40, 46.0), tool_from_camera=hand_eye_anywhere(generator), clutter=0.2
-        )
-        self.views: Views = self.room.views(poses_in_room(40, generator), generator)
-        camera, views = intrinsics(self.room.camera), self.views
-        given = (camera, views.world_from_tool, views.depth, views.amplitude)
-        self.recording, self.report = imported_room(folder / "walls", *given)
+    room: Room
+    views: Views
+    recording: Recording
+    report: dict[str, Any]
 
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory: pytest.TempPathFactory) -> Imported:
-    return Imported(tmp_path_factory.mktemp("room"))
+    generator = np.random.default_rng(1)
+    room = Room(Camera(48, 40, 46.0), tool_from_camera=hand_eye_anywhere(generator), clutter=0.2)
+    views = room.views(poses_in_room(40, generator), generator)
+    given = intrinsics(room.camera), views.world_from_tool, views.depth, views.amplitude
+    return Imported(room, views, *imported_room(tmp_path_factory.mktemp("room") / "walls", *given))
 
 
 def test_each_image_and_wall_is_a_frame_with_a_mask_of_its_own(imported: Imported) -> None:
@@ -87,11 +79,8 @@ def test_header_and_report_say_what_was_found_and_what_was_not(imported: Importe
 
 
 def test_training_finds_the_hand_eye_without_being_told_anything(imported: Imported) -> None:
-    options = EA | {
-        "advice": 0,
-        "weights": {"robust": "cauchy"},
-        "split": {"test_fraction": 0.2, "seed": 0},
-    }
+    split = {"test_fraction": 0.2, "seed": 0}
+    options = EA | {"advice": 0, "weights": {"robust": "cauchy"}, "split": split}
     result = tofcorr.train(imported.recording, options)
     report = result.report
     hand_eye = np.array(report["hand_eye"]["tool_from_camera"])
@@ -108,10 +97,8 @@ def test_evaluating_judges_every_column_against_walls_of_its_own(
 ) -> None:
     bent = _with_planes_of_nonsense(imported.recording, tmp_path / "bent")
     options = {"models": [EA], "folds": 0}
-    first, second = (
-        tofcorr.evaluate(one, options).sets[0].values["half"]["rms_mm"]
-        for one in (imported.recording, bent)
-    )
+    sets = (tofcorr.evaluate(one, options).sets[0] for one in (imported.recording, bent))
+    first, second = (one.values["half"]["rms_mm"] for one in sets)
     assert max(first[column][0] for column in ("before", "hand-eye only")) < 40.0
     assert first["EA"][0] < 3.0
     # Planes 20 degrees and 200 mm off are a start and no more.

@@ -7,15 +7,12 @@ The trials of Sifferman et al. (2022), `$TOFCORR_REAL_DATA/wall_trials_l3cx`: a 
 from pathlib import Path
 
 import numpy as np
-
-from tofcorr.geometry.camera import CameraIntrinsics
+from cameras import camera
 
 MOUNTS = ("P1", "P2")
 WALLS = ("R1", "R2", "W1", "W2")
 # One pixel at the principal point: its ray is the optical axis.
-ONE_PIXEL = CameraIntrinsics(
-    width=1, height=1, matrix=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-)
+ONE_PIXEL = camera((1, 1), (1.0, 1.0), (0.0, 0.0))
 
 
 def read_trial(real_data: Path, wall: str, mount: str) -> tuple[np.ndarray, np.ndarray]:
