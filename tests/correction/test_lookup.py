@@ -1,21 +1,14 @@
 """What a look-up table does not read, it refuses in words."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from tofcorr.correction.lookup import LookupTable, interpolate
 
-ARRAYS: dict[str, Any] = {
-    "offset": np.zeros((2, 3)),
-    "table": np.zeros((4, 1)),
-    "radial_of_z": np.ones((1, 1)),
-}
-
 
 def test_a_frame_of_another_size_is_refused_with_both_sizes() -> None:
-    table = LookupTable(**ARRAYS, metadata={})
+    arrays = {"offset": np.zeros((2, 3)), "table": np.zeros((4, 1))}
+    table = LookupTable(**arrays, radial_of_z=np.ones((1, 1)), metadata={})
     frame = np.ones((3, 2))
     with pytest.raises(ValueError, match=r"expected the camera's \(2, 3\).* got \(3, 2\)"):
         table(frame, frame)

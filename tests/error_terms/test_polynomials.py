@@ -28,16 +28,12 @@ def test_coefficients_survive_the_papers_symbols(name: str, generator: torch.Gen
 
 def test_ea_in_the_papers_symbols_is_the_papers_formula(generator: torch.Generator) -> None:
     model = built(D, P2, I1)
-    c = (0.01, -0.02, 0.015, -0.003)
+    c, i = (0.01, -0.02, 0.015, -0.003), (3e-5, -1e-8)
     p, r0, c0 = (2e-4, -1e-4), 3.3, 7.1
-    i = (3e-5, -1e-8)
-    model.set_paper_coefficients(
-        {
-            "distance": {"c0": c[0], "c1": c[1], "c2": c[2], "c3": c[3]},
-            "pixel": {"p1": p[0], "p2": p[1], "r0": r0, "c0": c0},
-            "intensity": {"i1": i[0], "i2": i[1]},
-        }
-    )
+    values = {"distance": {f"c{k}": one for k, one in enumerate(c)}}
+    values["pixel"] = {"p1": p[0], "p2": p[1], "r0": r0, "c0": c0}
+    values["intensity"] = {"i1": i[0], "i2": i[1]}
+    model.set_paper_coefficients(values)
     distance, amplitude, _ = inputs(generator)
     row = torch.arange(5, dtype=torch.float64)[:, None]
     column = torch.arange(7, dtype=torch.float64)

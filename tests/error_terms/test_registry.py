@@ -72,12 +72,8 @@ def test_a_larger_member_of_a_family_contains_the_smaller(kind: str, name: str) 
         "condition": inputs(torch.Generator().manual_seed(1))[2:],
     }
     group = first.group if first.group in given else "signal"
-    torch.testing.assert_close(
-        first.basis(*given[group]),  # type: ignore[attr-defined]
-        second.basis(*given[group])[same],  # type: ignore[attr-defined]
-        rtol=0,
-        atol=0,
-    )
+    small, large = (one.basis(*given[group]) for one in (first, second))  # type: ignore[attr-defined]
+    torch.testing.assert_close(small, large[same], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("kind", TERMS)

@@ -20,13 +20,12 @@ def trained(generator: torch.Generator, domain: Domain = DOMAIN) -> ResidualNetw
     return network
 
 
-def test_untrained_it_predicts_exactly_nothing(generator: torch.Generator) -> None:
+def test_it_adds_nothing_untrained_and_its_bound_at_most(
+    generator: torch.Generator,
+) -> None:
     network = ResidualNetwork(ResidualNetworkOptions(), DOMAIN)
     distance = 1 + 2 * torch.rand(3, 5, 7, generator=generator, dtype=torch.float64)
     assert not network(distance, 100 * distance, ROWS, COLUMNS).any()
-
-
-def test_it_never_adds_more_than_its_bound(generator: torch.Generator) -> None:
     network = trained(generator)
     distance = 5 * torch.rand(50, 5, 7, generator=generator, dtype=torch.float64)
     found = network(distance, 200 * distance, ROWS, COLUMNS).detach().abs()
@@ -44,10 +43,6 @@ def test_it_fades_to_zero_outside_the_calibrated_ranges(generator: torch.Generat
         far = torch.full((5, 7), distance, dtype=torch.float64)
         found = network(far, torch.full_like(far, strength), ROWS, COLUMNS)
         assert not found.any()
-
-
-def test_it_is_continuous_where_it_fades(generator: torch.Generator) -> None:
-    network = trained(generator)
     distance = torch.linspace(2.9, 3.2, 3001, dtype=torch.float64)[:, None, None]
     found = network(distance, torch.full_like(distance, 100.0), ROWS, COLUMNS)
     assert float(found.detach().diff(dim=0).abs().max()) < 1e-4

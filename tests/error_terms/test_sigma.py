@@ -5,21 +5,15 @@ from typing import Any
 import pytest
 import torch
 from correction.export.states import calibration
+from synthetic_scene import EB
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.geometry.rays import ray_directions
 
+SPLINES = {"kind": "distance_spline", "segments": 5}, {"kind": "tensor_spline"}
 MODELS: dict[str, list[dict[str, Any]]] = {
-    "EB": [
-        {"kind": "distance_polynomial"},
-        {"kind": "pixel_polynomial"},
-        {"kind": "amplitude_polynomial", "variable": "normalised_amplitude"},
-    ],
-    "splines": [
-        {"kind": "distance_spline", "segments": 5},
-        {"kind": "tensor_spline"},
-        {"kind": "incident_light"},
-    ],
+    "EB": EB["terms"],
+    "splines": [*SPLINES, {"kind": "incident_light"}],
     "periodic": [{"kind": "periodic"}, {"kind": "lookup_table", "segments": 6}],
 }
 

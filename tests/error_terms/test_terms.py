@@ -64,7 +64,7 @@ def condition_term(request: pytest.FixtureRequest) -> ConditionTerm:
     return built(request.param).condition_terms[0]  # type: ignore[return-value]
 
 
-def test_signal_term_is_its_coefficients_times_its_basis(
+def test_signal_term_is_its_coefficients_times_its_basis_scripted_too(
     signal_term: SignalTerm, generator: torch.Generator
 ) -> None:
     distance, amplitude = signals(generator)
@@ -72,15 +72,10 @@ def test_signal_term_is_its_coefficients_times_its_basis(
     randomise(signal_term, generator)
     expected = signal_term.coefficients @ signal_term.basis(distance, amplitude)
     torch.testing.assert_close(signal_term(distance, amplitude), expected, rtol=1e-12, atol=1e-12)
-
-
-def test_signal_term_scripts_identically(
-    signal_term: SignalTerm, generator: torch.Generator
-) -> None:
-    randomise(signal_term, generator)
-    distance, amplitude = signals(generator)
     scripted = torch.jit.script(signal_term)
     torch.testing.assert_close(scripted(distance, amplitude), signal_term(distance, amplitude))
+    nothing = torch.tensor([math.nan], dtype=torch.float64)
+    assert signal_term(nothing, nothing).isnan().all()
 
 
 def test_signal_term_leaves_the_constant_to_the_model(
@@ -91,14 +86,6 @@ def test_signal_term_leaves_the_constant_to_the_model(
     columns = torch.cat([torch.ones(1, basis.shape[1], dtype=torch.float64), basis])
     values = torch.linalg.svdvals(columns / columns.norm(dim=1, keepdim=True).clamp(min=1e-12))
     assert values.min() > 1e-5
-
-
-def test_signal_term_of_an_unknown_distance_is_unknown(
-    signal_term: SignalTerm, generator: torch.Generator
-) -> None:
-    randomise(signal_term, generator)
-    nothing = torch.tensor([math.nan], dtype=torch.float64)
-    assert signal_term(nothing, nothing).isnan().all()
 
 
 def test_condition_term_is_zero_at_mean_conditions_and_scripts(

@@ -1,23 +1,18 @@
 """Small modules of every kind of term, with random parameters, and frames for them."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
 from kinds_of_terms import DOMAIN
+from small_recordings import CAMERA
+from synthetic_scene import frame_batch
 from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.options import resolve_options
 from tofcorr.training.calibration import TrainingOptions
-
-CAMERA = CameraIntrinsics(
-    width=7,
-    height=5,
-    matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
-    distortion=(-0.05, 0.01, 0.0, 0.0, 0.0),
-)
 
 
 def options_of(*kinds: str) -> TrainingOptions:
@@ -62,11 +57,8 @@ def conditions(leading: tuple[int, ...] = ()) -> dict[str, Any]:
     """Return conditions inside the calibrated ranges of `DOMAIN`, one a frame."""
     generator = torch.Generator().manual_seed(7)
     value = 2.2 + torch.rand(leading, generator=generator, dtype=torch.float64)
-    return {
-        "timestamp_s": value,
-        "integration_time_us": 1e6 * value,
-        "room_temperature_c": value,
-    }
+    own = {"timestamp_s": value, "room_temperature_c": value}
+    return own | {"integration_time_us": 1e6 * value}
 
 
 def with_missing(depth: Tensor) -> Tensor:
@@ -83,12 +75,6 @@ def wall_batch(module: DepthCorrection) -> FrameBatch:
     valid[..., 0, :5] = False
     tilt = 0.2 * torch.randn(3, 3, generator=torch.Generator().manual_seed(9)).double()
     normal = torch.nn.functional.normalize(tilt - torch.eye(3, dtype=torch.float64)[2], dim=-1)
-    return FrameBatch(
-        indices=torch.arange(3),
-        radial_distance=with_missing(depth),
-        amplitude=amplitude,
-        valid=valid,
-        normal_tool=normal,
-        offset_tool=torch.tensor([1.0, 2.0, 1.5], dtype=torch.float64),
-        conditions=module.ranges.mean_conditions.expand(3, -1) + 0.1,
-    )
+    offset = torch.tensor([1.0, 2.0, 1.5], dtype=torch.float64)
+    batch = frame_batch(with_missing(depth), amplitude, normal, offset, valid)
+    return replace(batch, conditions=module.ranges.mean_conditions.expand(3, -1) + 0.1)

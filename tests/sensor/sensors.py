@@ -3,28 +3,19 @@
 from typing import Any
 
 import torch
+from cameras import camera
+from synthetic_scene import EB
 from torch import Tensor
 
 from tofcorr.conditions import condition
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions, ray_plane_distance
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 
-CAMERA = CameraIntrinsics(
-    width=16,
-    height=12,
-    matrix=((20.0, 0.0, 7.2), (0.0, 20.5, 5.9), (0.0, 0.0, 1.0)),
-    distortion=(-0.05, 0.01, 0.0, 0.0, 0.0),
-)
+CAMERA = camera((16, 12), (20.0, 20.5), (7.2, 5.9), -0.05, 0.01, 0.0, 0.0, 0.0)
 FREQUENCY = 20.0e6
 
-ERROR = {
-    "terms": [
-        {"kind": "distance_polynomial", "degree": 3},
-        {"kind": "pixel_polynomial", "degree": 2},
-        {"kind": "amplitude_polynomial", "variable": "normalised_amplitude", "degree": 2},
-    ],
+ERROR = EB | {
     "coefficients": {
         "distance": {"c0": 0.03, "c1": -0.02, "c2": 0.008, "c3": -0.001},
         "pixel": {"p1": 2e-5, "r0": 5.0, "p2": -1e-5, "c0": 8.0},
@@ -51,12 +42,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "row_column_pattern": {"height": 12, "width": 16, "row_rms_m": 0.002, "column_rms_m": 0.001},
     "lens": {"focal_x": 0.01, "centre_y_px": 0.4, "radial_2": 0.02},
 }
-IN_SI = {
-    "timestamp": 90.0,
-    "integration_time": 800e-6,
-    "room_temperature": 25.0,
-    "ambient": 300.0,
-}
+IN_SI = {"timestamp": 90.0, "integration_time": 800e-6, "room_temperature": 25.0, "ambient": 300.0}
 CONDITIONS: dict[str, float] = {
     condition(name).column: condition(name).in_file(value) for name, value in IN_SI.items()
 }

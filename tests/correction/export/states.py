@@ -1,18 +1,21 @@
 """Calibrations with known hand-eye transforms, for tests of the formats that robots read."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from kinds_of_terms import DOMAIN
 from scipy.spatial.transform import Rotation
+from small_recordings import CAMERA
+from synthetic_scene import EA
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
 from tofcorr.correction.state import CalibrationState, HandEyeAccuracy
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
+from tofcorr.geometry.camera import FrameNames
 
 NAMES = FrameNames(world="base_link", tool="tool0", camera="tof_optical_frame")
 EYE_TO_HAND = FrameNames(
@@ -21,11 +24,7 @@ EYE_TO_HAND = FrameNames(
 ACCURACY = HandEyeAccuracy(
     translation_se_mm=(0.12, 0.15, 0.34), rotation_se_deg=(0.011, 0.012, 0.023)
 )
-TERMS = (
-    {"kind": "distance_polynomial", "degree": 3},
-    {"kind": "pixel_polynomial", "degree": 2},
-    {"kind": "amplitude_polynomial", "degree": 2},
-)
+TERMS = EA["terms"]
 
 
 def calibration(
@@ -45,12 +44,7 @@ def calibration(
         "coefficients": 0.02 * torch.randn(len(model.symbols()), generator=generator).double(),
         "tool_from_camera": torch.eye(4).double() if transform is None else torch.tensor(transform),
         "hand_eye_estimated": True,
-        "camera": CameraIntrinsics(
-            width=7,
-            height=5,
-            matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
-            distortion=(-0.05, 0.01, 0.001, -0.002),
-        ),
+        "camera": replace(CAMERA, distortion=(-0.05, 0.01, 0.001, -0.002)),
         "depth_kind": depth_kind,
         "frames": NAMES,
         "hand_eye_accuracy": ACCURACY,

@@ -15,7 +15,7 @@ from correction.export.states import EYE_TO_HAND, NAMES, TRANSFORMS, calibration
 from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.state import HandEyeAccuracy
-from tofcorr.errors import ConfigError, ExportError
+from tofcorr.errors import ConfigError
 from tofcorr.geometry.camera import FrameNames
 
 every_transform = pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
@@ -158,19 +158,3 @@ def test_a_calibration_without_a_robot_is_refused_by_name(
 def test_another_ending_than_easy_handeye_loads_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"\.yaml.*\.calib"):
         write("easy_handeye", calibration(np.eye(4)), tmp_path / "arm.json")
-
-
-@every_format
-def test_a_file_that_cannot_be_written_leaves_the_older_one(
-    name: str, file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / file).write_text("older")
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(ExportError, match="No space left"):
-        write(name, calibration(np.eye(4)), tmp_path / file)
-    monkeypatch.undo()
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["older"]

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cameras
 import numpy as np
 import pytest
 import torch
@@ -137,12 +138,8 @@ def test_forty_two_frames_of_a_whole_sensor_are_corrected_as_by_the_model(
     terms = [{"kind": kind} for kind in kinds]
     terms.append({"kind": "amplitude_polynomial", "variable": "normalised_amplitude"})
     base = calibration(terms=terms, depth_kind=depth_kind)
-    camera = CameraIntrinsics(
-        width=645,  # Neither a multiple of a vector nor of a block.
-        height=480,
-        matrix=((500.0, 0.0, 322.0), (0.0, 500.0, 239.5), (0.0, 0.0, 1.0)),
-        distortion=(-0.05, 0.01, 0.001, -0.002),
-    )
+    lens, size = (-0.05, 0.01, 0.001, -0.002), (645, 480)  # No multiple of a vector or block.
+    camera = cameras.camera(size, (500.0, 500.0), (322.0, 239.5), *lens)
     domain = replace(base.domain, height=480, width=645)
     pattern = torch.randn(480, 645, generator=torch.Generator().manual_seed(1)).double()
     state = base.model_copy(
