@@ -55,14 +55,13 @@ def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(
     generator: torch.Generator,
 ) -> None:
     """Independent of any formula: draw the noise anew and look."""
-    ends, predicted = [], []
+    ends = []
     for _ in range(40):
         scene = make_scene(generator, EA, num_frames=20)
         moments = scene.moments()
         optimum = minimise(MomentObjective(moments), scene.truth).parameters
         standard_errors = jackknife_covariance(moments, optimum).standard_errors
         ends.append(step_between(scene.truth, optimum) / standard_errors)
-        predicted.append(standard_errors)
     # 40 draws of 14 parameters: the mean square of t variables of 19 degrees of freedom is
     # 19 / 17, give or take a tenth.
     assert 0.8 < float(torch.stack(ends).square().mean()) < 1.7

@@ -52,12 +52,8 @@ def test_the_p_value_is_that_of_leaving_out_each_pose(generator: torch.Generator
     known, further, residual = _columns(generator, 0.1, 0.5)
     compared = AddedColumns(_products(known, further, residual[..., None]), _no_prior())
     both = torch.cat([known, further[..., :1]], dim=2)
-    without = torch.stack(
-        [
-            _least_squares(both[kept], residual[kept])[-1]
-            for kept in (torch.arange(POSES) != left_out for left_out in range(POSES))
-        ]
-    )
+    others = [torch.arange(POSES) != left_out for left_out in range(POSES)]
+    without = torch.stack([_least_squares(both[kept], residual[kept])[-1] for kept in others])
     variance = (POSES - 1) / POSES * (without - without.mean()).square().sum()
     moved = compared([0])
     assert moved is not None

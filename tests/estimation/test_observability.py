@@ -79,20 +79,13 @@ def test_the_name_of_a_direction_fits_into_a_sentence(names: tuple[str, ...], wo
     assert direction.in_words() == words
 
 
-def test_a_good_recording_gives_no_warning(warned: Callable[[str], str]) -> None:
-    assert warned("good") == ""
-
-
 @pytest.mark.parametrize(("left", "said"), [(1.02, "is enough"), (1.2, "makes them worse")])
 def test_only_a_correction_that_clearly_does_harm_is_advised_against(
     walls: dict[str, Dataset], fits: FitOf, left: float, said: str
 ) -> None:
     # A perfect camera's run was good, and warned "do not use it" for 0.2 % more error.
-    alone = {"rms": 1.0}
-    errors = {
-        "after": {"train": alone, "test": {"rms": left}},
-        "hand_eye_only": {"test": alone},
-    }
+    after = {"train": {"rms": 1.0}, "test": {"rms": left}}
+    errors = {"after": after, "hand_eye_only": {"test": {"rms": 1.0}}}
     fit, wall = fits("good"), walls["good"]
     support = recording_support(wall, np.arange(3), fit.solution.parameters.tool_from_camera)
     found = judge(fit, errors, support, tofcorr.inspect(wall.first), robot_moves=True)
@@ -104,35 +97,22 @@ def test_without_tilt_four_directions_are_undetermined(
     fits: FitOf, warned: Callable[[str], str]
 ) -> None:
     undetermined = fits("no tilt").observability.undetermined
-    alone = {
-        next(iter(direction.shares)) for direction in undetermined if direction.correlation is None
-    }
+    alone = {next(iter(one.shares)) for one in undetermined if one.correlation is None}
     assert alone == {"t_x", "t_y", "w_z"}
-    paired = [
-        set(direction.shares) for direction in undetermined if direction.correlation is not None
-    ]
-    assert paired == [{"t_z", "c0"}]
+    (paired,) = [set(one.shares) for one in undetermined if one.correlation is not None]
+    assert paired == {"t_z", "c0"}
     assert "hardly tilted" in warned("no tilt")
     assert "how much of a constant is c0 and how much t_z" in warned("no tilt")
 
 
-def test_one_axis_of_tilt_without_roll_does_not_determine_one_translation(
+def test_one_axis_of_tilt_without_roll_leaves_a_translation_open(
     fits: FitOf, warned: Callable[[str], str]
 ) -> None:
     (direction,) = fits("one axis").observability.undetermined
     assert set(direction.shares) <= {"t_x", "t_y"}
     assert "one axis only" in warned("one axis")
     assert "hardly rolled" in warned("one axis")
-
-
-def test_roll_turns_one_axis_of_tilt_into_two(fits: FitOf) -> None:
     assert not fits("one axis and roll").observability.undetermined
-
-
-def test_a_white_wall_alone_is_named_for_its_one_reflectivity(
-    warned: Callable[[str], str],
-) -> None:
-    assert "one reflectivity" in warned("white")
 
 
 def test_a_narrow_range_of_distances_is_named_and_confounds_the_constant(
@@ -145,9 +125,11 @@ def test_a_narrow_range_of_distances_is_named_and_confounds_the_constant(
     assert "range of distances is narrow" in warned("narrow")
 
 
-def test_a_model_without_intensity_does_not_ask_for_reflectivities(
-    walls: dict[str, Dataset],
+def test_one_reflectivity_is_named_only_if_the_model_has_an_intensity(
+    walls: dict[str, Dataset], warned: Callable[[str], str]
 ) -> None:
+    assert warned("good") == ""
+    assert "one reflectivity" in warned("white")
     dataset = walls["white"]
     support = recording_support(dataset, np.arange(dataset.num_frames), true_hand_eye(dataset))
     assert not shortcomings(support, moves=True, with_intensity=False)

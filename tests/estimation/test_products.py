@@ -2,19 +2,17 @@
 
 import pytest
 import torch
-from kinds_of_terms import DOMAIN
-from synthetic_scene import EA, error_model
+from cameras import camera
+from kinds_of_terms import DOMAIN, built
+from synthetic_scene import EA, error_model, frame_batch
 
 from tofcorr.data.recording import FrameBatch
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.estimation.accumulator import Design, MomentAccumulator, moments_of_few, on_polynomials
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
-CAMERA = CameraIntrinsics(
-    width=66, height=66, matrix=((120.0, 0.0, 32.0), (0.0, 125.0, 33.0), (0.0, 0.0, 1.0))
-)
+CAMERA = camera((66, 66), (120.0, 125.0), (32.0, 33.0))
 DISTANCE = {"kind": "distance_polynomial", "degree": 2}
 
 
@@ -26,14 +24,10 @@ def frames(generator: torch.Generator) -> FrameBatch:
     """Distances and amplitudes of twice the calibrated range; a fifth of the pixels is missing."""
     distance, amplitude, chance = torch.rand(3, 4, 66, 66, generator=generator, dtype=torch.float64)
     valid = chance > 0.2
-    return FrameBatch(
-        indices=torch.arange(4),
-        radial_distance=torch.where(valid, 0.2 + 6.0 * distance, torch.nan),
-        amplitude=torch.where(valid, 5.0 + 1800.0 * amplitude, torch.inf),
-        valid=valid,
-        normal_tool=torch.eye(4, 3, dtype=torch.float64),
-        offset_tool=torch.ones(4, dtype=torch.float64),
-    )
+    distance = torch.where(valid, 0.2 + 6.0 * distance, torch.nan)
+    amplitude = torch.where(valid, 5.0 + 1800.0 * amplitude, torch.inf)
+    plane = torch.eye(4, 3, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
+    return frame_batch(distance, amplitude, *plane, valid)
 
 
 @pytest.mark.parametrize("with_distance", [True, False])
@@ -41,11 +35,8 @@ def frames(generator: torch.Generator) -> FrameBatch:
 def test_moments_are_those_of_the_columns_pixel_by_pixel(
     kind: str, *, with_distance: bool, generator: torch.Generator
 ) -> None:
-    terms = [{"kind": kind}]
-    if with_distance and kind != DISTANCE["kind"]:
-        terms.append(DISTANCE)
-    model = ErrorModel(ErrorModelOptions.from_mapping({"terms": terms}, kind), DOMAIN)
-    design, batch = design_of(model), frames(generator)
+    beside = [DISTANCE] if with_distance and kind != DISTANCE["kind"] else []
+    design, batch = design_of(built({"kind": kind}, *beside)), frames(generator)
     weights = 0.2 + torch.rand(batch.valid.shape, generator=generator, dtype=torch.float64)
     assert on_polynomials(design)
     for given in (None, weights):
@@ -64,8 +55,7 @@ def test_static_images_that_no_polynomials_follow_are_left_as_they_are() -> None
     design.pixel_functions[1, 2, 33:] += 1.0
     assert not on_polynomials(design)
     # A view of 150 degrees across, whose rays no polynomial that is tried follows to rounding.
-    matrix = ((focal, 0.0, 160.0), (0.0, focal, 30.0), (0.0, 0.0, 1.0))
-    wide = CameraIntrinsics(width=320, height=60, matrix=matrix)
+    wide = camera((320, 60), (focal, focal), (160.0, 30.0))
     assert not on_polynomials(Design(model, DOMAIN, ray_directions(wide)))
 
 

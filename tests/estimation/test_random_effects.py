@@ -27,14 +27,10 @@ def drawn(
 
 def test_integrating_effects_out_is_generalised_least_squares() -> None:
     sums, data = drawn(4, 12, (0.7, 0.2), 0.3, seed=1)
-    precision, right = reduced(
-        sums, torch.full((4,), 0.09).double(), torch.tensor([1 / 0.49, 1 / 0.04])
-    )
+    noise, random = torch.full((4,), 0.09).double(), torch.tensor([0.49, 0.04]).double()
+    precision, right = reduced(sums, noise, 1 / random)
     for k, (x, effects, y) in enumerate(data):
-        covariance = (
-            0.09 * torch.eye(12)
-            + effects @ torch.diag(torch.tensor([0.49, 0.04]).double()) @ effects.T
-        )
+        covariance = 0.09 * torch.eye(12) + effects @ torch.diag(random) @ effects.T
         weight = torch.linalg.inv(covariance)
         torch.testing.assert_close(precision[k], x.T @ weight @ x, rtol=1e-8, atol=1e-8)
         torch.testing.assert_close(right[k], x.T @ weight @ y, rtol=1e-8, atol=1e-8)

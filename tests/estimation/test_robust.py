@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from simulated_walls import fitted, simulated_wall, true_hand_eye
+from synthetic_scene import frame_batch
 
 from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.estimation.robust import outlying_images, robust_scale, robust_weights
@@ -81,57 +82,39 @@ def test_the_robust_scale_of_normal_residuals_is_their_standard_deviation(
     assert robust_scale(residuals) == pytest.approx(0.003, rel=0.02)
 
 
-def test_the_image_that_stands_out_is_named() -> None:
+def test_an_image_that_stands_out_is_named() -> None:
     random = np.random.default_rng(0)
     rms = 0.005 * np.exp(0.2 * random.normal(size=40))
     rms[17] = 0.05
     (found,) = outlying_images(np.arange(100, 140), rms)
     assert (found["frame"], found["rms_mm"]) == (117, pytest.approx(50.0))
     assert found["z"] > 3.5
-
-
-def test_equal_images_hold_no_outlier() -> None:
     assert outlying_images(np.arange(5), np.full(5, 0.004)) == []
 
 
 def planar_batch(normal: list[float], offset: float) -> tuple[FrameBatch, torch.Tensor]:
-    columns, rows = torch.meshgrid(
-        torch.linspace(-0.5, 0.5, 24).double(), torch.linspace(-0.4, 0.4, 20).double(),
-        indexing="xy",
-    )  # fmt: skip
+    across, down = torch.linspace(-0.5, 0.5, 24).double(), torch.linspace(-0.4, 0.4, 20).double()
+    columns, rows = torch.meshgrid(across, down, indexing="xy")
     rays = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
     rays = rays / rays.norm(dim=-1, keepdim=True)
     unit = torch.tensor([normal], dtype=torch.float64)
     unit = unit / unit.norm()
-    distance = ray_plane_distance(rays, unit, torch.tensor([offset], dtype=torch.float64))
-    return (
-        FrameBatch(
-            indices=torch.tensor([0]),
-            radial_distance=distance,
-            amplitude=torch.full_like(distance, 100.0),
-            valid=torch.isfinite(distance),
-            normal_tool=unit,
-            offset_tool=torch.tensor([offset], dtype=torch.float64),
-        ),
-        rays,
-    )
+    plane = unit, torch.tensor([offset], dtype=torch.float64)
+    distance = ray_plane_distance(rays, *plane)
+    amplitude = torch.full_like(distance, 100.0)
+    return frame_batch(distance, amplitude, *plane, distance.isfinite()), rays
 
 
 def test_an_image_with_a_third_of_outliers_shows_its_plane() -> None:
     batch, rays = planar_batch([0.3, -0.2, -1.0], 1.1)
     batch.radial_distance[0, :, ::3] *= 0.6
-    plane = image_planes(batch, rays, None)
-    torch.testing.assert_close(-plane, batch.normal_tool / batch.offset_tool, atol=1e-4, rtol=0)
+    # One fitted to some pixels is that of all.
+    for enough in (None, int(batch.valid.sum()) // 5):
+        plane = image_planes(batch, rays, enough)
+        torch.testing.assert_close(-plane, batch.normal_tool / batch.offset_tool, atol=1e-4, rtol=0)
     off = off_the_wall(rays)(batch)[0]
     assert bool(off[:, ::3].all())
     assert not bool(off[:, 1::3].any())
-
-
-def test_a_plane_fitted_to_some_pixels_is_that_of_all_whatever_the_pattern_of_outliers() -> None:
-    batch, rays = planar_batch([0.3, -0.2, -1.0], 1.1)
-    batch.radial_distance[0, :, ::5] *= 0.6
-    plane = image_planes(batch, rays, enough=int(batch.valid.sum()) // 5)
-    torch.testing.assert_close(-plane, batch.normal_tool / batch.offset_tool, atol=1e-4, rtol=0)
 
 
 def test_grazing_pixels_are_those_beyond_the_angle() -> None:

@@ -59,18 +59,15 @@ def test_data_without_noise_give_the_truth_back(generator: torch.Generator) -> N
     translation_mm, rotation_deg = apart(solution.parameters, scene.truth)
     assert translation_mm < 1e-7
     assert rotation_deg < 1e-8
-    torch.testing.assert_close(
-        solution.parameters.coefficients, scene.truth.coefficients, rtol=0.0, atol=1e-9
-    )
+    found = solution.parameters.coefficients
+    torch.testing.assert_close(found, scene.truth.coefficients, rtol=0.0, atol=1e-9)
 
 
 def test_the_optimum_does_not_depend_on_the_start(generator: torch.Generator) -> None:
     scene = make_scene(generator, EA)
     objective = MomentObjective(scene.moments())
-    ends = [
-        minimise(objective, nearby(scene.truth, generator, size)).parameters
-        for size in (0.0, 0.01, 0.1)
-    ]
+    starts = [nearby(scene.truth, generator, size) for size in (0.0, 0.01, 0.1)]
+    ends = [minimise(objective, start).parameters for start in starts]
     for end in ends[1:]:
         translation_mm, rotation_deg = apart(ends[0], end)
         assert translation_mm < 1e-4
@@ -123,9 +120,7 @@ def test_a_fixed_hand_eye_stays_exactly_where_it_is(generator: torch.Generator) 
 def test_without_unknowns_the_start_is_the_optimum(generator: torch.Generator) -> None:
     scene = make_scene(generator, EA)
     objective = MomentObjective(scene.moments().columns([]))
-    start = Parameters(
-        scene.truth.tool_from_camera, torch.zeros(0).double(), hand_eye_is_free=False
-    )
+    start = Parameters(scene.truth.tool_from_camera, torch.zeros(0).double(), False)
     solution = minimise(objective, start)
     assert solution.converged
     assert solution.loss == pytest.approx(float(objective.loss(start)))

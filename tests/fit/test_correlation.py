@@ -13,10 +13,8 @@ HEIGHT, WIDTH = 96, 128
 
 def squares(residual: Tensor, weight: float = 1.0) -> Tensor:
     """Return the sums for an image (H, W) of a wall that all rays meet from the front."""
-    rows, columns = (
-        one.flatten().double()
-        for one in torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    )
+    grid = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    rows, columns = (one.flatten().double() for one in grid)
     one = torch.ones_like(rows)
     image = LinearPixels(
         pixels=Pixels(one, one, rows, columns, torch.zeros(len(rows), 0)),

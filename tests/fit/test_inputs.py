@@ -1,15 +1,17 @@
 """What a model needs and a recording lacks is refused, with a way out."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from kinds_of_terms import DOMAIN
 from small_recordings import write_small_recording
 
 from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.data.recording import Recording
-from tofcorr.error_terms.base import Domain, Interval
+from tofcorr.error_terms.base import Interval
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.problem import build_model, refuse_missing_inputs
 from tofcorr.options import resolve_options
@@ -36,13 +38,9 @@ def test_the_model_named_by_the_refusal_of_another_takes_the_recording(
 
 def test_amplitudes_that_are_all_the_same_are_no_amplitudes(tmp_path: Path) -> None:
     # A driver without an infrared image wrote zeros: the training ended in a traceback.
-    depth = Recording.open(write_small_recording(tmp_path / "any")).depth
-    _, height, width = depth.shape
-    dark = np.zeros_like(depth)
+    dark = np.zeros((6, 5, 7), np.float32)
     data = Dataset((Recording.open(write_small_recording(tmp_path / "dark", amplitude=dark)),))
-    domain = Domain(
-        height=height, width=width, radial_distance=Interval(0.5, 2), amplitude=Interval(0, 0)
-    )
+    domain = replace(DOMAIN, amplitude=Interval(0, 0), normalised_amplitude=None)
     with pytest.raises(CalibrationDataError, match=r"holds 0 in every pixel.*--config e0"):
         build_model(data, resolve_options(TrainingOptions, "ea").model, domain)
     build_model(data, resolve_options(TrainingOptions, "e0").model, domain)

@@ -63,10 +63,8 @@ def test_an_error_that_the_model_lacks_is_found(tmp_path: Path, name: str) -> No
     # The step that it states leads to the truth, most of the way.
     assert float((error - found.twist[:3]).norm()) < 0.5 * float(error.norm())
     quantile = student_quantile(0.975, fit.covariance.degrees_of_freedom)
-    before, after = (
-        quantile * one.hand_eye_covariance[:3, :3].diagonal().sqrt()
-        for one in (fit, replace(fit, misfit=found))
-    )
+    covariances = (one.hand_eye_covariance for one in (fit, replace(fit, misfit=found)))
+    before, after = (quantile * one[:3, :3].diagonal().sqrt() for one in covariances)
     assert bool((error.abs() > before).any())
     assert bool((error.abs() <= after).all())
 
@@ -92,11 +90,8 @@ def test_no_probe_repeats_another(seen: MisfitPixels) -> None:
 
 def test_a_turned_principal_point_is_a_turned_camera(seen: MisfitPixels) -> None:
     """In the middle of the image both move every ray alike."""
-    x, y = (
-        seen.linear.ray[:, 0] / seen.linear.ray[:, 2],
-        seen.linear.ray[:, 1] / seen.linear.ray[:, 2],
-    )
-    middle = x.square() + y.square() < 0.05**2
+    away = seen.linear.ray[:, :2] / seen.linear.ray[:, 2:]
+    middle = away.square().sum(1) < 0.05**2
     assert int(middle.sum()) > 10
     columns = probes(seen)["principal_point"][1][middle]
     turns = torch.stack([seen.linear.unknowns[middle, 4], -seen.linear.unknowns[middle, 3]], dim=1)

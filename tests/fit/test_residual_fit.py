@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from simulated_walls import SENSOR, simulated_wall
+from synthetic_scene import EA
 
 from tofcorr.correction.state import load_calibration, save_calibration
-from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset, covered_domain
@@ -17,11 +17,8 @@ from tofcorr.simulation.signal import PixelDelayOptions, pixel_delay
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import calibration_state
 
-CORE = [
-    {"kind": "distance_polynomial", "degree": 3},
-    {"kind": "pixel_polynomial", "degree": 2},
-    {"kind": "amplitude_polynomial", "variable": "log_amplitude", "degree": 2},
-]
+LOG = {"kind": "amplitude_polynomial", "variable": "log_amplitude", "degree": 2}
+CORE = [*EA["terms"][:2], LOG]
 NETWORK = {"pixels": 2000, "iterations": 100, "folds": 3}
 # Waves of a length that no cubic follows within half a metre to two and a half.
 WAVY = SENSOR | {
@@ -111,16 +108,6 @@ def test_fixed_pattern_is_that_of_the_simulated_chip(tmp_path: Path) -> None:
     assert float(correlation) > 0.95
     assert float(offset.std()) == pytest.approx(4e-3, rel=0.15)
     assert held_out(dataset, found) < held_out(dataset, fitted(dataset, CORE))
-
-
-def test_missing_column_or_frequency_is_refused_by_name(tmp_path: Path) -> None:
-    dataset = simulated_wall(tmp_path / "recording", conditions={"recorded": ["pose_id"]})
-    for kind, name in (
-        ("integration_time", "integration_time_us"),
-        ("room_temperature", "room_temperature_c"),
-    ):
-        with pytest.raises(CalibrationDataError, match=rf"'{name}' is missing; the term {kind}"):
-            fitted(dataset, [{"kind": kind}])
 
 
 def test_drift_over_temperature_and_time_is_found(tmp_path: Path) -> None:

@@ -50,8 +50,5 @@ def expected_frames(options: SimulatorOptions) -> list[FrameState]:
 
 def files_in(folder: Path) -> dict[str, bytes]:
     """Return what a simulation wrote, byte by byte."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}

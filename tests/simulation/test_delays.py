@@ -67,11 +67,10 @@ def test_latency_grows_with_amplitude(law: str) -> None:
 
 def test_cameras_of_one_kind_differ_in_the_irregular_part_alone() -> None:
     rays = ray_directions(small().camera.intrinsics())
-    regular = pixel_delay(PixelDelayOptions(row_line_mm=5.0, bowl_mm=3.0), rays)
+    kind = PixelDelayOptions(row_line_mm=5.0, bowl_mm=3.0)
+    regular = pixel_delay(kind, rays)
     units = [
-        pixel_delay(
-            PixelDelayOptions(row_line_mm=5.0, bowl_mm=3.0, irregular_mm=2.0, unit=unit), rays
-        )
+        pixel_delay(kind.model_copy(update={"irregular_mm": 2.0, "unit": unit}), rays)
         for unit in (1, 1, 2)
     ]
     assert torch.equal(units[0], units[1])
@@ -79,14 +78,11 @@ def test_cameras_of_one_kind_differ_in_the_irregular_part_alone() -> None:
     assert (units[0] - regular).std().item() == pytest.approx(2e-3, rel=0.2)
 
 
-def test_curve_is_constant_beyond_its_knots_and_differentiable_within() -> None:
+def test_curves_are_constant_beyond_their_knots_and_one_point_is_flat() -> None:
     curve = Curve((1.0, 2.0, 3.0, 4.0), (1.0, 8.0, 27.0, 64.0))
     at = torch.tensor([0.0, 1.5, 3.7, 9.0], dtype=torch.float64, requires_grad=True)
     value = curve(at)
     torch.testing.assert_close(value, at.new_tensor([1.0, 1.5**3, 3.7**3, 64.0]))
     value.sum().backward()
     torch.testing.assert_close(at.grad, at.new_tensor([0.0, 3 * 1.5**2, 3 * 3.7**2, 0.0]))
-
-
-def test_lattice_of_one_point_is_flat() -> None:
     assert image_from_lattice(((0.25,),), 3, 4).eq(0.25).all()

@@ -13,10 +13,8 @@ from tofcorr.simulation.robot import hand_eye_guess, tool_twists
 
 
 def test_wall_fills_every_frame_within_the_limits() -> None:
-    options = small(
-        shots=[{"target": "white", "poses": 25}],
-        robot={"tilt_deg": 45.0, "farthest_pixel_m": 2.0, "steepest_incidence_deg": 70.0},
-    )
+    robot = {"tilt_deg": 45.0, "farthest_pixel_m": 2.0, "steepest_incidence_deg": 70.0}
+    options = small(shots=[{"target": "white", "poses": 25}], robot=robot)
     for state in expected_frames(options):
         assert state.radial_distance.isfinite().all()
         assert state.radial_distance.max() <= 2.0
@@ -24,11 +22,9 @@ def test_wall_fills_every_frame_within_the_limits() -> None:
 
 
 def test_distance_along_the_optical_axis_is_within_its_bounds() -> None:
-    options = small(
-        shots=[{"target": "white", "poses": 25}],
-        robot={"distance_m": [0.7, 0.9], "farthest_pixel_m": None},
-        scene={"plane": {"normal": [0.6, 0.0, 0.8], "offset_m": -2.0}},
-    )
+    scene = {"plane": {"normal": [0.6, 0.0, 0.8], "offset_m": -2.0}}
+    robot = {"distance_m": [0.7, 0.9], "farthest_pixel_m": None}
+    options = small(shots=[{"target": "white", "poses": 25}], robot=robot, scene=scene)
     for frame in planned(options):
         camera = frame.facts.world_from_tool[-1] @ options.hand_eye.tool_from_camera()
         normal, offset = plane_in_frame(*options.scene.plane.tensors(), camera)
@@ -49,10 +45,8 @@ def test_tilt_is_restricted_to_its_axes(axes: str, tilted: tuple[bool, bool]) ->
 
 
 def test_robot_reaches_poses_within_its_repeatability() -> None:
-    options = small(
-        shots=[{"target": "white", "poses": 300}],
-        robot={"repeatability_mm": 0.4, "repeatability_mrad": 0.7, "farthest_pixel_m": None},
-    )
+    robot = {"repeatability_mm": 0.4, "repeatability_mrad": 0.7, "farthest_pixel_m": None}
+    options = small(shots=[{"target": "white", "poses": 300}], robot=robot)
     frames = planned(options)
     recorded = frames[-1].facts.world_from_tool
     reached = torch.stack([f.world_from_tool for f in frames])
@@ -62,10 +56,9 @@ def test_robot_reaches_poses_within_its_repeatability() -> None:
 
 
 def test_repeated_frames_share_their_pose() -> None:
-    options = small(
-        robot={"repeat_poses": 2, "repeat_frames": 4, "farthest_pixel_m": None},
-        conditions={"integration_time_us": [250.0, 500.0, 1000.0], "ambient_counts": [10, 20]},
-    )
+    robot = {"repeat_poses": 2, "repeat_frames": 4, "farthest_pixel_m": None}
+    conditions = {"integration_time_us": [250.0, 500.0, 1000.0], "ambient_counts": [10, 20]}
+    options = small(robot=robot, conditions=conditions)
     frames = planned(options)
     assert [f.pose_id for f in frames] == [0] * 4 + [1] * 4 + [2, 3, 4, 5, 6]
     for frame in frames[1:4]:
@@ -98,19 +91,10 @@ def test_hand_eye_options_hold_any_transform(generator: torch.Generator) -> None
 
 
 def test_speed_on_a_path_agrees_with_the_poses_before_and_after() -> None:
-    options = small(
-        shots=[{"target": "white", "poses": 40}],
-        robot={
-            "motion": "continuous",
-            "roll_deg": 30.0,
-            "tilt_deg": 20.0,
-            "farthest_pixel_m": None,
-            "repeatability_mm": 0.0,
-            "repeatability_mrad": 0.0,
-            "waypoint_every_frames": 20,
-        },
-        conditions={"frame_interval_s": 0.1},
-    )
+    robot = {"motion": "continuous", "roll_deg": 30.0, "tilt_deg": 20.0, "farthest_pixel_m": None}
+    robot |= {"repeatability_mm": 0.0, "repeatability_mrad": 0.0, "waypoint_every_frames": 20}
+    shots, conditions = [{"target": "white", "poses": 40}], {"frame_interval_s": 0.1}
+    options = small(shots=shots, robot=robot, conditions=conditions)
     frames = planned(options)
     facts = frames[-1].facts
     truth = facts.tool_twist

@@ -53,9 +53,8 @@ def test_recorded_geometry_predicts_the_expected_measurement(tmp_path: Path) -> 
 
 
 def test_z_depth_is_the_radial_distance_along_the_axis(tmp_path: Path) -> None:
-    radial, z = (
-        simulate(small(depth_kind=kind), tmp_path / kind, noise=False) for kind in ("radial", "z")
-    )
+    kinds = ("radial", "z")
+    radial, z = (simulate(small(depth_kind=one), tmp_path / one, noise=False) for one in kinds)
     along = torch.from_numpy(np.array(radial.depth)).to(torch.float64)
     expected = z_depth_from_radial_distance(along, ray_directions(radial.camera))
     np.testing.assert_allclose(z.depth, expected, atol=3e-7)
@@ -73,17 +72,10 @@ def test_raw_samples_demodulate_to_depth_and_amplitude(tmp_path: Path) -> None:
 
 
 def test_conditions_reach_the_recording_or_stay_unknown(tmp_path: Path) -> None:
-    conditions = {
-        "integration_time_us": [400.0],
-        "ambient_counts": [30.0, 30.0],
-        "room_temperature_c": 20.0,
-        "room_drift_c": 0.0,
-        "body_rise_c": 10.0,
-        "body_time_constant_s": 100.0,
-        "power_on_s": 0.0,
-        "interval_jitter": 0.0,
-        "frame_interval_s": 50.0,
-    }
+    conditions = {"integration_time_us": [400.0], "ambient_counts": [30.0, 30.0]}
+    conditions |= {"room_temperature_c": 20.0, "room_drift_c": 0.0, "body_rise_c": 10.0}
+    conditions |= {"body_time_constant_s": 100.0, "power_on_s": 0.0}
+    conditions |= {"interval_jitter": 0.0, "frame_interval_s": 50.0}
     recording = simulate(small(conditions=conditions), tmp_path / "all")
     np.testing.assert_allclose(recording.require("integration_time", "this test"), 400e-6)
     np.testing.assert_allclose(recording.require("ambient", "this test"), 30.0)

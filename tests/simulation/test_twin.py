@@ -13,10 +13,8 @@ from tofcorr.simulation.simulator import simulate, twin_frames
 
 
 def test_twin_at_recorded_poses_equals_the_simulation(tmp_path: Path) -> None:
-    options = small(
-        sensor=IMPERFECT,
-        conditions={"integration_time_us": [300.0, 600.0], "ambient_counts": [50.0, 400.0]},
-    )
+    conditions = {"integration_time_us": [300.0, 600.0], "ambient_counts": [50.0, 400.0]}
+    options = small(sensor=IMPERFECT, conditions=conditions)
     recording = simulate(options, tmp_path / "r", noise=False)
     amplitudes = recording.require("amplitude", "this test")
     for state in twin_frames(options, recording):
@@ -26,7 +24,7 @@ def test_twin_at_recorded_poses_equals_the_simulation(tmp_path: Path) -> None:
         np.testing.assert_allclose(amplitude, state.measured_amplitude, rtol=1e-6)
 
 
-def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(tmp_path: Path) -> None:
+def test_a_twin_sees_the_recorded_brightness_or_says_that_it_is_missing(tmp_path: Path) -> None:
     recording = simulate(small(sensor=IMPERFECT), tmp_path / "r", noise=False)
     assert recording.amplitude is not None
     blind = small(scene={"targets": {}}, sensor={"delays": IMPERFECT["delays"]})
@@ -35,14 +33,10 @@ def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(tmp_path:
     for state in twin_frames(blind, recording, reflectivity="from_recording"):
         amplitude = recording.amplitude[state.index]
         np.testing.assert_allclose(state.measured_amplitude, amplitude, rtol=1e-6)
-
-
-def test_twin_without_recorded_amplitude_says_what_is_missing(tmp_path: Path) -> None:
-    simulate(small(), tmp_path / "r")
     (tmp_path / "r/amplitude.npy").unlink()
-    recording = Recording.open(tmp_path / "r")
+    dark = Recording.open(tmp_path / "r")
     with pytest.raises(CalibrationDataError, match=r"amplitude.npy is missing; a twin"):
-        list(twin_frames(small(), recording, reflectivity="from_recording"))
+        list(twin_frames(blind, dark, reflectivity="from_recording"))
 
 
 def test_twin_uses_the_hand_eye_transform_it_is_given(tmp_path: Path) -> None:

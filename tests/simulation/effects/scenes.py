@@ -31,9 +31,8 @@ class Scene:
         self.inputs: EffectInputs = diagnosed_recordings.true_inputs(self.plain, self.options)
 
     def record(self, name: str, effects: list[dict[str, Any]]) -> Recording:
-        return diagnosed_recordings.recorded(
-            self.folder / name, 7, effects, self.changes, noise=False
-        )
+        folder = self.folder / name
+        return diagnosed_recordings.recorded(folder, 7, effects, self.changes, noise=False)
 
     def change(self, effect: CatalogueEffect) -> torch.Tensor:
         """Return by how much an effect changes the measured distances, shape (M,)."""

@@ -14,12 +14,9 @@ def test_an_arm_that_comes_from_the_other_side_stops_farther_by_the_play(
     play = torch.tensor([0.003, -0.002, 0.001], dtype=torch.float64)
     effect = BacklashEffect(BacklashEffect.shape_type(), play / 2)
     sides = [torch.full((4, 3), side, dtype=torch.float64) for side in (-1.0, 1.0)]
-    below, above = (
-        effect.shift(
-            replace(inputs, facts=replace(inputs.facts, approach=side)), effect.coefficients
-        )
-        for side in sides
-    )
+    facts = [replace(inputs.facts, approach=side) for side in sides]
+    reached = [replace(inputs, facts=one) for one in facts]
+    below, above = (effect.shift(one, effect.coefficients) for one in reached)
     camera = (inputs.facts.world_from_tool @ inputs.tool_from_camera)[inputs.frame, :3, :3]
     rays = (camera @ inputs.rays[:, :, None])[..., 0]
     normal = inputs.facts.normal_world[inputs.frame]

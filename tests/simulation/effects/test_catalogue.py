@@ -58,11 +58,8 @@ def test_an_effect_describes_every_shift_of_those_it_contains(
 ) -> None:
     outer = CATALOGUE[name].for_recording(at_rest.inputs)
     # At the finest resolution of a map: each pixel once.
-    every = replace(
-        at_rest.inputs,
-        frame=torch.zeros(32 * 24, dtype=torch.int64),
-        pixel=torch.arange(32 * 24),
-    )
+    pixel = torch.arange(32 * 24)
+    every = replace(at_rest.inputs, frame=torch.zeros_like(pixel), pixel=pixel)
     if "block_px" in outer.shape.to_mapping():
         outer = type(outer)(outer.shape.model_copy(update={"block_px": 1}))
     small, _ = _drawn(CATALOGUE[inner].for_recording(every), every, generator)

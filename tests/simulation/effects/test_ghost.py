@@ -1,5 +1,6 @@
 """A ghost is the image turned half round about the optical axis, and smaller."""
 
+import cameras
 import pytest
 import torch
 
@@ -10,8 +11,7 @@ WIDTH, HEIGHT = 41, 31
 
 
 def camera(column: float, row: float) -> CameraIntrinsics:
-    matrix = ((40.0, 0.0, column), (0.0, 40.0, row), (0.0, 0.0, 1.0))
-    return CameraIntrinsics(width=WIDTH, height=HEIGHT, matrix=matrix)
+    return cameras.camera((WIDTH, HEIGHT), (40.0, 40.0), (column, row))
 
 
 @pytest.fixture
@@ -38,14 +38,11 @@ def test_a_point_is_seen_on_the_other_side_of_the_optical_axis(size: float) -> N
     torch.testing.assert_close(centre, expected.double(), atol=0.02, rtol=0)
 
 
-def test_beyond_the_edge_of_the_ghost_it_is_dark(images: torch.Tensor) -> None:
+def test_beyond_its_edge_a_ghost_is_dark_and_ghosts_of_sums_add(images: torch.Tensor) -> None:
     found = ghost(images, camera(20.0, 15.0), 0.5)
     inside = found[:, 8:23, 10:31]
     assert bool((inside.abs() > 1e-9).all())
     assert int((found.abs() > 1e-9).sum()) == inside.numel()
-
-
-def test_a_sum_of_images_has_the_sum_of_their_ghosts(images: torch.Tensor) -> None:
     seen = camera(18.3, 16.2)
     both = ghost(images[:1] + 2j * images[1:], seen, 0.7)
     each = ghost(images, seen, 0.7)

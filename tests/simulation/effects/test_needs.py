@@ -8,7 +8,7 @@ from simulation.effects.scenes import Scene
 from tofcorr.simulation.effects import CATALOGUE
 
 
-def test_a_missing_column_is_named_and_not_taken_for_zero(at_rest: Scene) -> None:
+def test_a_missing_or_incomplete_column_is_named_and_not_taken_for_zero(at_rest: Scene) -> None:
     facts = replace(at_rest.inputs.facts, integration_time=None, room_temperature=None)
     blind = replace(at_rest.inputs, facts=facts, amplitude=None, modulation_frequency=None)
     assert CATALOGUE["integration_time"].missing(blind) == ["integration_time_us"]
@@ -19,9 +19,6 @@ def test_a_missing_column_is_named_and_not_taken_for_zero(at_rest: Scene) -> Non
     ]
     assert CATALOGUE["motion"].missing(blind)[0] == "velocity of the tool"
     assert CATALOGUE["incidence_angle"].missing(blind) == []
-
-
-def test_one_empty_cell_makes_a_column_unknown(at_rest: Scene) -> None:
     times = torch.full((8,), 5e-4, dtype=torch.float64)
     times[3] = torch.nan
     facts = replace(at_rest.inputs.facts, integration_time=times)

@@ -29,12 +29,8 @@ def shaded(at_rest: Scene) -> EffectInputs:
 def _lit(inputs: EffectInputs, images: Tensor, noise: float | None = None) -> EffectInputs:
     """Return the inputs with other amplitudes, and noise that is a share of each of them."""
     own = images.flatten(1)[inputs.frame, inputs.pixel].double()
-    return replace(
-        inputs,
-        amplitude=own,
-        amplitude_images=images,
-        amplitude_noise=None if noise is None else noise * own,
-    )
+    lit = replace(inputs, amplitude=own, amplitude_images=images)
+    return replace(lit, amplitude_noise=None if noise is None else noise * own)
 
 
 def _explained(inputs: EffectInputs, generator: torch.Generator, noise: float | None) -> float:

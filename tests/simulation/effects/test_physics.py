@@ -121,9 +121,8 @@ def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
     effect = MixedPixelsEffect(MixedPixelsShape())
     columns = effect.columns(flat).reshape(camera.height, camera.width, -1)
     names = [term.name for term in effect.terms(effect.shape)]
-    astride, share = (
-        columns[:, :, names.index(name)] for name in ("astride", "astride_at_one_metre")
-    )
+    two = ("astride", "astride_at_one_metre")
+    astride, share = (columns[:, :, names.index(name)] for name in two)
     assert bool((astride[:, 16] > 0.9).all())
     assert bool((astride[:, [3, 10, 15, 17, 28]] < 1e-6).all())
     torch.testing.assert_close(share, astride / 2.0)
