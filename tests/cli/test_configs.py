@@ -20,6 +20,7 @@ from tofcorr.training.calibration import TrainingOptions
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(CONFIGS.glob("*/*.yaml"))
+PROGRAM = Path(sys.executable).with_name("tofcorr")
 
 
 def test_the_list_names_every_shipped_file_with_its_first_line(program: Program) -> None:
@@ -67,6 +68,7 @@ WRONG = {
     "simulate --out o": "Missing option '--config'",
     "diagnose --set sed=2 --recording r --out o": "Did you mean 'seed'?",
     "no-such-command": "No such command 'no-such-command'",
+    "import polaroid": "No such command 'polaroid'",
     "correct --modle x": "No such option",
     "correct --model a --recording b --out c": "b: there is no such folder",
     "export --run a --format lut --out b": "state.pt: there is no such",
@@ -102,37 +104,27 @@ def test_simulate_takes_a_name_and_changes(tmp_path: Path, program: Program) -> 
 
 def completed(words: str, shell: str = "bash") -> list[str]:
     """Return what the shell offers at the end of `words`."""
-    words_typed = words.split(" ")
-    environment = os.environ | {
-        "_TOFCORR_COMPLETE": f"{shell}_complete",
-        "COMP_WORDS": words,
-        "COMP_CWORD": str(len(words_typed) - 1),
-    }
-    program = Path(sys.executable).with_name("tofcorr")
-    done = subprocess.run([program], env=environment, capture_output=True, text=True, check=False)
+    typed = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    environment = os.environ | typed | {"_TOFCORR_COMPLETE": f"{shell}_complete"}
+    done = subprocess.run([PROGRAM], env=environment, capture_output=True, text=True, check=False)
     return done.stdout.split("\n")[:-1]
 
 
-def test_the_shell_completes_commands_and_configurations() -> None:
+def test_the_shell_completes_commands_and_configurations_and_says_what_they_are() -> None:
     assert completed("tofcorr ev") == ["plain,evaluate"]
     logarithmic, *others = completed("tofcorr train --config ea_")
     assert logarithmic == "plain,ea_log"
     assert others == ["plain,ea_residual", "plain,ea_robust"]
     assert completed("tofcorr train --config ./e") == ["file,./e"]
-
-
-def test_completion_says_of_a_command_what_the_list_of_commands_says() -> None:
     assert completed("tofcorr ev", "zsh") == ["plain", "evaluate", COMMANDS["evaluate"][1]]
     importer = IMPORTERS["bop"]
     assert completed("tofcorr import bo", "zsh") == ["plain", "bop", importer]
 
 
 def test_the_module_is_the_same_program(tmp_path: Path) -> None:
-    module = [sys.executable, "-m", "tofcorr", "configs", "ea"]
-    program = [Path(sys.executable).with_name("tofcorr"), "configs", "ea"]
     by_module, by_program = (
-        subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path).stdout
-        for command in (module, program)
+        subprocess.check_output([*program, "configs", "ea"], cwd=tmp_path)
+        for program in ((sys.executable, "-m", "tofcorr"), (PROGRAM,))
     )
     assert by_module == by_program
 

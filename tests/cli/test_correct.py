@@ -125,10 +125,8 @@ def test_a_model_without_intensity_term_corrects_a_recording_without_amplitude(
 def test_another_lens_is_remarked_upon(tmp_path: Path, program: Program, source: Path) -> None:
     lens = {"K": [list(row) for row in CAMERA.matrix], "distortion": list(CAMERA.distortion)}
     size = {"width": CAMERA.width, "height": CAMERA.height}
-    for name, described, remarked in [
-        ("same", lens, False),
-        ("other", lens | {"distortion": [0.0, 0.0, 0.0, 0.0]}, True),
-    ]:
+    other = lens | {"distortion": [0.0, 0.0, 0.0, 0.0]}
+    for name, described, remarked in (("same", lens, False), ("other", other, True)):
         model = save_corrector(tmp_path / f"{name}.ts", camera=size | described)
         code, _, told = program(*CORRECT, model, "--recording", source, "--out", tmp_path / name)
         assert code == 0

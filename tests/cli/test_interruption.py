@@ -2,7 +2,6 @@
 
 import shutil
 import signal
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -10,31 +9,29 @@ from typing import Any
 
 import click
 import pytest
+from running import Program, Said
 
-from tofcorr.cli.main import group, main
+from tofcorr.cli.main import group
 from tofcorr.files import remove_begun, scratch_folder, staged_file, staged_folder
 
-Run = Callable[[Callable[[], object]], tuple[object, str]]
+Run = Callable[[Callable[[], object]], Said]
 
 
 @pytest.fixture
-def program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """The program with a command of the test's own; it returns exit code and standard error."""
+def run(program: Program, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """The program with a command of the test's own."""
 
-    def run(command: Callable[[], object]) -> tuple[object, str]:
+    def call(command: Callable[[], object]) -> Said:
         monkeypatch.setattr(group, "get_command", lambda context, name: click.command()(command))
-        monkeypatch.setattr(sys, "argv", ["tofcorr", "train"])
         monkeypatch.setattr(threading, "excepthook", threading.excepthook)
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code, capsys.readouterr().err
+        return program("train")
 
-    return run
+    return call
 
 
 @pytest.mark.parametrize("told_to_end", [True, False])
 def test_only_an_interruption_excuses_the_error_of_a_library_that_is_being_imported(
-    told_to_end: bool, program: Run
+    told_to_end: bool, run: Run
 ) -> None:
     def work() -> None:
         try:
@@ -45,16 +42,14 @@ def test_only_an_interruption_excuses_the_error_of_a_library_that_is_being_impor
         raise ImportError("initialization failed")  # As modules in C++ do.
 
     if told_to_end:
-        assert program(work)[0] == 130
+        assert run(work).code == 130
     else:
         with pytest.raises(ImportError):
-            program(work)
+            run(work)
 
 
 def test_what_a_second_interruption_kept_from_being_removed_is_removed_at_the_end(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    program: Run,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
     remove = shutil.rmtree
 
@@ -68,8 +63,7 @@ def test_what_a_second_interruption_kept_from_being_removed_is_removed_at_the_en
             monkeypatch.setattr(shutil, "rmtree", stop)
             raise KeyboardInterrupt
 
-    code, _ = program(work)
-    assert code == 130
+    assert run(work).code == 130
     assert list(tmp_path.iterdir()) == []
 
 

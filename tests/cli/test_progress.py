@@ -1,6 +1,5 @@
 """Progress bars are for people: nothing of them in a log file."""
 
-import ast
 import io
 import os
 import pty
@@ -8,7 +7,7 @@ import select
 import subprocess
 import sys
 import termios
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -19,37 +18,11 @@ from tofcorr.cli.main import COMMANDS, group
 from tofcorr.progress import LOG, log_to_stderr, stages, through
 
 
-def test_no_progress_bar_is_drawn_where_stderr_is_not_a_terminal() -> None:
-    # tqdm asks the stream itself if, and only if, `disable=None` is passed.
-    calls = [
-        (path.name, node.lineno, {word.arg: word.value for word in node.keywords})
-        for path in Path(tofcorr.__file__).parent.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "tqdm"
-    ]
-    assert calls
-    for name, line, words in calls:
-        disable = words.get("disable", ast.Constant("left out"))
-        assert ast.unparse(disable) == "None", f"{name}:{line}"
-
-
 class Terminal(io.StringIO):
     """Standard error as a terminal has it."""
 
     def isatty(self) -> bool:
         return True
-
-
-@pytest.fixture
-def at_terminal(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Terminal]:
-    """Return what makes standard error a terminal; in the test, for pytest sets it before."""
-
-    def patched() -> Terminal:
-        stream = Terminal()
-        monkeypatch.setattr("sys.stderr", stream)
-        return stream
-
-    return patched
 
 
 @pytest.fixture
@@ -60,15 +33,12 @@ def log_lines() -> Iterator[None]:
     LOG.handlers[:] = handlers
 
 
-def test_at_a_terminal_a_bar_counts(at_terminal: Callable[[], Terminal]) -> None:
-    terminal = at_terminal()
+def test_at_a_terminal_a_bar_counts_and_the_stage_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
     assert list(through([1, 2, 3], "weighing")) == [1, 2, 3]
     assert "weighing" in terminal.getvalue()
     assert "/3" in terminal.getvalue()
-
-
-def test_at_a_terminal_the_stage_is_named(at_terminal: Callable[[], Terminal]) -> None:
-    terminal = at_terminal()
     with stages("cooking", 2) as begin:
         begin("boiling")
         begin("frying")
@@ -86,8 +56,9 @@ def test_elsewhere_nothing_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("log_lines")
-def test_log_lines_stand_in_place_of_bars(at_terminal: Callable[[], Terminal]) -> None:
-    terminal = at_terminal()
+def test_log_lines_stand_in_place_of_bars(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
     log_to_stderr()
     with stages("cooking", 1) as begin:
         begin("boiling")
@@ -126,10 +97,7 @@ def test_long_commands_show_progress_at_a_terminal_and_nowhere_else(
     shown = b""
     while select.select([primary], [], [], 1.0)[0]:
         shown += os.read(primary, 1 << 16)
-    assert {"train": "training: fit", "check": "checking", "diagnose": "naming"}[
-        command
-    ] in shown.decode()
-    quiet = subprocess.run(
-        [*program, "--out", str(tmp_path / "b")], capture_output=True, text=True, check=True
-    )
-    assert quiet.stderr == ""
+    words = {"train": "training: fit", "check": "checking", "diagnose": "naming"}
+    assert words[command] in shown.decode()
+    quiet = subprocess.run([*program, "--out", tmp_path / "b"], capture_output=True, check=True)
+    assert quiet.stderr == b""

@@ -1,11 +1,11 @@
 """Threads sleep while they wait and are as many as the cores, unless the user says otherwise."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from running import printed
 
 from tofcorr.cli.main import set_up_threads
 
@@ -44,16 +44,5 @@ def test_the_program_sets_them_before_torch_is_loaded() -> None:
     )
     names = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OPENBLAS_NUM_THREADS"
     clean = {k: v for k, v in os.environ.items() if k not in names}
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=clean
-    )
-    assert done.stdout.split() == ["passive", "1", "False"]
-
-
-@pytest.mark.parametrize("words", [["-m", "tofcorr"], [str(Path("scripts") / "train.py")]])
-def test_unusable_arguments_end_with_two(words: list[str]) -> None:
-    root = Path(__file__).parents[2]
-    command = [sys.executable, *words, "--nonsense"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
-    assert done.returncode == 2
-    assert "No such option" in done.stderr
+    said = printed(sys.executable, "-c", code, env=clean)
+    assert said.split() == ["passive", "1", "False"]

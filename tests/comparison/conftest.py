@@ -23,6 +23,5 @@ def dataset(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="session")
 def evaluation(dataset: Dataset) -> Experiment:
-    return held_out_experiment(
-        "wall", dataset, options(repeats={"number": 3, "test_fraction": 0.25})
-    )
+    asked = options(repeats={"number": 3, "test_fraction": 0.25})
+    return held_out_experiment("wall", dataset, asked)

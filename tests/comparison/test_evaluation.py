@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from comparison.evaluated import MODELS, options
+from comparison.evaluated import options
 from synthetic_scene import Scene, write_scene
 
 from tofcorr.comparison.experiment import Experiment, held_out_experiment
@@ -47,7 +47,7 @@ def test_every_split_is_measured_as_a_training_on_its_frames_would_be(
             assert found == pytest.approx([expected.mean_abs_mm(), expected.rms_mm()], rel=1e-6)
 
 
-def test_before_is_the_recorded_hand_eye_without_correction(
+def test_before_has_no_correction_and_hand_eye_only_no_term(
     dataset: Dataset, evaluation: Experiment, domain: Domain
 ) -> None:
     hand_eye = HandEye(dataset.first.tool_from_camera)
@@ -57,11 +57,6 @@ def test_before_is_the_recorded_hand_eye_without_correction(
     found = evaluation.values["half"]["mean_abs_mm"]
     assert found[BEFORE][0] == pytest.approx(expected, rel=1e-12)
     assert found["EA"][0] < found[HAND_EYE_ONLY][0] < found[BEFORE][0]
-
-
-def test_hand_eye_only_is_the_fit_of_the_hand_eye_without_any_term(
-    dataset: Dataset, evaluation: Experiment, domain: Domain
-) -> None:
     train = np.setdiff1d(np.arange(dataset.num_frames), evaluation.splits["half"]["half"])
     none = TrainingOptions(name="x", model=ErrorModelOptions())
     alone = fit(dataset, train, none, domain).hand_eye_only.tool_from_camera
@@ -134,24 +129,11 @@ def test_without_a_robot_hand_eye_only_is_before(scene: Scene, tmp_path: Path) -
     assert found.hand_eye["EA"] == np.eye(4).tolist()
 
 
-def test_too_few_poses_for_the_folds_are_refused(dataset: Dataset) -> None:
+def test_too_few_poses_are_refused_and_fits_that_do_not_converge_told(
+    dataset: Dataset,
+) -> None:
     with pytest.raises(CalibrationDataError, match="16 poses cannot be divided into 17 folds"):
         held_out_experiment("wall", dataset, options(folds=17))
-
-
-def test_a_fit_that_does_not_converge_is_told(dataset: Dataset) -> None:
     found = held_out_experiment("wall", dataset, options(folds=0, solver={"max_iterations": 1}))
     assert len(found.warnings) == 3
     assert "Not converged" in found.warnings[0]
-
-
-def test_a_model_that_needs_amplitudes_refuses_a_recording_without(
-    scene: Scene, tmp_path: Path
-) -> None:
-    recording = write_scene(scene, tmp_path / "wall", amplitude=None)
-    with pytest.raises(CalibrationDataError, match=r"amplitude\.npy is missing"):
-        held_out_experiment("wall", Dataset((recording,)), options())
-    geometric = held_out_experiment(
-        "wall", Dataset((recording,)), options(models=[MODELS[0]], folds=0)
-    )
-    assert geometric.estimate("half", "rms_mm", "E0").mean > 0

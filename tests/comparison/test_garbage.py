@@ -30,10 +30,8 @@ def garbage(clean: Recording) -> Recording:
 
 def test_garbage_hardly_changes_a_table(clean: Recording, garbage: Recording) -> None:
     """The table said 63 mm where the report of a training said 7."""
-    without, found = (
-        tofcorr.evaluate(one, OPTIONS).sets[0].estimate("half", "rms_mm", "EA").mean
-        for one in (clean, garbage)
-    )
+    evaluated = (tofcorr.evaluate(one, OPTIONS).sets[0] for one in (clean, garbage))
+    without, found = (one.estimate("half", "rms_mm", "EA").mean for one in evaluated)
     report = tofcorr.train(garbage, "ea").report
     assert found < 1.2 * without
     assert found == pytest.approx(report["error_mm"]["after"]["test"]["rms"], rel=0.2)

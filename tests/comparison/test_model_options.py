@@ -34,9 +34,8 @@ def test_the_resolved_configuration_can_be_read_again() -> None:
     asked = options({"config": "ea_robust"}, {"name": "b"}, hand_eye={"estimate": "no"})
     again = EvaluationOptions.from_mapping(asked.to_mapping(), "again")
     assert again == asked
-    assert [again.training(model) for model in again.models] == [
-        asked.training(model) for model in asked.models
-    ]
+    one, other = ([each.training(model) for model in each.models] for each in (again, asked))
+    assert one == other
 
 
 def test_a_model_of_a_training_file_is_read_from_there(tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_walls import EA, simulated_wall
+from simulated_walls import simulated_wall
+from synthetic_scene import E0, EA
 
 from tofcorr.comparison.options import SelectionOptions
 from tofcorr.comparison.select import select
@@ -13,13 +14,7 @@ from tofcorr.comparison.statistics import rank
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.pixels.dataset import Dataset
 
-E0 = {
-    "terms": [
-        {"kind": "distance_polynomial", "degree": 3},
-        {"kind": "pixel_polynomial", "degree": 1},
-    ]
-}
-MODELS = [{"name": "E0", "model": E0}, {"name": "EA", "model": EA.to_mapping()}]
+MODELS = [{"name": "E0", "model": E0}, {"name": "EA", "model": EA}]
 
 
 def options(**values: object) -> SelectionOptions:
@@ -56,14 +51,11 @@ def test_a_difference_far_smaller_than_the_errors_spread_is_seen_because_it_is_p
     assert ranking.errors["m1"].standard_error > 0.3
 
 
-def test_models_of_equal_error_and_complexity_are_ranked_by_name() -> None:
+def test_the_ranking_depends_on_no_order_and_equal_models_are_ranked_by_name() -> None:
     for names in (["b", "a", "c"], ["c", "b", "a"]):
         errors = {name: np.array([1.0, 2.0, 3.0]) for name in names}
         ranking = rank(errors, dict.fromkeys(names, 1), 3)
         assert (ranking.best, ranking.winner) == ("a", "a")
-
-
-def test_the_ranking_does_not_depend_on_the_order_of_the_models() -> None:
     errors, complexity = drawn(0, 0.0, 0.01, 0.02), {"m0": 20, "m1": 10, "m2": 5}
     one, other = (
         rank(dict(own), complexity, 6) for own in (errors.items(), [*errors.items()][::-1])

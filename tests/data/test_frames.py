@@ -74,9 +74,8 @@ def test_planes_in_the_tool_frame_hold_the_same_points(radial: Recording) -> Non
     batches = list(iterate_frames(radial))
     normal, offset = joined(batches, "normal_tool"), joined(batches, "offset_tool")
     table = radial.frames
-    for frame in range(NUM_FRAMES):
+    for frame, pose in enumerate(table.world_from_tool):
         point_tool = generator.normal(size=3)
-        pose = table.world_from_tool[frame]
         point_world = pose[:3, :3] @ point_tool + pose[:3, 3]
         in_world = table.normal_world[frame] @ point_world + table.offset[frame]
         assert normal[frame] @ point_tool + offset[frame] == pytest.approx(in_world, abs=1e-14)
@@ -121,9 +120,6 @@ def test_a_pixel_is_valid_if_it_returns_is_masked_in_and_not_saturated() -> None
     mask = torch.tensor([1, 1, 1, 1, 1, 1, 1, 1, 0])
     valid = valid_pixels(distance, amplitude, mask, 10.0)
     assert valid.nonzero().flatten().tolist() == [0, 6]
-
-
-def test_what_is_unknown_invalidates_nothing() -> None:
     assert valid_pixels(torch.ones(2, 3)).all()
     assert valid_pixels(torch.ones(2, 3), saturation_amplitude=5.0).all()
 
@@ -156,13 +152,8 @@ def test_streaming_needs_memory_for_a_chunk_and_not_for_the_recording(tmp_path: 
     with RecordingWriter(tmp_path / "long", camera=camera, depth_kind="radial") as writer:
         for _ in range(100):
             writer.append(image, row=row, amplitude=image)
-    done = subprocess.run(
-        [sys.executable, "-c", STREAM, str(tmp_path / "long")],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    pixels, grown_mb = done.stdout.split()
+    words = [sys.executable, "-c", STREAM, str(tmp_path / "long")]
+    pixels, grown_mb = subprocess.check_output(words, text=True).split()
     assert int(pixels) == 100 * 400 * 500
     # The recording has 160 MB; opening reads pieces of 16 MB and a batch of 200 000 pixels has 5.
     assert float(grown_mb) < 80

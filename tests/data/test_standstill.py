@@ -18,7 +18,7 @@ def _recording(folder: Path, step: float, *, named: bool = False, moves: bool = 
     for frame in range(6):
         stop = stops[frame // 2]
         pose = stop.world_from_tool.copy() if moves else np.eye(4)
-        pose[0, 3] += step * (frame % 2) if moves else 0.0
+        pose[0, 3] += step * (frame % 2)
         pose_id = frame // 2 if named else None
         rows.append(replace(stop, timestamp=float(frame), world_from_tool=pose, pose_id=pose_id))
     return Recording.open(write_small_recording(folder, rows=rows))
@@ -31,25 +31,19 @@ def test_frames_of_one_stop_share_a_number(named: bool, tmp_path: Path) -> None:
     assert pose_numbers(recording).tolist() == [0, 0, 1, 1, 2, 2]
 
 
-def test_a_tenth_of_a_millimetre_is_another_pose(tmp_path: Path) -> None:
+def test_what_moves_is_another_pose_and_without_a_robot_every_frame(tmp_path: Path) -> None:
     assert pose_numbers(_recording(tmp_path / "moved", 1e-4)).tolist() == [0, 1, 2, 3, 4, 5]
+    recording = _recording(tmp_path / "tripod", 0.0, moves=False)
+    assert pose_numbers(recording).tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_a_robot_that_creeps_does_not_stand_still(tmp_path: Path) -> None:
     # Every frame is 40 micrometres from the one before: they were one pose, however many.
-    row = frame_rows(np.random.default_rng(3))[0]
-    rows = []
-    for frame in range(6):
-        pose = row.world_from_tool.copy()
-        pose[0, 3] += 4e-5 * frame
-        rows.append(replace(row, timestamp=float(frame), world_from_tool=pose, pose_id=None))
+    row, step = frame_rows(np.random.default_rng(3))[0], 4e-5 * np.eye(4, k=3)
+    poses = [row.world_from_tool + frame * step for frame in range(6)]
+    rows = [replace(row, world_from_tool=pose, pose_id=None) for pose in poses]
     recording = Recording.open(write_small_recording(tmp_path / "creeping", rows=rows))
     assert pose_numbers(recording).tolist() == [0, 0, 1, 1, 2, 2]
-
-
-def test_without_a_robot_nothing_says_that_the_target_stood_still(tmp_path: Path) -> None:
-    recording = _recording(tmp_path / "tripod", 0.0, moves=False)
-    assert pose_numbers(recording).tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_no_stop_is_fitted_and_held_out_at_once(tmp_path: Path) -> None:

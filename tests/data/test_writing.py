@@ -20,21 +20,28 @@ def contents(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
+def write(
+    path: Path,
+    *frames: dict[str, Any],
+    camera: CameraIntrinsics = CAMERA,
+    end: type[BaseException] | None = None,
+) -> None:
+    """Write frames of ones beside what is given of each, and end by an error."""
+    row = frame_rows(np.random.default_rng(0))[0]
+    with RecordingWriter(path, camera=camera, depth_kind="radial") as writer:
+        for frame in frames:
+            writer.append(np.ones((camera.height, camera.width)), row=row, **frame)
+            assert contents(path.parent) != []
+        if end is not None:
+            raise end
+
+
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt, RuntimeError, SystemExit])
 def test_an_interrupted_write_leaves_nothing(
     tmp_path: Path, interruption: type[BaseException]
 ) -> None:
-    rows, images = frame_rows(np.random.default_rng(0)), small_images(np.random.default_rng(0))
-
-    def write() -> None:
-        path = tmp_path / "a" / "b"
-        with RecordingWriter(path, camera=CAMERA, depth_kind="radial") as writer:
-            writer.append(images["depth"][0], row=rows[0], truth={"x": np.ones(2)})
-            assert contents(tmp_path) != []
-            raise interruption
-
     with pytest.raises(interruption):
-        write()
+        write(tmp_path / "a" / "b", {"truth": {"x": np.ones(2)}}, end=interruption)
     assert contents(tmp_path) == []
 
 
@@ -46,10 +53,8 @@ def test_nothing_is_visible_under_the_final_name_before_the_end(tmp_path: Path) 
             writer.append(depth, row=row)
             assert not path.exists()
     assert Recording.open(path).num_frames == len(rows)
-    assert contents(tmp_path) == [
-        "recording",
-        *(f"recording/{name}" for name in ("depth.npy", "frames.csv", "recording.yaml")),
-    ]
+    assert contents(path) == ["depth.npy", "frames.csv", "recording.yaml"]
+    assert [one.name for one in tmp_path.iterdir()] == ["recording"]
 
 
 def test_a_folder_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
@@ -65,40 +70,24 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path: Path) -> None:
     # A limit on the size of a file answers as a full disk does: the write fails half-way.
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     camera = CameraIntrinsics(width=300, height=200, matrix=CAMERA.matrix)
-    row = frame_rows(np.random.default_rng(0))[0]
     resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, before[1]))
-
-    def write() -> None:
-        with RecordingWriter(tmp_path / "full", camera=camera, depth_kind="z") as writer:
-            for _ in range(20):
-                writer.append(np.ones((200, 300)), row=row)
-
     try:
         with pytest.raises(CalibrationDataError, match=r"full: cannot be written \(File too large"):
-            write()
+            write(tmp_path / "full", *20 * [{}], camera=camera)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert contents(tmp_path) == []
 
 
-def test_a_parent_that_is_a_file_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(CalibrationDataError, match="recording: cannot be written"):
-        write_small_recording(tmp_path / "file" / "recording")
-    assert contents(tmp_path) == ["file"]
-
-
-def _changed(part: str, index: tuple[int, ...], value: float) -> dict[str, Any]:
-    images = small_images(np.random.default_rng(0))
-    images[part] = images[part].copy()
-    images[part][index] = value
-    return {part: images[part]}
+def _changed(part: str, value: float) -> dict[str, Any]:
+    image = small_images(np.random.default_rng(0))[part]
+    image[2, 0, 0] = value
+    return {part: image}
 
 
 def _with_row(**changes: Any) -> dict[str, Any]:
     rows = frame_rows(np.random.default_rng(0))
-    for name, value in changes.items():
-        object.__setattr__(rows[3], name, value)
+    rows[3] = replace(rows[3], **changes)
     return {"rows": rows}
 
 
@@ -111,14 +100,8 @@ def _with_row(**changes: Any) -> dict[str, Any]:
             dict.fromkeys(("amplitude", "mask", "raw")) | {"depth": np.ones((0, 5, 7)), "rows": []},
             r"a recording of no frame",
         ),
-        (
-            _changed("amplitude", (2, 0, 0), -1.0),
-            r"amplitude\.npy: frame 2, row 0, column 0: -1; expected 0 to",
-        ),
-        (
-            _changed("mask", (2, 0, 0), 7),
-            r"mask\.npy: frame 2, row 0, column 0: 7; expected 0 or 1",
-        ),
+        (_changed("amplitude", -1.0), r"amplitude\.npy: frame 2, row 0, column 0: -1; expected"),
+        (_changed("mask", 7), r"mask\.npy: frame 2, row 0, column 0: 7; expected 0 or 1"),
         (_with_row(world_from_tool=2.0 * np.eye(4)), r"frame 3, world_from_tool: .*rigid"),
         (_with_row(world_from_tool=np.full((4, 4), np.nan)), r"frame 3, world_from_tool: .*finite"),
         (_with_row(normal_world=np.zeros(3)), r"frames\.csv: frame 3: the normal .* length 0"),
@@ -142,16 +125,8 @@ def test_what_the_reader_would_refuse_is_not_written(
 
 
 def test_an_image_given_for_some_frames_only_is_refused(tmp_path: Path) -> None:
-    rows, images = frame_rows(np.random.default_rng(0)), small_images(np.random.default_rng(0))
-
-    def write() -> None:
-        path = tmp_path / "recording"
-        with RecordingWriter(path, camera=CAMERA, depth_kind="radial") as writer:
-            writer.append(images["depth"][0], row=rows[0], amplitude=images["amplitude"][0])
-            writer.append(images["depth"][1], row=rows[1])
-
     with pytest.raises(CalibrationDataError, match="frame 1: amplitude must be given for all"):
-        write()
+        write(tmp_path / "recording", {"amplitude": np.ones((5, 7))}, {})
     assert contents(tmp_path) == []
 
 

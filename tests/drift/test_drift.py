@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 from drift.few_walls import FEW, Walls, sensor
+from running import Program
 from simulated_walls import CAMERA, simulated_wall
 
 import tofcorr
-from tofcorr.cli.main import group as cli
 from tofcorr.correction.state import CalibrationState, save_calibration
 from tofcorr.drift.check import check_drift
 from tofcorr.drift.offset import Wall
@@ -96,19 +95,16 @@ def test_a_wall_that_bends_is_not_flat_any_more(state: CalibrationState, walls: 
 
 
 def test_the_command_says_so_and_writes_json(
-    state: CalibrationState, walls: Walls, tmp_path: Path
+    state: CalibrationState, walls: Walls, tmp_path: Path, program: Program
 ) -> None:
     few = walls(11, 20.0)
     run = tmp_path / "run"
     run.mkdir()
     save_calibration(run / "state.pt", state)
-    arguments = ["check", "--run", str(run), "--recording", str(few.first.path)]
-    arguments += ["--wall", "recorded", "--out", str(tmp_path / "check.json")]
-    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
-    assert result.exit_code == 0
-    assert "drifted" in result.output
+    given = ("--run", run, "--recording", few.first.path, "--wall", "recorded")
+    said = program("check", *given, "--out", tmp_path / "check.json")
     found = tofcorr.check(run, few.first.path, wall="recorded")
-    assert result.output == f"{found!r}\n"
+    assert said == (0, f"{found!r}\n", "")
     written = json.loads((tmp_path / "check.json").read_text())
     assert written == found.to_mapping()
     assert written["verdict"] == "drifted"
@@ -119,30 +115,24 @@ def test_the_command_says_so_and_writes_json(
 
 
 @pytest.mark.parametrize(
-    ("wall", "changed", "small", "large", "wider", "at_most"),
+    ("wall", "changed", "ends", "wider"),
     [
         # A bow of the wall hides an offset only where the wall is unknown.
-        ("per_image", "bow_variance", 1e-10, 1e-6, 2, np.inf),
-        ("recorded", "bow_variance", 1e-10, 1e-6, 1, 1.2),
+        ("per_image", "bow_variance", (1e-10, 1e-6), (2, np.inf)),
+        ("recorded", "bow_variance", (1e-10, 1e-6), (1, 1.2)),
         # Images that scattered less when calibrated leave a narrower interval; where the place of
         # the wall is known, the poses' errors stand for how images scatter.
-        ("per_image", "scatter", 0.3, 1.0, 1.1, np.inf),
-        ("recorded", "scatter", 0.3, 1.0, 1, 1),
+        ("per_image", "scatter", (0.3, 1.0), (1.1, np.inf)),
+        ("recorded", "scatter", (0.3, 1.0), (1, 1)),
         # Images that are alike leave a wider one.
-        ("recorded", "persistence", 0.0, 0.5, 1.2, np.inf),
+        ("recorded", "persistence", (0.0, 0.5), (1.2, np.inf)),
     ],
 )
 def test_what_the_calibration_left_uncertain_widens_the_interval(
-    checked: Check,
-    wall: Wall,
-    changed: str,
-    small: float,
-    large: float,
-    wider: float,
-    at_most: float,
+    checked: Check, wall: Wall, changed: str, ends: tuple[float, ...], wider: tuple[float, ...]
 ) -> None:
-    ends = [width(checked(wall, **{changed: one})) for one in (small, large)]
-    assert wider <= ends[1] / ends[0] <= at_most
+    small, large = (width(checked(wall, **{changed: one})) for one in ends)
+    assert wider[0] <= large / small <= wider[1]
 
 
 def test_views_that_were_not_calibrated_are_mentioned(checked: Check, reference: Reference) -> None:

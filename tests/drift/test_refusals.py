@@ -11,27 +11,22 @@ import tofcorr
 from tofcorr.correction.state import CalibrationState, save_calibration
 from tofcorr.drift.check import check_drift
 from tofcorr.drift.offset import Wall
+from tofcorr.error_terms.base import Interval
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.fit.reference import REFERENCE_FILE, Reference, save_reference
 from tofcorr.pixels.dataset import Dataset
 
 
-def test_another_camera_is_refused(state: CalibrationState, walls: Walls) -> None:
+def test_another_camera_and_a_wall_outside_the_range_are_refused(
+    state: CalibrationState, walls: Walls
+) -> None:
     few = walls(11).first
     other = replace(few, camera=replace(few.camera, distortion=(0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(CalibrationDataError, match="not the camera that was calibrated"):
         check_drift(state, Dataset((other,)))
-
-
-def test_a_wall_outside_the_calibrated_range_is_refused(
-    state: CalibrationState, walls: Walls
-) -> None:
-    few = walls(11)
-    low, high = state.domain.radial_distance
-    far = replace(state.domain, radial_distance=type(state.domain.radial_distance)(9.0, 10.0))
-    assert low < high
+    far = replace(state.domain, radial_distance=Interval(9.0, 10.0))
     with pytest.raises(CalibrationDataError, match="within the calibrated ranges"):
-        check_drift(state.model_copy(update={"domain": far}), few)
+        check_drift(state.model_copy(update={"domain": far}), Dataset((few,)))
 
 
 def test_one_wall_needs_a_robot(state: CalibrationState, walls: Walls) -> None:
@@ -53,12 +48,11 @@ def test_planes_found_in_the_depth_show_no_offset_and_several_walls_are_not_one(
         check_drift(state, estimated, "one")
 
 
-def test_a_threshold_that_is_not_positive_is_refused(tmp_path: Path) -> None:
+def test_a_threshold_that_is_not_positive_and_no_run_are_refused(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(ConfigError, match="threshold_mm: expected a positive number"):
         tofcorr.check(tmp_path, tmp_path, threshold_mm=0.0)
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationDataError, match="no such file; expected a calibration"):
         tofcorr.check(tmp_path, tmp_path)
 

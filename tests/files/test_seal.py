@@ -20,20 +20,21 @@ def content() -> bytes:
     return sealed(buffer)
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "file"
+
+
 def load(path: Path) -> dict:
     refuse_damaged(path, "a test")
     return torch.load(path, weights_only=True)
 
 
-def test_torch_reads_a_sealed_archive(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "file"
+def test_every_flipped_bit_is_noticed_or_harmless(path: Path, content: bytes) -> None:
     path.write_bytes(content)
     assert torch.equal(load(path)["numbers"], VALUES["numbers"])
-
-
-def test_every_flipped_bit_is_noticed_or_harmless(tmp_path: Path, content: bytes) -> None:
     # torch itself does not compare the checksums of an archive.
-    path, noticed = tmp_path / "file", 0
+    noticed = 0
     for place in range(0, len(content), 7):
         flipped = content[place] ^ (1 << place % 8)
         path.write_bytes(content[:place] + bytes([flipped]) + content[place + 1 :])
@@ -47,12 +48,11 @@ def test_every_flipped_bit_is_noticed_or_harmless(tmp_path: Path, content: bytes
     assert noticed > 0
 
 
-def test_a_record_marked_as_a_folder_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_a_record_marked_as_a_folder_is_refused(path: Path, content: bytes) -> None:
     # Found by the fuzz: torch leaves out such a record, and its numbers are whatever memory held.
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         before = content.index(b"PK\x01\x02", archive.start_dir)
     assert content[before + 38] == 0
-    path = tmp_path / "file"
     path.write_bytes(content[: before + 38] + b"\x10" + content[before + 39 :])
     with pytest.raises(CalibrationDataError, match="file: is damaged"):
         load(path)
@@ -65,19 +65,13 @@ def test_a_folder_in_place_of_the_file_is_called_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
-def test_an_archive_that_was_cut_short_is_refused(
-    tmp_path: Path, content: bytes, share: float
-) -> None:
-    path = tmp_path / "file"
+def test_an_archive_that_was_cut_short_is_refused(path: Path, content: bytes, share: float) -> None:
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(CalibrationDataError, match="file: is not a test, or is cut short"):
         load(path)
 
 
-def test_a_record_changed_with_a_fitting_checksum_is_refused(
-    tmp_path: Path, content: bytes
-) -> None:
-    path = tmp_path / "file"
+def test_a_record_changed_with_a_fitting_checksum_is_refused(path: Path, content: bytes) -> None:
     with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(path, "w") as new:
         for name in old.namelist():
             record = old.read(name)

@@ -110,6 +110,13 @@ def test_what_the_file_system_refuses_is_one_sentence(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_that_is_not_finished_leaves_the_older_one(tmp_path: Path) -> None:
+    write_file(tmp_path / "file", "older")
+    with pytest.raises(ZeroDivisionError), staged_file(tmp_path / "file"):
+        _ = 1 / 0
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["older"]
+
+
 def die_while_writing(folder: Path) -> None:
     """End as a killed process does: no handler runs, the system lets go of the locks."""
     with staged_folder(folder / "run") as run, scratch_folder(), staged_file(folder / "file.yaml"):

@@ -14,13 +14,8 @@ from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.training.calibration import TrainingOptions
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-CLASSES: list[type[Options]] = [
-    TrainingOptions,
-    EvaluationOptions,
-    SelectionOptions,
-    SimulatorOptions,
-    DiagnosisOptions,
-]
+COMPARISONS: list[type[Options]] = [EvaluationOptions, SelectionOptions]
+CLASSES = [TrainingOptions, *COMPARISONS, SimulatorOptions, DiagnosisOptions]
 SHIPPED = [
     pytest.param(cls, name, id=f"{cls.config_folder}/{name}")
     for cls in CLASSES
@@ -49,17 +44,9 @@ def test_every_shipped_file_belongs_to_a_class_and_has_a_name() -> None:
 
 def test_changes_reach_mappings_lists_and_keys_that_the_file_leaves_out() -> None:
     plain = resolve_options(TrainingOptions, "ea").to_mapping()
-    changed = resolve_options(
-        TrainingOptions,
-        "ea",
-        [
-            "model.terms.0.degree=4",
-            "solver.max_iterations=30",
-            "weights.noise=true",
-            "name=of = mine",
-            "split={test_fraction: 0.25}",
-        ],
-    ).to_mapping()
+    changes = ["model.terms.0.degree=4", "solver.max_iterations=30", "weights.noise=true"]
+    changes += ["name=of = mine", "split={test_fraction: 0.25}"]
+    changed = resolve_options(TrainingOptions, "ea", changes).to_mapping()
     assert changed["model"]["terms"][0]["degree"] == 4
     assert changed["model"]["terms"][1:] == plain["model"]["terms"][1:]
     assert changed["solver"] == plain["solver"] | {"max_iterations": 30}
@@ -68,24 +55,16 @@ def test_changes_reach_mappings_lists_and_keys_that_the_file_leaves_out() -> Non
     assert changed["split"] == plain["split"] | {"test_fraction": 0.25}
 
 
-def test_a_change_leads_into_a_default_that_no_file_states() -> None:
+def test_a_change_leads_into_defaults_and_modifies_no_mapping() -> None:
     plain = DiagnosisOptions().to_mapping()
     changed = resolve_options(DiagnosisOptions, "many", ["base.terms.0.degree=5"]).to_mapping()
     assert changed["base"]["terms"][0] == plain["base"]["terms"][0] | {"degree": 5}
     assert changed["base"]["terms"][1:] == plain["base"]["terms"][1:]
     assert changed["page"] is False
-
-
-def test_a_mapping_is_not_modified_by_a_change() -> None:
     values = {"name": "D", "model": {"terms": [{"kind": "distance_polynomial", "degree": 3}]}}
     options = resolve_options(TrainingOptions, values, ["model.terms.0.degree=1"])
     assert options.to_mapping()["model"]["terms"][0]["degree"] == 1
     assert values["model"] == {"terms": [{"kind": "distance_polynomial", "degree": 3}]}
-
-
-def test_a_change_supplies_what_a_file_lacks(tmp_path: Path) -> None:
-    (tmp_path / "nameless.yaml").write_text("model: {terms: []}\n")
-    assert resolve_options(TrainingOptions, tmp_path / "nameless.yaml", ["name=X"]).name == "X"
 
 
 def test_a_shipped_name_comes_before_a_folder_or_file_so_called(

@@ -23,10 +23,7 @@ def flipped(parts: Parts, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "select", "diagnose"])
 def test_every_command_stops_with_one_sentence_and_writes_nothing(
-    command: str,
-    flipped: Path,
-    tmp_path: Path,
-    program: Program,
+    command: str, flipped: Path, tmp_path: Path, program: Program
 ) -> None:
     out = tmp_path / "out"
     code, _, told = program(command, "--recording", flipped, "--out", out)
@@ -37,9 +34,7 @@ def test_every_command_stops_with_one_sentence_and_writes_nothing(
 
 
 def test_inspect_prints_the_findings_and_writes_one_page(
-    flipped: Path,
-    tmp_path: Path,
-    program: Program,
+    flipped: Path, tmp_path: Path, program: Program
 ) -> None:
     page = tmp_path / "page.html"
     code, told, _ = program("inspect", flipped, "--out", page)
@@ -50,10 +45,9 @@ def test_inspect_prints_the_findings_and_writes_one_page(
     assert "point away from the camera" in text
     assert "<script" not in text
     assert "src=" not in text
-    for wrong, said in ((page, "exists already"), (tmp_path / "page", "a name that ends in .html")):
-        code, _, told = program("inspect", flipped, "--out", wrong)
-        assert code == 2
-        assert said in told
+    assert (
+        "a name that ends in .html" in program("inspect", flipped, "--out", tmp_path / "page").err
+    )
 
 
 def test_evaluate_and_select_leave_out_the_frames_that_a_training_leaves_out(
@@ -152,8 +146,7 @@ def test_a_check_of_poses_that_never_change_is_refused_in_words(
 
 @pytest.mark.slow
 def test_an_amplitude_of_one_value_heads_a_diagnosis(parts: Parts, tmp_path: Path) -> None:
-    folder = FURTHER["amplitude of one value"](parts, np.random.default_rng(0)).write(
-        tmp_path / "flat"
-    )
+    flat = FURTHER["amplitude of one value"](parts, np.random.default_rng(0))
+    folder = flat.write(tmp_path / "flat")
     found = tofcorr.diagnose(folder, config={"bootstraps": 19, "simulate_anew": False})
     assert found.verdict.startswith("Doubtful recording: The amplitude is 100 nearly everywhere")

@@ -147,9 +147,7 @@ def test_a_camera_knocked_by_little_is_told_and_poses_that_scatter_as_much_are_n
 
 
 @pytest.mark.parametrize("draw", range(4))
-def test_two_cameras_are_told_apart_by_their_pixels(
-    parts: Parts, tmp_path: Path, draw: int
-) -> None:
+def test_two_cameras_are_told_by_their_pixels(parts: Parts, tmp_path: Path, draw: int) -> None:
     # A quarter of the draws once passed without a word, 9 mm off.
     fault = TABLE["two cameras mixed"](parts, np.random.default_rng(draw))
     found = inspect(fault.write(tmp_path / "mixed"))
@@ -175,18 +173,14 @@ def test_one_pixel_and_planes_per_frame_are_no_faults(parts: Parts, tmp_path: Pa
     single = TABLE["1 x 1 pixels"](parts, np.random.default_rng(0)).write(tmp_path / "single")
     assert inspect(single).headline is None
     # A camera without a robot: identity poses, each plane in the camera's frame.
-    camera = parts.poses @ true_hand_eye(parts, single.parent / "fitted")
+    given = inspect(parts.write(tmp_path / "fitted")).look.as_given
+    assert given is not None
+    camera = parts.poses @ given.hand_eye
     normal = np.einsum("fba,fb->fa", camera[:, :3, :3], parts.normal)
     offset = parts.offset + (parts.normal * camera[:, :3, 3]).sum(1)
     identity = np.repeat(np.eye(4)[None], len(camera), axis=0)
     board = parts.changed(poses=identity, normal=normal, offset=offset)
     assert inspect(board.write(tmp_path / "board")).headline is None
-
-
-def true_hand_eye(parts: Parts, folder: Path) -> np.ndarray:
-    given = inspect(parts.write(folder)).look.as_given
-    assert given is not None
-    return given.hand_eye
 
 
 @pytest.mark.slow

@@ -36,8 +36,7 @@ def test_noise_bends_no_wall(clean: Path) -> None:
     seen = [examine(Dataset((_flat_wall(clean, generator),))).look.shape for _ in range(_DRAWS)]
     shapes = [shape for shape in seen if shape is not None]
     assert len(shapes) == _DRAWS
-    standardised = np.array(
-        [shape["curvature"].value / shape["curvature"].error for shape in shapes]
-    )
+    curvatures = [shape["curvature"] for shape in shapes]
+    standardised = np.array([one.value / one.error for one in curvatures])
     # The mean of nine estimates without bias has a third of a standard error; three of these.
     assert np.abs(standardised.mean(axis=0)).max() < 1.0

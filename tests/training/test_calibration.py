@@ -13,17 +13,11 @@ from tofcorr.pixels.dataset import Dataset
 
 
 def error_in_the_papers_symbols(
-    groups: dict[str, dict[str, dict[str, float]]],
-    distance: Tensor,
-    amplitude: Tensor,
-    row: Tensor,
-    column: Tensor,
-) -> Tensor:
+    groups: dict[str, Any], distance: Any, amplitude: Any, row: Any, column: Any
+) -> Any:
     """Return c0 + c1 D + c2 D^2 + c3 D^3 + p1 (r - r0)^2 + p2 (c - c0)^2 + i1 A + i2 A^2."""
-    d, p, i = (
-        {symbol: one["value"] for symbol, one in groups[name].items()}
-        for name in ("distance", "pixel", "intensity")
-    )
+    names = ("distance", "pixel", "intensity")
+    d, p, i = ({symbol: one["value"] for symbol, one in groups[name].items()} for name in names)
     by_distance = d["c0"] + d["c1"] * distance + d["c2"] * distance**2 + d["c3"] * distance**3
     by_place = p["p1"] * (row - p["r0"]) ** 2 + p["p2"] * (column - p["c0"]) ** 2
     return by_distance + by_place + i["i1"] * amplitude + i["i2"] * amplitude**2
@@ -57,10 +51,8 @@ def test_reported_errors_are_millimetres_to_the_plane(trained: Trained, half: st
     frames = np.array(report["frames"][half])
     recorded = np.asarray(trained.data.first.tool_from_camera)
     estimated = report["hand_eye"]["tool_from_camera"]
-    for stage, transform, used in (
-        ("before", recorded, None),
-        ("after", estimated, calibration),
-    ):
+    stages = (("before", recorded, None), ("after", estimated, calibration))
+    for stage, transform, used in stages:
         off = distances_to_plane_mm(trained.data, frames, transform, used)
         told = report["error_mm"][stage][half]
         assert told["mean_abs"] == pytest.approx(float(off.abs().mean()), rel=1e-6)
@@ -79,10 +71,8 @@ def test_the_hand_eye_is_known_to_its_standard_errors_in_their_units(trained: Tr
     assert (np.abs(apart_deg) < 6 * np.array(hand_eye["rotation_se_deg"])).all()
     # In metres and radians they would be a thousand and 57 times too small.
     assert (np.array(hand_eye["translation_se_mm"]) > 1e-2).all()
-    for name in ("translation", "rotation"):
-        unit = "mm" if name == "translation" else "deg"
-        half_widths = np.array(hand_eye[f"{name}_ci95_{unit}"])
-        ratio = half_widths / np.array(hand_eye[f"{name}_se_{unit}"])
+    for name, unit in (("translation", "mm"), ("rotation", "deg")):
+        ratio = np.divide(hand_eye[f"{name}_ci95_{unit}"], hand_eye[f"{name}_se_{unit}"])
         assert ((ratio > 1.96) & (ratio < 3)).all()
 
 
@@ -99,11 +89,8 @@ def test_the_papers_coefficients_reproduce_the_correctors_error(trained: Trained
         depth = torch.full((height, width), distance, dtype=torch.float32)
         corrected, valid = corrector(depth, torch.full_like(depth, amplitude))
         for row, column in ((0, 0), (7, 20), (height - 1, width - 1)):
-            expected = error_in_the_papers_symbols(
-                calibration["coefficients"],
-                *(torch.tensor(x, dtype=torch.float64) for x in (distance, amplitude)),
-                *(torch.tensor(x, dtype=torch.float64) for x in (row, column)),
-            )
+            at = (distance, amplitude, row, column)
+            expected = error_in_the_papers_symbols(calibration["coefficients"], *at)
             error = float(depth[row, column] - corrected[row, column])
             # float32 at one to three metres resolves 2.4e-7 m.
             assert error == pytest.approx(float(expected), abs=1e-6)

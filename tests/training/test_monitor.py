@@ -13,10 +13,7 @@ from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import errors_along_ray, sample_pixels, thinned
-from tofcorr.training.calibration import Calibration
 from tofcorr.training.figures import coloured
-
-STAGES = ("before", "hand_eye_only", "after")
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +52,8 @@ def test_loss_hand_eye_and_every_coefficient_are_shown_by_iteration(
         value = _scalar(shown, f"coefficients_mm/{tag}")[-1]
         assert value == pytest.approx(1e3 * float(last[symbol]), rel=1e-6)
     moved = 1e3 * (estimate.tool_from_camera - iterations[0].parameters.tool_from_camera)[2, 3]
-    assert _scalar(shown, "hand_eye_since_start/t_z_mm")[-1] == pytest.approx(
-        float(moved), rel=1e-5
-    )
+    found = _scalar(shown, "hand_eye_since_start/t_z_mm")[-1]
+    assert found == pytest.approx(float(moved), rel=1e-5)
     assert _scalar(shown, "hand_eye_since_start/rotation_deg")[0] == 0.0
 
 
@@ -68,7 +64,8 @@ def test_error_images_distributions_and_the_report_are_there(
     assert min(image.width, image.height) > 300
     (words,) = shown.Tensors("frames/error_before_and_after/text_summary")
     assert b"held out" in words.tensor_proto.string_val[0]
-    expected = {f"error_mm/{stage}_{half}" for stage in STAGES for half in ("fitted", "held_out")}
+    stages = ("before", "hand_eye_only", "after")
+    expected = {f"error_mm/{stage}_{half}" for stage in stages for half in ("fitted", "held_out")}
     assert set(shown.Tags()["histograms"]) == expected
     text = shown.Tensors("report/text_summary")[0].tensor_proto.string_val[0].decode()
     report = trained.report()
@@ -116,7 +113,7 @@ def test_errors_are_measured_minus_true_along_the_ray(tmp_path: Path) -> None:
     assert not any("amplitude" in name for name in sample_pixels(data, {"b": bare}, [1]).covariates)
 
 
-def test_a_sample_holds_usable_pixels_of_the_frames_asked_for(trained: Trained) -> None:
+def test_a_sample_holds_usable_pixels_and_thinning_keeps_both_ends(trained: Trained) -> None:
     found, camera = trained.result.calibration, trained.data.first.camera
     sample = sample_pixels(trained.data, found.stages, found.test)
     assert set(sample.frame) == set(found.test)
@@ -126,24 +123,8 @@ def test_a_sample_holds_usable_pixels_of_the_frames_asked_for(trained: Trained) 
     assert sample.covariates["row [pixel]"].max() == camera.height - 1
     assert sample.covariates["column [pixel]"].max() == camera.width - 1
     assert sample.errors_mm["after"].std() < sample.errors_mm["hand_eye_only"].std()
-
-
-def test_thinning_keeps_both_ends_and_never_exceeds_its_number() -> None:
     assert thinned(np.arange(100), 3).tolist() == [0, 50, 99]
     assert thinned(np.arange(3), 5).tolist() == [0, 1, 2]
-
-
-def test_the_numbers_are_kept_when_a_figure_fails(
-    trained: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(_: Calibration) -> None:
-        raise RuntimeError("in the middle")
-
-    monkeypatch.setattr("tofcorr.training.monitor.frames_to_show", fail)
-    with pytest.raises(RuntimeError, match="in the middle"):
-        trained.result.monitor.write(tmp_path, trained.result.calibration)
-    losses = [iteration.loss for iteration in trained.result.iterations]
-    assert _scalar(_read(tmp_path), "convergence/loss_m2") == pytest.approx(losses, rel=1e-6)
 
 
 def test_without_figures_only_they_are_missing(

@@ -6,6 +6,7 @@ run ended in a traceback, or was `usable` with distances at half of what they we
 
 from pathlib import Path
 
+import cameras
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,12 +16,7 @@ import tofcorr
 from tofcorr.data.table import FrameRow
 from tofcorr.geometry.rays import ray_directions
 
-CAMERA = tofcorr.CameraIntrinsics(
-    width=32,
-    height=24,
-    matrix=((30.0, 0.0, 15.5), (0.0, 30.0, 11.5), (0.0, 0.0, 1.0)),
-    distortion=(),
-)
+CAMERA = cameras.camera((32, 24), (30.0, 30.0), (15.5, 11.5))
 WALL = 0.9
 """Distance of the wall from the tool in every frame, metres."""
 
@@ -49,18 +45,11 @@ def _recording(folder: Path, frames: int, spread: float) -> Path:
             facing = rays @ camera[2, :3]
             distance = (WALL - camera[2, 3]) / facing
             noise = 2e-3 * generator.standard_normal(distance.shape)
-            row = FrameRow(
-                timestamp=float(number),
-                world_from_tool=pose,
-                normal_world=np.array([0.0, 0.0, -1.0]),
-                offset=WALL,
-                target="white",
-            )
-            writer.append(
-                (distance + 0.015 + 0.01 * distance + noise).astype(np.float32),
-                row=row,
-                amplitude=(500 * facing / distance**2).astype(np.float32),
-            )
+            plane = {"normal_world": np.array([0.0, 0.0, -1.0]), "offset": WALL, "target": "white"}
+            row = FrameRow(timestamp=float(number), world_from_tool=pose, **plane)
+            read = (0.015 + 1.01 * distance + noise).astype(np.float32)
+            amplitude = (500 * facing / distance**2).astype(np.float32)
+            writer.append(read, row=row, amplitude=amplitude)
     return folder
 
 

@@ -3,28 +3,22 @@
 import csv
 import itertools
 import math
-import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from running import Program
 from scipy.spatial.transform import Rotation
-from simulated_walls import CAMERA, EA, fitted, taken, wall_options
+from simulated_walls import EA, fitted, taken, wall_options
 
-from tofcorr.cli.main import main
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import tangents
 from tofcorr.training.advice import PosePlan, Workspace, plan_poses
 
-SMALL = CameraIntrinsics(
-    width=CAMERA["width"],
-    height=CAMERA["height"],
-    matrix=tuple(tuple(row) for row in CAMERA["K"]),  # type: ignore[arg-type]
-    distortion=tuple(CAMERA["distortion"]),
-)
+SMALL = wall_options(1).camera.intrinsics()
 SPACE = Workspace(nearest=0.5, farthest=1.5)
 
 
@@ -65,12 +59,11 @@ def test_a_guess_of_the_hand_eye_moves_the_tool_and_not_the_camera(plan: PosePla
 
 
 def test_a_wall_of_limited_size_keeps_every_corner_of_the_view() -> None:
-    found = plan_poses(
-        SMALL, EA, Workspace(nearest=0.5, farthest=1.5, wall_size=(1.2, 1.0)), number=8
-    )
+    wall = replace(SPACE, wall_size=(1.2, 1.0))
+    found = plan_poses(SMALL, EA, wall, number=8)
     assert float(found.described[:, 0].max()) < 1.5
     with pytest.raises(ConfigError, match="No view between the given distances"):
-        plan_poses(SMALL, EA, Workspace(nearest=0.5, farthest=1.5, wall_size=(0.2, 0.2)))
+        plan_poses(SMALL, EA, replace(SPACE, wall_size=(0.2, 0.2)))
 
 
 @pytest.mark.parametrize(
@@ -84,7 +77,7 @@ def test_an_impossible_workspace_is_refused(nearest: float, farthest: float, til
 def test_a_camera_taken_to_the_planned_poses_is_calibrated_as_promised(
     tmp_path: Path, generator: torch.Generator
 ) -> None:
-    plan = plan_poses(SMALL, EA, Workspace(nearest=0.5, farthest=1.5, checkerboard=True), number=24)
+    plan = plan_poses(SMALL, EA, replace(SPACE, checkerboard=True), number=24)
     simulator = wall_options(1)
     hand_eye = simulator.hand_eye.tool_from_camera()
     # The plan's tool is the camera; it starts one metre in front of the simulator's wall.
@@ -101,13 +94,13 @@ def test_a_camera_taken_to_the_planned_poses_is_calibrated_as_promised(
     assert error_mm < 3 * 3**0.5 * float(plan.expected[-1, 0])
 
 
-def test_the_command_writes_poses_of_the_robot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["tofcorr", "poses", "--focal", "45", "--centre", "15.9,11.8", "--size", "32", "25"]
-    arguments += ["--distance", "0.5", "1.5", "--number", "6", "--out", str(tmp_path / "poses.csv")]
-    monkeypatch.setattr(sys, "argv", [*arguments, "--start", "0.4,0,0.5,0,0.7071068,0,0.7071068"])
-    main()
+COMMAND = "poses --focal 45 --centre 15.9,11.8 --size 32 25 --distance 0.5 1.5 --number 6 --start"
+
+
+def test_the_command_writes_poses_of_the_robot(tmp_path: Path, program: Program) -> None:
+    start = "0.4,0,0.5,0,0.7071068,0,0.7071068"
+    code, told, _ = program(*COMMAND.split(), start, "--out", tmp_path / "poses.csv")
+    assert code == 0
     rows = list(csv.DictReader((tmp_path / "poses.csv").read_text().splitlines()))
     assert len(rows) == 6
     for row in rows:
@@ -116,16 +109,11 @@ def test_the_command_writes_poses_of_the_robot(
         # The start looks along the world's x axis; every pose looks at the same point of the wall.
         looked_at = np.array(pose[:3]) + float(row["distance_m"]) * forward
         np.testing.assert_allclose(looked_at, [1.4, 0.0, 0.5], atol=1e-3)
-    assert "6 poses written to" in capsys.readouterr().out
+    assert "6 poses written to" in told
 
 
-def test_a_start_that_is_no_pose_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["tofcorr", "poses", "--focal", "45", "--centre", "15.9,11.8", "--size", "32", "25"]
-    arguments += ["--distance", "0.5", "1.5", "--out", str(tmp_path / "poses.csv")]
-    monkeypatch.setattr(sys, "argv", [*arguments, "--start", "0,0,0,1,1,0,0"])
-    with pytest.raises(SystemExit, match="2"):
-        main()
-    assert "--start: the quaternion x y z w has length 1.414" in capsys.readouterr().err
+def test_a_start_that_is_no_pose_is_refused(tmp_path: Path, program: Program) -> None:
+    code, _, told = program(*COMMAND.split(), "0,0,0,1,1,0,0", "--out", tmp_path / "poses.csv")
+    assert code == 2
+    assert "--start: the quaternion x y z w has length 1.414" in told
     assert list(tmp_path.iterdir()) == []

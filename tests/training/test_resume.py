@@ -77,12 +77,11 @@ def test_outside_the_main_thread_no_handler_is_set() -> None:
     assert seen == [[]]
 
 
-def test_a_run_of_another_model_is_not_resumed(trained: Trained) -> None:
+def test_a_run_of_another_model_and_a_folder_without_one_are_not_resumed(
+    trained: Trained, tmp_path: Path
+) -> None:
     smaller = {**CONFIG, "model": {"terms": CONFIG["model"]["terms"][:1]}}
     with pytest.raises(ConfigError, match="other terms than the configuration"):
         tofcorr.train(trained.recording, smaller, resume=trained.folder)
-
-
-def test_a_folder_without_a_run_is_not_resumed(trained: Trained, tmp_path: Path) -> None:
     with pytest.raises(CalibrationDataError, match=r"state\.pt: there is no such file"):
         tofcorr.train(trained.recording, CONFIG, resume=tmp_path)

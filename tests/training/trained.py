@@ -7,19 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from synthetic_scene import EA
 
 from tofcorr import TrainingResult
 from tofcorr.pixels.dataset import Dataset
 
 CONFIG: dict[str, Any] = {
     "name": "EA",
-    "model": {
-        "terms": [
-            {"kind": "distance_polynomial", "degree": 3},
-            {"kind": "pixel_polynomial", "degree": 2},
-            {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
-        ]
-    },
+    "model": EA,
     "split": {"test_fraction": 0.4, "seed": 3},
     "advice": 2,
 }
