@@ -2,6 +2,7 @@
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,7 +87,7 @@ def test_any_pose_and_time_survive_the_table(
     pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     pose[:3, 3] = metres
     seconds = microseconds * 1e-6
-    plane = {"normal_world": pose[2, :3], "offset": metres, "target": 'a, "b"'}
+    plane: dict[str, Any] = {"normal_world": pose[2, :3], "offset": metres, "target": 'a, "b"'}
     when = {"timestamp": metres, "integration_time": seconds}
     row = FrameRow(world_from_tool=pose, **plane, **when)
     path = tmp_path_factory.mktemp("table") / "frames.csv"

@@ -123,8 +123,8 @@ def test_white_filter_widths_are_those_of_scipy_and_come_back() -> None:
 
 
 def test_noise_curve_has_the_values_of_its_equation_and_holds_them_in_the_dark() -> None:
-    parts = {"floor_m": 1e-3, "shot_m": 2e-3, "read_m": 3e-3, "fixed_share": 0.19}
-    at_reference = {"reference_amplitude": REFERENCE, "reference_distance_m": 1.0}
+    parts: dict[str, Any] = {"floor_m": 1e-3, "shot_m": 2e-3, "read_m": 3e-3, "fixed_share": 0.19}
+    at_reference: dict[str, Any] = {"reference_amplitude": REFERENCE, "reference_distance_m": 1.0}
     curve = NoiseModel(**parts, **at_reference, least_brightness=0.1, correlation_px=0.0)
     at = np.array([4000.0, 1000.0, 100.0, 1.0])
     squares = np.array([1 + 4 / 4 + 9 / 16, 1 + 4 + 9, 1 + 40 + 900, 1 + 40 + 900])
