@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from benchmarks.renewed.signal_chain import Form
 from benchmarks.sealed.command import OUT, SEED, counts_by_name, kept_rows
 from benchmarks.sealed.oracle import ask
 from benchmarks.sealed.scores import LEAST_MM, by_design, known, share, table
+from tofcorr.simulation.effects import CATALOGUE
 
 Row = Mapping[str, Any]
 KINDS = ("nothing", "effect", "outside", "pair")
@@ -101,8 +103,8 @@ def judge(case: Case, folder: Path) -> dict[str, Any]:
         "sets": named.cause_sets,
         "tested": named.tested,
         "unknown": left.unknown,
-        "p_values": dict(left.p_values),
-        "p_value": left.p_value,
+        "probabilities": named.probabilities,
+        "unknown_probability": named.unknown,
         "gap_mm": {"before": 1e3 * gap.before, "after": 1e3 * gap.after, "floor": 1e3 * gap.floor},
         "closed": gap.closed,
         "intervals": said,
@@ -118,13 +120,13 @@ SAID: dict[str, Callable[[Row], bool]] = {
     "unknown": lambda row: row["unknown"],
     "detected": lambda row: row["tested"] and (bool(row["names"]) or row["unknown"]),
 }
-QUANTILES = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 0.75)
+BINS = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)  # ends of what is stated alike
 
 
 def tables(rows: Sequence[Row]) -> str:
     """Return all tables as Markdown: levels by what was drawn, effects, pairs, coverage."""
     of = {kind: [row for row in rows if row["kind"] == kind] for kind in KINDS}
-    parts = [_levels, _quantiles], [_found], [_pairs], [_coverage]
+    parts = [_levels], [_found], [_pairs], [_reliability, _coverage]
     asked = of["nothing"], [row for kind in SINGLE for row in of[kind]], of["pair"], rows
     made = [make(some) for makes, some in zip(parts, asked, strict=True) for make in makes if some]
     return "\n\n".join(made)
@@ -138,17 +140,24 @@ def _levels(rows: Sequence[Row]) -> str:
     return table(("nothing missing", "", "n", *SAID), lines)
 
 
-def _quantiles(rows: Sequence[Row]) -> str:
-    """Of the p-values with nothing missing: uniform ones equal the head of the table."""
-    rows = [row for row in rows if row["tested"] and not row["names"]]
-    found = {"joined": [row["p_value"] for row in rows]}
-    for name in rows[0]["p_values"] if rows else ():
-        found[name] = [row["p_values"][name] for row in rows]
-    lines = [
-        (name, *(f"{np.mean(np.array(values) <= q + 1e-9):.3f}" for q in QUANTILES))
-        for name, values in found.items()
-    ]
-    return table(("share of p-values at most", *(f"{q:g}" for q in QUANTILES)), lines)
+def _reliability(rows: Sequence[Row]) -> str:
+    """Of the effects of the catalogue stated at some probability, what share is there."""
+    stated: list[tuple[float, bool]] = []
+    for row in rows:
+        there = known(row["sizes_mm"])
+        said = [(name, own) for name, own in row["probabilities"].items() if name in CATALOGUE]
+        stated += [(own, bool(known([name]) & there)) for name, own in said]
+    if not stated:
+        return ""
+    probability, true = np.array(stated).T
+    lines = [("Brier score", len(true), f"{np.mean((probability - true) ** 2):.4f}", "")]
+    for low, high in pairwise(BINS):
+        own = (probability >= low) & (probability <= high)
+        if own.any():
+            there = str(share(map(bool, true[own])))
+            said = f"{probability[own].mean():.3f}"
+            lines.append((f"{low:g} to {high:g}", int(own.sum()), there, said))
+    return table(("effects stated at", "n", "are there", "stated, mean"), lines)
 
 
 def _found(rows: Sequence[Row]) -> str:

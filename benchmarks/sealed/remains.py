@@ -1,10 +1,9 @@
 """What is true of the gaps in a report: what its models leave of the distances without noise.
 
 The diagnosis is run again in this process. Base model and effects are fitted as there, to the noisy
-distances; each pose, or tile of an image where the report uses tiles, is predicted by the fit to
-all others, and compared with its distances without noise. Pixels count as in the report: outliers
-do not, noisy ones less. So a report that knew the noise of every pixel would state these gaps
-exactly.
+distances; each pose is predicted by the fit to all others, and compared with its distances without
+noise. Pixels count as in the report: outliers do not, noisy ones less. So a report that knew the
+noise of every pixel would state these gaps exactly.
 """
 
 import json
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchmarks.renewed.geometry import Array
 from benchmarks.renewed.recording import read
@@ -26,13 +24,11 @@ from tofcorr.diagnosis.findings.gap import (
     OpenSet,
     judge_remainder,
     measure_gap,
-    name_in_two,
     resampled,
 )
-from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.linear_system import tile_sums
 from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(simulate_anew=False, page=False)
@@ -45,7 +41,7 @@ def diagnosed(
     study = prepare(Recording.open(folder), options).study
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = resampled(study.sums.num_units, options.bootstraps, generator)
-    named = name_in_two(study, resamples)
+    named = name_effects(study)
     gap = measure_gap(study, named, resamples)
     return study, named, gap, judge_remainder(study, named, gap)
 
@@ -108,10 +104,8 @@ def _holds(interval: Sequence[float | None] | None, value: float) -> bool:
 
 
 def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
-    observations, sums, unit = study.observations, study.sums, study.unit_of_pixel
-    if study.tiles is not None and any(map(study.candidates.is_tested_by_tiles, names)):
-        sums, unit = tile_sums(study.system, names, study.tiles, study.fit), _unit_of_pixel(study)
-    theta = sums.ols.left_out_coefficients(names)[unit]
+    observations = study.observations
+    theta = study.sums.ols.left_out_coefficients(names)[study.unit_of_pixel]
     left, start = study.system.residual.clone(), 0
     for part in study.system.of(names):
         left -= (part * theta[:, start : start + part.shape[1]]).sum(1)
@@ -120,13 +114,3 @@ def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
     share = study.fit.share.numpy() * np.isfinite(own)
     squares = (left.numpy() - np.nan_to_num(own)) ** 2
     return 1e3 * float(np.sqrt((share * squares).sum() / share.sum()))
-
-
-def _unit_of_pixel(study: Study) -> Tensor:
-    """The whole pose or tile that each pixel belongs to, shape (M,)."""
-    tiles = study.tiles
-    assert tiles is not None
-    unit = torch.searchsorted(tiles.whole, study.unit_of_pixel)
-    counts = torch.tensor(tiles.counts)
-    unit[tiles.pixels] = len(tiles.whole) + torch.arange(len(counts)).repeat_interleave(counts)
-    return unit

@@ -49,3 +49,8 @@ def nothing_named(nothing_study: Study) -> NamedEffects:
 @pytest.fixture(scope="session")
 def time_diagnosis(time_missing: Recording) -> DiagnosisResult:
     return diagnose(time_missing, config=OPTIONS)
+
+
+@pytest.fixture(scope="session")
+def time_named(time_diagnosis: DiagnosisResult) -> NamedEffects:
+    return time_diagnosis.evidence.named

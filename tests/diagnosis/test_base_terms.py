@@ -10,7 +10,7 @@ from typing import Any
 import diagnosed_recordings
 import numpy as np
 import pytest
-from diagnosis.comparisons import model_of
+from diagnosis.resamples import unnamed
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
@@ -71,7 +71,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_every_kind_of_term_can_be_the_base_of_a_diagnosis(kind: str, demo: Recording) -> None:
     found = diagnose(demo, config=_base(kind) | {"catalogue": ["wiggling", "lens"]})
     assert np.isfinite([found.gap.before, found.gap.after, found.gap.floor]).all()
-    assert {test.name for test in found.ranking} == {"wiggling", "lens"}
+    assert set(found.evidence.named.ranking) == {"wiggling", "lens"}
     expected = ("lacks these terms", "as outliers")  # A base of one term misfits some pixels.
     assert all(any(words in warning for words in expected) for warning in found.warnings)
 
@@ -109,7 +109,7 @@ def test_the_simulator_makes_the_error_of_the_base_model(
     kind: str, beside_pixels: Callable[[str], Study]
 ) -> None:
     study = beside_pixels(kind)
-    twin = Evidence(study=study, named=model_of(study)).distance()
+    twin = Evidence(study=study, named=unnamed(study)).distance()
     fitted = study.observations.measured - study.system.residual_of(())
     # Tables have knots, and a delay changes the amplitude that the next one depends on.
     assert float((twin - fitted).square().mean().sqrt()) < 3e-4
@@ -124,7 +124,7 @@ def test_a_fixed_pattern_in_the_base_is_not_named(folder: Path) -> None:
     )
     assert without.names == ("fixed_pattern",)
     assert with_pattern.names == ()
-    assert not {"fixed_pattern", "row_column_pattern"} & set(with_pattern.first.tests)
+    assert not {"fixed_pattern", "row_column_pattern"} & set(with_pattern.ranking)
 
 
 def test_an_integration_time_term_in_the_base_takes_the_effect_away(

@@ -113,12 +113,15 @@ def test_columns_are_the_differences_of_the_predicted_distance(walls: Recording)
         )
 
 
-def test_the_same_effect_is_named_as_with_measured_planes(
+def test_the_same_effect_is_named_first_as_with_measured_planes(
     prepared: Prepared, time_study: Study
 ) -> None:
+    """Walls that are found hold pixels of their edges; what these add is less probable."""
     estimated, measured = name_effects(prepared.study), name_effects(time_study)
-    assert estimated.names == measured.names == ("integration_time",)
-    assert estimated.cause_sets == measured.cause_sets
+    assert measured.names == ("integration_time",)
+    assert estimated.names[0] == "integration_time"
+    assert estimated.cause_sets[0] == measured.cause_sets[0]
+    assert all(estimated.probabilities[name] < 0.7 for name in estimated.names[1:])
 
 
 def test_what_planes_absorb_needs_measured_planes_by_name(prepared: Prepared) -> None:

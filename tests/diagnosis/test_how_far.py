@@ -4,7 +4,7 @@ import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
-from diagnosis.comparisons import resamples_of
+from diagnosis.resamples import resamples_of
 
 from tofcorr.diagnosis.findings.gap import (
     Gap,
@@ -56,11 +56,6 @@ def test_a_noise_known_to_a_per_cent_or_two_does_not_change_the_gap(
         for gap in gaps[1:]:
             assert gap.before == pytest.approx(gaps[0].before, rel=1e-6)
             assert gap.after == pytest.approx(gaps[0].after, rel=1e-6)
-
-
-@pytest.fixture(scope="module")
-def time_named(time_diagnosis: DiagnosisResult) -> NamedEffects:
-    return time_diagnosis.evidence.named
 
 
 @pytest.fixture(scope="module")

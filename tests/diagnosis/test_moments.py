@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from tofcorr.diagnosis.sums.gains import HeldOutSquares
 from tofcorr.diagnosis.sums.linear_system import BASE, draw_folds, pose_sums
 from tofcorr.diagnosis.sums.study import Study, with_residual
 from tofcorr.pixels.dataset import thread_number
@@ -29,20 +28,6 @@ def _base_prior(study: Study) -> torch.Tensor:
 def _per_pose(study: Study, residual: torch.Tensor) -> torch.Tensor:
     squares = torch.zeros(study.sums.num_units, dtype=torch.float64)
     return squares.index_add(0, study.unit_of_pixel, study.fit.share * residual**2)
-
-
-@pytest.mark.parametrize("names", [[], ["integration_time"], ["lens", "wiggling"]])
-def test_held_out_squares_are_those_of_refits_without_the_fold(
-    time_study: Study, names: list[str]
-) -> None:
-    folds = draw_folds(time_study.system.sums.num_units, 3, torch.Generator().manual_seed(3))
-    expected = torch.zeros(time_study.system.sums.num_units, dtype=torch.float64)
-    for fold in range(3):
-        inside = folds[fold] > 0
-        residual = _brute_force(time_study, names, (~inside).double())
-        expected[inside] = _per_pose(time_study, residual)[inside]
-    squares = HeldOutSquares(time_study.sums.ols, names, folds).squares
-    torch.testing.assert_close(squares, expected, rtol=1e-6, atol=0)
 
 
 def test_left_out_squares_are_those_of_refits_without_the_pose(time_study: Study) -> None:

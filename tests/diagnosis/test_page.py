@@ -265,7 +265,7 @@ def test_every_word_stands_inside_the_figure_however_large_the_noise_is(floor: f
     """The label of a noise beyond the axis was cut at the edge of the picture."""
     stage = Stage(name="recalibrated", gap=Estimated(2.1e-3, interval=(1.4e-3, 2.8e-3)))
     gap, stages = SimpleNamespace(floor=floor), (Stage(name="as_given"), stage)
-    known = {"stages": stages, "effects": (), "refined_terms": (), "gap_steps": ()}
+    known = {"stages": stages, "effects": (), "gap_steps": ()}
     figure = stage_bars(cast("Any", SimpleNamespace(gap=gap, degraded=None, **known)))
     figure.draw_without_rendering()
     for text in figure.findobj(lambda one: isinstance(one, Text) and one.get_text() != ""):

@@ -21,9 +21,17 @@ from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 
 KEYS_AGREED = {
-    *("format", "version", "gap_mm", "parameter_gap_mm", "detected", "p_value", "effects"),
-    *("simulator", "stages", "attribution", "unknown_p_value", "warnings"),
-    *("cause_sets", "unknown", "ranking", "where", "transfer_mm", "hand_eye_shift_mm"),
+    *("format", "version", "gap_mm", "parameter_gap_mm", "detected", "probability", "effects"),
+    *("simulator", "stages", "attribution", "unknown_probability", "warnings"),
+    *(
+        "cause_sets",
+        "set_probabilities",
+        "unknown",
+        "ranking",
+        "where",
+        "transfer_mm",
+        "hand_eye_shift_mm",
+    ),
     *("minimum_detectable_mm", "next_recording", "verdict"),
 }
 
@@ -46,9 +54,11 @@ def test_the_findings_have_the_keys_agreed_and_name_the_cause(report: Path) -> N
     assert found.keys() >= KEYS_AGREED
     assert found["effects"] == ["integration_time"]
     assert found["cause_sets"][0][0] == "integration_time"
-    closes = found["cause_sets_close"][0]
-    assert closes["integration_time"] == 1.0
-    assert closes.keys() == set(found["cause_sets"][0])
+    shares = found["cause_sets_shares"][0]
+    assert shares.keys() == set(found["cause_sets"][0])
+    (probability,) = found["set_probabilities"]
+    stated = {entry["effect"]: entry["probability"] for entry in found["ranking"]}
+    assert found["probability"] >= probability >= stated["integration_time"] > 0.5
     gap = found["gap_mm"]
     assert gap["before_ci"][0] <= gap["before"] <= gap["before_ci"][1]
     assert gap["after"] < 0.5 * gap["before"]

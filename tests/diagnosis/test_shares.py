@@ -189,7 +189,7 @@ def test_without_a_simulator_nothing_is_as_given_and_shares_are_of_the_fitted_on
     time_diagnosis: DiagnosisResult,
 ) -> None:
     found = time_diagnosis.to_mapping()
-    assert found["version"] == 2
+    assert found["version"] == 3
     assert found["simulator"] == "fitted"
     names = ["as_given", "recalibrated", "with_effects"]
     assert [stage["name"] for stage in found["stages"]] == names

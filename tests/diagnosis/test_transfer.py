@@ -6,7 +6,7 @@ import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
-from diagnosis.comparisons import resamples_of
+from diagnosis.resamples import resamples_of
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects

@@ -1,6 +1,5 @@
 """Sentences of a verdict that must not contradict one another."""
 
-import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,14 +11,14 @@ from tofcorr.diagnosis.report.words import effect_line, moving_waves, write_verd
 
 STUDY: Any = SimpleNamespace(
     fit=SimpleNamespace(model=SimpleNamespace(groups=set())),
-    options=SimpleNamespace(target_gap_mm=1.0),
+    options=SimpleNamespace(target_gap_mm=1.0, tests=SimpleNamespace(named_from=0.5)),
     candidates=SimpleNamespace(effects={}),
 )
 
 
 def named_of(**changes: Any) -> Any:
     """Return a model in which nothing is named but what is said."""
-    known = {"names": (), "sets": {}, "tested": True, "likeliest": (), "certain": False}
+    known = {"names": (), "sets": {}, "tested": True, "probabilities": {}, "anything": 0.1}
     return SimpleNamespace(study=STUDY, **known | changes)
 
 
@@ -43,16 +42,10 @@ def verdict_of(
     return write_verdict(named, known, remainder, causes)
 
 
-@pytest.mark.parametrize("certain", [False, True])
-def test_a_name_on_less_evidence_is_said_to_be_one(certain: bool) -> None:
-    named = named_of(names=("warm_up",), sets={"warm_up": {"warm_up": 1.0}}, certain=certain)
-    assert verdict_of(named).endswith("More poses would decide.") == certain
-
-
 @pytest.mark.parametrize(
     ("low", "unknown", "said"),
     [
-        (0.0, False, "Noise may be all of it."),
+        (0.0, False, "It may be noise alone."),
         (0.2, False, "That is too small to show a cause."),
         (0.2, True, "None of the effects tested explains it."),
     ],
@@ -69,7 +62,7 @@ def test_a_gap_without_a_cause_is_unexplained_only_where_something_unknown_was_d
 @pytest.mark.parametrize(
     ("scatter", "said"),
     [
-        (1e-3, "None of the effects tested is significant."),
+        (1e-3, "None of the effects tested is probable."),
         (2.5e-3, "Poses of camera or target that scatter by 2.5 mm would explain it."),
     ],
 )
@@ -84,41 +77,28 @@ def test_a_small_rest_does_not_read_as_nothing() -> None:
     assert "Shares of its square: hand_eye 100 %; < 1 % is unexplained." in verdict
 
 
-def test_a_large_gap_without_a_significant_cause_names_the_likeliest_ones() -> None:
-    verdict = verdict_of(named_of(likeliest=("warm_up", "lens")))
-    assert "(likeliest, but not significant: warm_up, lens)" in verdict
-    assert "record more poses" in verdict
+def test_a_gap_without_a_name_says_how_probable_something_is_and_what_most() -> None:
+    verdict = verdict_of(named_of(anything=0.8, probabilities={"warm_up": 0.45, "lens": 0.3}))
+    assert "(most probable: warm_up 0.45, lens 0.30)" in verdict
+    assert "very probably (probability 0.80) missing: record more poses" in verdict
     assert "missing that this recording could show" not in verdict
 
 
 def test_an_unknown_cause_is_said_with_the_effects_that_are_nearest() -> None:
-    verdict = verdict_of(named_of(likeliest=("lens",)), unknown=True)
-    assert verdict.endswith("None of the effects tested explains it (nearest: lens).")
+    verdict = verdict_of(named_of(probabilities={"lens": 0.2, "any_time": 0.9}), unknown=True)
+    assert verdict.endswith("None of the effects tested explains it (most probable: lens 0.20).")
 
 
-@pytest.mark.parametrize(
-    ("sets", "said"),
-    [
-        ((("warm_up",), ("lens", "pixel")), "With warm_up and lens added"),
-        ((("warm_up",), ("lens", "warm_up")), "(or only warm_up, of another form) added"),
-        ((("warm_up", "lens"), ("lens", "warm_up")), "(or only warm_up or lens, of another form)"),
-    ],
-)
-def test_named_effects_that_may_be_one_are_said_to(
-    sets: tuple[tuple[str, ...], ...], said: str
-) -> None:
-    known = {each[0]: dict.fromkeys(each, 0.0) for each in sets}
-    assert said in verdict_of(named_of(names=("warm_up", "lens"), sets=known))
-
-
-def test_a_cause_says_what_it_may_be_instead_and_an_error_in_the_form_of() -> None:
-    own = {"room_temperature": 1.0, "lens": 0.5, "warm_up": math.nan}
-    sets = {"warm_up": {"warm_up": 1.0}, "room_temperature": own}
-    named = named_of(names=("warm_up", "room_temperature"), sets=sets)
-    line = effect_line(named, "room_temperature")
-    assert "which these data cannot distinguish from lens (closes 50 % of what" in line
-    assert line.endswith("; it may be an error in the form of warm_up")
-    assert "error in the form" not in effect_line(named, "warm_up")
+def test_a_cause_says_what_may_be_there_in_its_place() -> None:
+    named = named_of(
+        names=("warm_up", "lens"),
+        sets={"warm_up": {"warm_up": 1.0}, "lens": {"lens": 0.7, "pixel": 0.25}},
+        probability_of_any=lambda *names: 0.97 if "lens" in names else 0.6,
+    )
+    line = effect_line(named, "lens")
+    assert "; these data cannot tell it (0.70) from pixel (0.25)" in line
+    assert line.endswith("; one of them is almost surely (probability 0.97) there")
+    assert effect_line(named, "warm_up").endswith("; it is probably (probability 0.60) there")
 
 
 @pytest.mark.parametrize("striped", [True, False])

@@ -81,8 +81,8 @@ def test_tables_count_what_is_said_and_what_intervals_hold() -> None:
         "names": [],
         "sets": [],
         "tested": True,
-        "p_value": 0.02,
-        "p_values": {"waves": 0.02},
+        "sizes_mm": {},
+        "probabilities": {"lens": 0.25, "any_time": 0.4},
         "intervals": {"before": [0.5, 1.0]},
         "before_all_alike_mm": 2.0,
         "held": {"before": True, "after": False, "closed": True},
@@ -90,7 +90,8 @@ def test_tables_count_what_is_said_and_what_intervals_hold() -> None:
     text = levels.tables([row, row | {"unknown": False}])
     assert "| all |  | 2 | 0.000 [0.000, 0.658] | 0.500 [0.095, 0.905] | 0.500" in text
     assert "| nothing | 2 | 1.000 [0.342, 1.000] | 0.000 [0.000, 0.658] | 1.000" in text
-    assert "| waves | 0.000 | 1.000 | 1.000" in text
+    assert "| 0.2 to 0.4 | 2 | 0.000 [0.000, 0.658] | 0.250 |" in text
+    assert "| Brier score | 2 | 0.0625 |" in text
     pair = row | {
         "kind": "pair",
         "names": ["lens", "backlash", "pixel"],

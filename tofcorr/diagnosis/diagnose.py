@@ -9,15 +9,14 @@ from typing import Any
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.effect_comparison import least_p_value
 from tofcorr.diagnosis.findings.gap import (
     gap_steps,
     judge_remainder,
     measure_gap,
-    name_in_two,
     resampled,
     stages_of,
 )
+from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.outliers import headline_of_given, refuse_impossible_gap
 from tofcorr.diagnosis.findings.shares import attribute, explained_squares, parts_of
 from tofcorr.diagnosis.given import GivenSimulator, Simulator, open_simulator
@@ -117,7 +116,7 @@ def conclude(
     begin("naming effects")
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = resampled(study.sums.num_units, options.bootstraps, generator)
-    named = name_in_two(study, resamples)
+    named = name_effects(study)
     given = None if simulator is None else simulator.options
     found = Evidence(study=study, named=named, given=given)
 
@@ -130,7 +129,7 @@ def conclude(
     shares = attribute(parts, gap, resamples)
     begin("judging what remains")
     stages = stages_of(study, named, gap, residual)
-    remainder = judge_remainder(study, named, gap, stages[-1])
+    remainder = judge_remainder(study, named, gap)
     detectable = minimum_detectable(study, named, options.seed + 2)
 
     closure = transfer = degraded = None
@@ -162,17 +161,14 @@ def conclude(
         shares=shares,
         warnings=tuple(warnings),
         detected=named.tested and (bool(named.names) or remainder.unknown),
-        p_value=least_p_value(study, named.first),
+        probability=named.anything,
         effects=named.names,
         cause_sets=named.cause_sets,
-        likeliest=named.likeliest,
-        refined_terms=named.refined_terms,
         tested=named.tested,
         gap=gap,
         gap_steps=tuple(gap_steps(study, named, gap, resamples)),
         remainder=remainder,
         outliers=prepared.outliers,
-        ranking=tuple(named.first.ordered()),
         missing=dict(study.candidates.missing),
         detectable=detectable,
         advice=tuple(next_recording(study, named)),

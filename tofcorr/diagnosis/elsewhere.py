@@ -21,7 +21,7 @@ from tofcorr.diagnosis.sums.base import (
     fit_base,
     supported_base,
 )
-from tofcorr.diagnosis.sums.gains import FittedMap
+from tofcorr.diagnosis.sums.maps import FittedMap
 from tofcorr.diagnosis.sums.observations import (
     TINY,
     Observations,

@@ -16,7 +16,7 @@ from tofcorr.diagnosis.sums.base import (
     filtered_inputs,
     fit_base,
 )
-from tofcorr.diagnosis.sums.gains import FittedMap
+from tofcorr.diagnosis.sums.maps import FittedMap
 from tofcorr.diagnosis.sums.observations import (
     Observations,
     effect_inputs,

@@ -2,30 +2,14 @@
 
 Each pose is predicted by a fit to all others. To first order a sum of such squares varies only by
 the poses that are drawn: the fit is where they are least. So nothing is fitted to a resample, whose
-few different poses would predict far worse; but the effects are selected again, or none where none
-is large enough. Poses differ in their noise, which is subtracted as it is there. A pose that alone
+few different poses would predict far worse; but a model is drawn again, by its probability there.
+Poses differ in their noise, which is subtracted as it is there. A pose that alone
 shows a range of distances or angles is missed by any amount: the model is not wrong there, but
 unknown.
 
-The tests behind `unknown` ask whether more remains than poses, noise and the target gap allow. Each
-has a null hypothesis of its own; a weighted Bonferroni correction joins them. Four of them ask
-whether anything remains. With nothing missing their p-values are uniform, and they have nearly all
-of the level, so that the cause is then called unknown about as often as the level says. The others
-ask whether more remains than matters.
-
-What was shown to be smaller than half of the target gap is not unknown, however significant. Where
-effects are named, neither is what was not shown to be larger than matters: the forms of effects are
-never quite right.
-
-Effects are named a second time where a gap is certain and no single effect was significant. With
-few poses a test of twenty effects has little power: a cause must be far beyond what each of them
-reaches by chance. That guards against a name where nothing is missing. The tests behind `unknown`
-ask the same of the recording as a whole, at the same level. Where they find that something is
-missing, nothing is left to guard against, and an effect need be significant by itself only (a
-gatekeeping procedure; Dmitrienko, Offen and Westfall 2003).
+What was shown to be smaller than half of the target gap is not unknown, however probable.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -34,23 +18,16 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import (
-    NORMAL_95,
-    compare_effects,
-    held_out_squares,
-    least_p_value,
-)
-from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.probability import Model
 from tofcorr.diagnosis.findings.structure import (
     Coherence,
     NoiseFloor,
     coherence,
     noise_floor,
-    unlike_waves,
 )
 from tofcorr.diagnosis.findings.where import (
     Estimated,
-    Region,
     Stage,
     binned_covariates,
     find_where,
@@ -205,13 +182,12 @@ def squared_gaps(
     """
     before = _squared_gap(study, study.left_out_squares(()), floor.size, resamples)
     after = before.clone()
-    if named.adds_something:
-        rivals = _rivals(named)
-        chosen = [_chosen_again(named, rivals, weights) for weights in resamples]
-        for names in dict.fromkeys(chosen):
-            own = torch.tensor([each == names for each in chosen])
-            squares = named.study.left_out_squares(names)
+    if named.names:
+        for model, own in _drawn_again(named, resamples).items():
+            squares = _left_by(study, named, model)
             after[own] = _squared_gap(study, squares, floor.size, resamples[own])
+        # A model that predicts worse than none would not be taken.
+        after = torch.minimum(after, before)
     random, most = np.random.default_rng(study.options.seed), floor.size**2
     excess = floor.error * random.standard_normal(len(before))
     excess += min(floor.structure, most) * random.uniform(-1, 1, len(before)).clip(min=0)
@@ -232,34 +208,30 @@ def _squared_gap(study: Study, squares: Tensor, floor: float, resamples: Tensor)
     return studentised(left, study.sums.count, resamples)
 
 
-def _rivals(named: NamedEffects) -> list[dict[str, Tensor]]:
-    """Return what each named effect and its cause set close in its place, (U,) each."""
-    rivals = []
-    for name, members in named.sets.items():
-        if name in named.columns:
-            others = [other for other in named.columns if other != name]
-            tests = compare_effects(named.study, others, flips=False, maps=False).tests
-            rivals.append({n: test.closed for n, test in tests.items() if n in members})
-    return rivals
+def _drawn_again(named: NamedEffects, resamples: Tensor) -> dict[Model, Tensor]:
+    """Draw a model for each resample, by the probabilities that its poses give; probes left out.
 
-
-def _chosen_again(
-    named: NamedEffects, rivals: Sequence[dict[str, Tensor]], weights: Tensor
-) -> tuple[str, ...]:
-    """Select for each named effect the member of its cause set that closes most in a resample.
-
-    None is selected where none closes what an effect must close to be named.
+    Returns:
+        The resamples of each model, shape (B,), bool.
     """
-    chosen = [name for name in named.columns if name in named.refined_terms]
-    tests, count = named.study.options.tests, named.study.sums.count
-    size = tests.material_mm if len(named.names) == 1 else tests.further_mm
-    least = (size / 1000) ** 2 * float(weights @ count)
-    for gains in rivals:
-        left = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
-        best = max(left, key=lambda n: left[n])
-        if left[best] >= least:
-            chosen.append(best)
-    return tuple(chosen)
+    generator = torch.Generator().manual_seed(named.study.options.seed + 5)
+    probability = named.models.posterior(resamples, generator).T
+    drawn = torch.multinomial(probability, 1, generator=generator)[:, 0]
+    own = [
+        tuple(name for name in named.models.models[number] if name not in named.models.probes)
+        for number in drawn.tolist()
+    ]
+    return {model: torch.tensor([each == model for each in own]) for model in dict.fromkeys(own)}
+
+
+def _left_by(study: Study, named: NamedEffects, model: Model) -> Tensor:
+    """Return what a model leaves of each pose, predicted by all others, shape (U,), m^2.
+
+    A map is taken where it is the one named; another one would have to be fitted again.
+    """
+    columns = named.columns_of(model)
+    own = named.study if not named.maps.keys().isdisjoint(model) else study
+    return own.left_out_squares(columns)
 
 
 def gap_steps(
@@ -296,7 +268,7 @@ def stages_of(
         as_given = find_where(study, "as_given", residual=residual, binned=binned)
     recalibrated = find_where(study, "recalibrated", binned=binned)
     with_effects = replace(recalibrated, name="with_effects")
-    if named.adds_something:
+    if named.names:
         with_effects = find_where(named.study, "with_effects", named.columns, binned=binned)
     return (
         replace(as_given, gap=gap.as_given),
@@ -310,10 +282,6 @@ class OpenSet:
     """What remains after the named effects.
 
     Class attributes:
-        weights: What each test has of the level. Chosen: nearly all for those that are uniform with
-            nothing missing; the others reject then almost never, and otherwise by far. Of 299
-            draws, p-values are multiples of 1/300: the shares of 5 % are four, one and five of
-            these.
         least_poses: With fewer poses nothing is called unknown. Two of the tests take standard
             errors over poses as known: of 60 recordings with four to seven poses and nothing
             missing seven would be.
@@ -323,8 +291,6 @@ class OpenSet:
         least_variance: Least variance that others are divided by, m^2: a micrometre squared.
             Chosen, below any noise.
         half_size: Size of an unknown gap at which the score is a half, metres. Chosen.
-        least_structure: The right causes leave little structure inside images: at most a third of
-            what there was before, and this size, metres. Chosen.
 
     Attributes:
         unknown: Whether a gap remains that no effect explains.
@@ -332,32 +298,18 @@ class OpenSet:
         after: Structure of the residual with the named effects.
         remaining_share: Squared structure after over before.
         fingerprint: What the remainder looks like: clauses that follow "It".
-        p_value: Probability of such a remainder if none is larger than what does not matter.
-        p_values: Of each test by itself.
     """
 
-    weights: ClassVar[Mapping[str, float]] = {
-        "probes": 0.27,
-        "effects": 0.08,
-        "covariates": 0.34,
-        "waves": 0.28,
-        "structure": 0.01,
-        "poses": 0.01,
-        "size": 0.01,
-    }
     least_poses: ClassVar[int] = 8
     most_scatter: ClassVar[float] = 0.003
     least_variance: ClassVar[float] = 1e-12
     half_size: ClassVar[float] = 0.0007
-    least_structure: ClassVar[float] = 0.0003
 
     unknown: bool
     score: float
     after: Coherence
     remaining_share: float
     fingerprint: tuple[str, ...]
-    p_value: float
-    p_values: Mapping[str, float]
 
     @property
     def scatter(self) -> float:
@@ -365,56 +317,49 @@ class OpenSet:
         return max(self.after.between, 0.0) ** 0.5
 
 
-def judge_remainder(
-    study: Study, named: NamedEffects, gap: Gap, where: Stage | None = None
-) -> OpenSet:
-    """Test whether more remains than poses, noise and the target gap allow.
+def judge_remainder(study: Study, named: NamedEffects, gap: Gap) -> OpenSet:
+    """Judge whether something remains that no effect of the catalogue explains.
+
+    It does where something in no catalogue is probable and may be larger than half of the target
+    gap; where what remains is larger than poses and target together, and much of what there was;
+    and where poses scatter by more than was stated.
 
     Args:
         study: The recording, before any effect was named.
         named: The effects named.
         gap: Before and after them.
-        where: Bias of what they leave along all covariates; None: it is computed.
     """
-    options, tiny = study.options, OpenSet.least_variance
+    options, tiny, poses = study.options, OpenSet.least_variance, study.sums.num_units
     theta, system = named.study.sums.ols.solve(named.with_probes), named.study.system
     known = len(system.sums.layout.of(named.columns))
     left = system.residual - system.times(named.columns, theta[:known])
     after = coherence(named.study, left)
-    allowed = allowed_scatter(study, after)
-    p_values = unknown_p_values(study, named, gap, after, where)
-    p_value = joined(p_values)
+    allowed, target = allowed_scatter(study, after), options.target_gap_mm / 1000
 
-    def size(structure: Coherence) -> float:
-        """Return the variance of significant structure beyond the repeatability of poses, m^2."""
-        clear = structure.within > 3 * structure.within_error  # The usual convention.
-        inside = max(structure.within, 0.0) if clear else 0.0
-        return inside + max(structure.between - allowed, 0.0)
+    def beyond_poses(size: float, structure: Coherence) -> float:
+        """Return the square of a gap without the pose variance that is no gap, m^2."""
+        return max(size**2 - float(np.clip(structure.between, 0.0, allowed)), 0.0)
 
-    share = float(np.clip(size(after) / max(size(gap.structure), tiny), 0.0, 1.0))
-    half = OpenSet.half_size**2
-    score = share * size(after) / (size(after) + half)
-    if named.probes:
-        without, probed, before = (
-            float(held_out_squares(own, names).sum() / study.sums.count.sum())
-            for own, names in (
-                (named.study, named.columns),
-                (named.study, named.with_probes),
-                (study, ()),
-            )
-        )
-        whole = max(before - study.fit.floor**2, before - probed, tiny)
-        closed = max(without - probed, 0.0)
-        score = max(score, min(closed / whole, 1.0) * closed / (closed + half))
-    enough = named.tested and study.sums.num_units >= OpenSet.least_poses
+    remains, most = (beyond_poses(own, after) for own in (gap.after, gap.after.interval[1]))
+    # A hundredth of the level: with nothing missing it hardly ever rejects.
+    spread = float(np.std(np.square(gap.after.draws)))
+    chance = special.ndtr(-(remains - target**2) / max(spread, tiny))
+    large = chance <= options.tests.level / 100
+    share = remains / max(beyond_poses(gap.before, gap.structure), tiny)
+    scattered = False
+    if options.pose_repeatability_mm != "auto":
+        chance = special.chdtrc(poses, poses * max(after.between, 0.0) / max(allowed, tiny))
+        scattered = chance <= options.tests.level
+    unknown = named.unknown > options.tests.named_from and most > (target / 2) ** 2
+    unknown |= scattered or (large and share > options.unknown_share)
+    enough = named.tested and poses >= OpenSet.least_poses
+    size = remains / (remains + OpenSet.half_size**2)
     return OpenSet(
-        unknown=enough and p_value <= options.tests.level,
-        score=score,
+        unknown=bool(unknown and enough),
+        score=max(named.unknown, min(share, 1.0)) * size,
         after=after,
-        remaining_share=share,
+        remaining_share=min(share, 1.0),
         fingerprint=tuple(_fingerprint(named, left, after)),
-        p_value=p_value,
-        p_values=p_values,
     )
 
 
@@ -429,92 +374,6 @@ def allowed_scatter(study: Study, after: Coherence) -> float:
     share = study.fit.share
     arm = float((share * columns[:, 3:].square().sum(1)).sum() / share.sum())
     return min(max(after.between, 0.0), OpenSet.most_scatter**2 * (1 + arm))
-
-
-def unknown_p_values(
-    study: Study, named: NamedEffects, gap: Gap, after: Coherence, where: Stage | None = None
-) -> dict[str, float]:
-    """Return the p-value of each test, by name.
-
-    - probes: one belongs to the model, or is significant where nothing is named;
-    - effects: nothing is named, yet one is significant: it explains too little of what remains;
-    - covariates: some of them show a bias;
-    - waves: slow waves over the image have unlike energies;
-    - structure: more is left within images than matters, or than right causes leave (normal);
-    - poses: they scatter more than they may (chi-squared);
-    - size: more remains than target and poses together, and much of what there was (normal).
-
-    Args:
-        study: The recording, before any effect was named.
-        named: The effects named.
-        gap: Before and after them.
-        after: Structure of what they leave.
-        where: Bias of that along all covariates; None: it is computed.
-    """
-    options, tiny, poses = study.options, OpenSet.least_variance, study.sums.num_units
-    # A part of the gap matters from half of the target on: enough where effects are named.
-    half = options.target_gap_mm / 2000
-    target, least = (half, half) if named.names else (2 * half, 0.0)
-    allowed = scatter = allowed_scatter(study, after)
-    if options.pose_repeatability_mm != "auto" and not named.names:
-        scatter += target**2
-
-    def beyond_poses(size: float, structure: Coherence) -> float:
-        """Return the square of a gap without the pose variance that is no gap, m^2."""
-        return max(size**2 - float(np.clip(structure.between, 0.0, allowed)), 0.0)
-
-    def within(size: float) -> float:
-        """Return the square of the structure within images that matters, m^2."""
-        right = max(gap.structure.within / 3, OpenSet.least_structure**2)
-        return min(size**2, right) if named.names else size**2
-
-    left, before = beyond_poses(gap.after, after), beyond_poses(gap.before, gap.structure)
-    spread = float(np.std(np.square(gap.after.draws)))
-    p_values = dict.fromkeys(OpenSet.weights, 1.0) | {
-        "structure": special.ndtr(-(after.within - within(target)) / max(after.within_error, tiny)),
-        "poses": special.chdtrc(poses, poses * max(after.between, 0.0) / max(scatter, tiny)),
-    }
-    if left > options.unknown_share * before:
-        p_values["size"] = special.ndtr(-(left - target**2) / max(spread, tiny))
-    if beyond_poses(gap.after.interval[1], after) > half**2:
-        found = list(named.probes.values())
-        if not named.names and named.last.probes:
-            alone = replace(named.last, tests={})
-            best = max(alone.probes.values(), key=lambda test: test.score)
-            found.append(alone.family_p_value(best.name))
-        p_values["probes"] = min(found, default=1.0)
-        if not named.names and left > half**2:
-            p_values["effects"] = least_p_value(named.study, named.last, probes=False)
-        waves = unlike_waves(named.study, named.columns)
-        p_values["waves"] = waves.p_value if waves.square > within(least) else 1.0
-        where = where or find_where(named.study, "with_effects", named.columns)
-        p_values["covariates"] = bias_p_value(where.by_covariate(), least)
-    return {name: float(value) for name, value in p_values.items()}
-
-
-def joined(p_values: Mapping[str, float]) -> float:
-    """Return the p-value of all tests together (Bonferroni, weighted)."""
-    return min(1.0, *(value / OpenSet.weights[name] for name, value in p_values.items()))
-
-
-def bias_p_value(regions: Mapping[str, Sequence[Region]], target: float) -> float:
-    """Return the p-value of a bias along some covariate that is larger than a target, metres.
-
-    Those of the regions are adjusted for their number. Their intervals are simultaneous, wider than
-    those of one.
-    """
-    found = [1.0]
-    for own in regions.values():
-        squares = [
-            one.bias**2 - ((one.bias.interval[1] - one.bias.interval[0]) / (4 * NORMAL_95)) ** 2
-            for one in own
-        ]
-        bins = [square for square, one in zip(squares, own, strict=True) if not one.trend]
-        # Of a line from end to end.
-        lines = [square / 12 for square, one in zip(squares, own, strict=True) if one.trend]
-        if max([*lines, float(np.mean(bins)) if bins else 0.0]) > target**2:
-            found.append(min(region.p_value for region in own))
-    return min(found)
 
 
 def _fingerprint(
@@ -561,17 +420,3 @@ def _lag_of_offsets(study: Study, left: Tensor, *, level: float = 0.01) -> float
         return None
     lag = float(centred[1:] @ centred[:-1]) / square
     return lag if 2 * special.ndtr(-abs(lag) * frames**0.5) < level else None
-
-
-def name_in_two(study: Study, resamples: Tensor) -> NamedEffects:
-    """Name effects; where none is and a gap is certain, name the one that explains most of it.
-
-    Args:
-        study: The recording.
-        resamples: How often each resample holds each pose, shape (B, U); for the gap.
-    """
-    named = name_effects(study)
-    if named.names or not named.likeliest:
-        return named
-    remainder = judge_remainder(study, named, measure_gap(study, named, resamples))
-    return name_effects(study, certain=True) if remainder.unknown else named

@@ -1,82 +1,100 @@
-"""Names the missing effects: add one, try to swap, drop; say which others it could be."""
+"""Names the missing effects, with the probability of each and of something unknown.
 
-from collections.abc import Mapping, Sequence
+`probability` gives the probability of every set of effects. What is named is the most probable set;
+each of its effects stands with all those that may be there in its place.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import chain, combinations
+from functools import cached_property
 
+import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import (
-    EffectComparison,
-    EffectTest,
-    cause_set,
-    closed_square,
-    comparable,
-    compare_effects,
-    fits_too_badly,
-    held_out_squares,
-    one_cause,
-    pose_scatter_squares,
-    unexplained_squares,
-    vary_alike,
-)
-from tofcorr.diagnosis.sums.gains import FittedMap, HeldOutSquares
-from tofcorr.diagnosis.sums.observations import TINY
+from tofcorr.diagnosis.findings.probability import Evidence, Model, Models, Search
 from tofcorr.diagnosis.sums.study import (
     Study,
-    absent_forms,
     relinearised,
     with_poses_reestimated,
     without_map,
 )
 from tofcorr.simulation.effects import CATALOGUE
 
-# A score above this counts whatever the size is. Scores are standard deviations; chosen far above
-# what any of the few hundred sign flips reaches.
-_CLEAR_SCORE = 12.0
-
 
 @dataclass(frozen=True, kw_only=True)
 class NamedEffects:
-    """A model of named effects, while it grows and in the end, and what led to it.
+    """The effects named, and how probable everything is.
 
     Attributes:
-        study: The recording with the named maps subtracted, and the uncertainty of the poses
-            estimated with the model.
-        first: All effects as additions to the base model.
-        last: All others as additions to this model.
-        names: The effects named, in the order added.
-        refined_terms: Finer forms of base terms that were added to the model; too small to report.
-        probes: Probes in the model, which explain what no effect explains, and the p-value of each
-            when it was added.
-        maps: Value in each pixel of every named effect that has no columns, (M,) each, metres.
-        map_sets: The cause set of each of these, from when it was added.
-        order: All effects ever named; one that was dropped and comes back keeps its place.
-        rejected: Effects that lead back to an earlier model.
-        sets: For each named effect those that the data cannot distinguish from it, itself first,
-            and what each closes in its place over what it closes; NaN for another named effect,
-            where it may be an error in the form of that one.
-        likeliest: At most three effects that would close most of what remains, but are not
-            significant among so many; the likeliest first.
-        tested: Whether there were enough poses for a test.
-        certain: Whether other tests have found that something is missing, so that a first effect
-            is named which is not significant among so many.
+        study: The recording with the named map subtracted, the effects named linearised where they
+            are, and the uncertainty of the poses estimated beside them.
+        names: The effects named, the most probable first.
+        sets: For each of them those that may be there in its place, itself first, and the
+            probability of each there: they sum to at least `cover`.
+        models: The models that were tried.
+        probability: Of each of them, shape (N,).
+        maps: Values in each pixel of the named effect that has no columns, (M,), metres.
+        probes: What is in no catalogue, as far as it belongs to the most probable model.
+        closed: By how much each effect alone lowers the squares of held-out poses, (U,), m^2.
+        squares: What the base model leaves of all held-out poses, m^2.
+        tested: Whether there were enough poses.
     """
 
     study: Study
-    first: EffectComparison
-    last: EffectComparison
-    names: tuple[str, ...] = ()
-    refined_terms: tuple[str, ...] = ()
-    probes: Mapping[str, float] = field(default_factory=dict)
+    names: tuple[str, ...]
+    sets: Mapping[str, Mapping[str, float]]
+    models: Models
+    probability: Tensor
     maps: Mapping[str, Tensor] = field(default_factory=dict)
-    map_sets: Mapping[str, list[str]] = field(default_factory=dict)
-    order: tuple[str, ...] = ()
-    rejected: frozenset[str] = frozenset()
-    sets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    likeliest: tuple[str, ...] = ()
+    probes: tuple[str, ...] = ()
+    closed: Mapping[str, Tensor] = field(default_factory=dict)
+    squares: float = 0.0
     tested: bool = True
-    certain: bool = False
+
+    @cached_property
+    def probabilities(self) -> dict[str, float]:
+        """The probability of each effect and probe that some model has, the highest first."""
+        found: dict[str, float] = {}
+        for model, probability in zip(self.models.models, self.probability.tolist(), strict=True):
+            for name in model:
+                found[name] = found.get(name, 0.0) + probability
+        return dict(sorted(found.items(), key=lambda one: -one[1]))
+
+    def probability_of_any(self, *names: str) -> float:
+        """Return the probability that at least one of some effects and probes is there."""
+        own = [not set(names).isdisjoint(model) for model in self.models.models]
+        return float(self.probability[torch.tensor(own)].sum())
+
+    @property
+    def anything(self) -> float:
+        """The probability that anything is missing."""
+        return 1.0 - float(self.probability[self.models.models.index(())])
+
+    @property
+    def unknown(self) -> float:
+        """The probability that something is missing that is in no catalogue."""
+        return self.probability_of_any(*self.models.probes)
+
+    @property
+    def ranking(self) -> list[str]:
+        """Every effect tested, the most probable first, then by what each closes alone."""
+        known = self.probabilities
+
+        def order(name: str) -> tuple[float, float]:
+            return -round(known.get(name, 0.0), 2), -float(self.closed[name].sum())
+
+        return sorted(self.closed, key=order)
+
+    def closed_gap(self, name: str) -> tuple[float, float]:
+        """Return by how much an effect alone lowers the gap, metres, and its share of the square.
+
+        Where it makes predictions worse, the first number is negative.
+        """
+        count = float(self.study.sums.count.sum())
+        before = max(self.squares / count - self.study.fit.floor**2, 0.0)
+        closed = float(self.closed[name].sum()) / count
+        share = min(max(closed / before, 0.0), 1.0) if before > 0 else 0.0
+        return before**0.5 - max(before - closed, 0.0) ** 0.5, share
 
     @property
     def cause_sets(self) -> tuple[tuple[str, ...], ...]:
@@ -84,416 +102,136 @@ class NamedEffects:
         return tuple(map(tuple, self.sets.values()))
 
     @property
-    def adds_something(self) -> bool:
-        """Whether a simulator with the findings differs from one without."""
-        return bool(self.names or self.refined_terms)
-
-    @property
-    def gap(self) -> float:
-        """Squared gap of the base model, m^2."""
-        square = float(self.first.squares.sum() / self.study.sums.count.sum())
-        return square - self.study.fit.floor**2
-
-    @property
     def columns(self) -> tuple[str, ...]:
-        """Effects of the model that have columns, refined base terms included."""
-        effects = self.study.candidates.effects
-        return tuple(name for name in (*self.names, *self.refined_terms) if name in effects)
+        """The effects named that have columns."""
+        return self.columns_of(self.names)
 
     @property
     def with_probes(self) -> tuple[str, ...]:
-        """All of the model that has columns, probes included."""
+        """The columns of the model: those of the effects named, then of probes."""
         return (*self.columns, *self.probes)
 
-    def without(self, name: str | None) -> list[str]:
-        """Return all columns but those of one effect."""
-        return [other for other in self.with_probes if other != name]
-
-    def naming(self, effect: str, instead_of: str | None = None) -> "NamedEffects":
-        """Return the model with an effect under its name."""
-        order, place = list(self.order), len(self.order)
-        if instead_of is not None:
-            place = order.index(instead_of) + 1
-        if effect not in order:
-            order.insert(place, effect)
-        names = {*self.names, effect} - {instead_of}
-        return replace(
-            self,
-            names=tuple(name for name in order if name in names),
-            order=tuple(order),
-            refined_terms=tuple(name for name in self.refined_terms if name != effect),
-        )
+    def columns_of(self, model: Model) -> tuple[str, ...]:
+        """Return the effects of a model that have columns, probes left out."""
+        return tuple(name for name in model if name in self.study.candidates.effects)
 
 
-def name_effects(study: Study, *, certain: bool = False, most_steps: int = 12) -> NamedEffects:
-    """Name effects until none is both significant and large enough to report.
+def name_effects(study: Study) -> NamedEffects:
+    """Name the effects of the most probable set, unless nothing may be missing.
+
+    The search is done twice: what poses scatter, and how an effect that is not linear looks, is
+    known only beside the effects that are there. The first one asks for half of the evidence: an
+    effect that is there but not in the model would pass for scatter of the poses.
 
     Args:
         study: The recording.
-        certain: Whether other tests have found that something is missing. A first effect that
-            explains most of the gap need then be significant by itself only.
-        most_steps: At most so many additions; a bound on the time, never reached in practice.
     """
-    tests, final, first = study.options.tests, study, compare_effects(study, ())
+    options, probes, tests = study.options, study.candidates.probes, study.options.tests
     tested = study.sums.num_units >= tests.least_images
-    model = NamedEffects(study=study, first=first, last=first, tested=tested, certain=certain)
-    compared, seen = [first], [_members(model)]
-    for _ in range(most_steps if tested else 0):
-        if len(model.names) >= tests.most_effects:
-            break
-        name, larger = _with_next(model)
-        if name is None:
-            break
-        if _members(larger) in seen:
-            # Two effects would otherwise drop one another in turn.
-            model = replace(model, rejected=model.rejected | {name})
-            continue
-        final = relinearised(larger.study, larger.with_probes)
-        model = replace(larger, last=compare_effects(final, larger.with_probes))
-        compared.append(model.last)
-        seen.append(_members(model))
-    return replace(
-        model,
-        study=final,
-        sets=final_sets(model, compared),
-        likeliest=likeliest(study, model.last),
-        certain=certain and model.names != (),
+    evidence = Evidence(study)
+    model, _ = Search(evidence, tests.odds**0.5, tests.most_effects).models(probes).best()
+    if model:
+        study = _beside(study, model, evidence)
+        evidence = Evidence(study, [name for name in model if name in study.sums.layout.effects])
+    models = Search(evidence, tests.odds, tests.most_effects).models(probes)
+    generator = torch.Generator().manual_seed(options.seed + 4)
+    shape = options.bootstraps, study.sums.num_units
+    weights = torch.empty(shape).exponential_(generator=generator).double()
+    weights *= shape[1] / weights.sum(1, keepdim=True)
+    probability = models.posterior(weights, generator).mean(1)
+    joint = _without_probes(models, probability)
+    chosen = max(joint, key=lambda one: joint[one])
+    least_probable = tests.named_from
+    if tested and 1.0 - joint[()] > least_probable:
+        chosen = max((one for one in joint if one), key=lambda one: joint[one])
+    base = study.left_out_squares(())
+    large = _large_enough(study, evidence, models.sizes_of(chosen)) if tested else ()
+    named = NamedEffects(
+        study=study,
+        names=(),
+        sets={},
+        models=models,
+        probability=probability,
+        probes=tuple(name for name in models.best()[0] if name in probes),
+        closed={
+            name: base - evidence.left_out_squares((name,))
+            for name in (*study.candidates.effects, *evidence.maps)
+        },
+        squares=float(base.sum()),
+        tested=tested,
     )
+    order = named.probabilities
+    sets = {
+        name: _in_place_of(name, chosen, joint, tests.cover)
+        for name in sorted(large, key=lambda name: -order[name])
+    }
+    names = tuple(n for n, s in sets.items() if named.probability_of_any(*s) > least_probable)
+    sets = {name: sets[name] for name in names}
+    maps = {name: evidence.maps[name].values for name in names if name in evidence.maps}
+    for name, values in maps.items():
+        spent = {name, *study.candidates.maps[name].contains}
+        study = without_map(study, values, spent)
+    study = with_poses_reestimated(study, named.columns_of(names))
+    return replace(named, study=study, names=names, maps=maps, sets=sets)
 
 
-def _members(model: NamedEffects) -> tuple[set[str], ...]:
-    return set(model.names), set(model.refined_terms), set(model.probes)
+def _beside(study: Study, model: Model, evidence: Evidence) -> Study:
+    """Return the study with a model's effects linearised, and poses as certain as beside them."""
+    columns = [name for name in model if name in study.sums.layout.effects]
+    without = next((evidence.without(name) for name in model if name in evidence.maps), study)
+    sums = with_poses_reestimated(without, columns).sums
+    known = replace(study.sums, dispersion=sums.dispersion, pose_sd=sums.pose_sd)
+    return relinearised(replace(study, system=replace(study.system, sums=known)), columns)
 
 
-def _with_next(model: NamedEffects) -> tuple[str | None, NamedEffects]:
-    """Return the effect or probe to add, and the model with it; None: there is none to add."""
-    name, study = probe_to_add(model), model.study
-    if name is not None:
-        larger = replace(model, probes={**model.probes, name: model.last.family_p_value(name)})
-    else:
-        found = next_effect(model)
-        if found is None:
-            return None, model
-        name, report = found
-        larger = replace(model, refined_terms=(*model.refined_terms, name))
-        if report:
-            larger = model.naming(name)
-        if name in study.candidates.maps:
-            tests, effect = study.options.tests, study.candidates.maps[name]
-            members = cause_set(model.last, name, tests.level, tests.set_share)
-            fitted = FittedMap(study, effect, study.system.residual_of(model.with_probes, gls=True))
-            larger = replace(
-                larger,
-                map_sets={**model.map_sets, name: members},
-                maps={**model.maps, name: fitted.values},
-                study=without_map(study, fitted.values, {name, *effect.contains}),
-            )
-    larger = _reestimated(larger)
-    return name, refined(larger) if len(larger.with_probes) > 1 else larger
+def _without_probes(models: Models, probability: Tensor) -> dict[Model, float]:
+    """Return the probability of each set of effects, whatever else may be there."""
+    joint: dict[Model, float] = {}
+    for model, own in zip(models.models, probability.tolist(), strict=True):
+        effects = tuple(name for name in model if name not in models.probes)
+        joint[effects] = joint.get(effects, 0.0) + own
+    return joint
 
 
-def _reestimated(model: NamedEffects) -> NamedEffects:
-    return replace(model, study=with_poses_reestimated(model.study, model.with_probes))
+def _large_enough(study: Study, evidence: Evidence, sizes: Mapping[str, float]) -> list[str]:
+    """Return the effects of a model that add enough to be named.
+
+    The largest must add `material_mm`, each further one `further_mm`, and one that is a finer form
+    of a base term `form_tolerance_mm`: what a polynomial misses of a curve is rarely news.
+    """
+    tests, added = study.options.tests, evidence.added(sizes)
+    effects = {name: own for name, own in added.items() if name in CATALOGUE}
+
+    def least(name: str) -> float:
+        largest = effects[name] == max(effects.values())
+        refines = not study.fit.model.groups.isdisjoint(CATALOGUE[name].refines)
+        size = study.material_mm if largest else tests.further_mm
+        return max(size, tests.form_tolerance_mm if refines else 0.0) / 1000
+
+    return [name for name, own in effects.items() if own >= least(name)]
 
 
-def probe_to_add(model: NamedEffects) -> str | None:
-    """Return a probe that explains what no effect explains; None: there is none."""
-    tests, comparison = model.study.options.tests, model.last
-    least = max((tests.unknown_mm / 1000) ** 2, tests.material_share * model.gap)
-    best = max((test.total for test in comparison.tests.values()), default=0.0)
-    for test in sorted(comparison.probes.values(), key=lambda test: -test.total):
-        if test.total <= max(best, 0.0) or test.name in model.rejected:
-            continue
-        if comparison.family_p_value(test.name) > tests.level:
-            continue
-        if closed_square(model.study, test) < least and test.score < _CLEAR_SCORE:
-            continue
-        members = cause_set(comparison, test.name, tests.level, tests.set_share)
-        # A map of single pixels can also take any smooth shape, so maps are no rivals of probes;
-        # nor is an effect that is as likely but explains little of what the probe does.
-        rivals = comparison.tests.keys() & set(members) - model.study.candidates.maps.keys()
-        if all(comparison.tests[name].total <= 0.5 * test.total for name in rivals):
-            return test.name
-    return None
-
-
-def next_effect(model: NamedEffects, *, least_of_rest: float = 0.1) -> tuple[str, bool] | None:
-    """Return the effect to add, and whether under its name, not as a base term; None: stop.
+def _in_place_of(
+    name: str, model: Model, joint: Mapping[Model, float], cover: float
+) -> dict[str, float]:
+    """Return the credible set of the effect that stands in the place of a named one.
 
     Args:
-        model: The model so far.
-        least_of_rest: An effect below the same score is named if it closes at least this share, in
-            squares, of what then stays unexplained. Chosen: a cause that is not in the catalogue
-            resembles some effect a little.
+        name: The effect named.
+        model: The most probable set of effects, it among them.
+        joint: The probability of each set of effects.
+        cover: Probability that the set holds, given the other effects.
     """
-    tests, comparison = model.study.options.tests, model.last
-    unexplained = unexplained_squares(model.study, comparison, at_least=True)
-    for test in comparison.ordered():
-        if test.total <= 0:
-            return None
-        rest = least_of_rest * (unexplained - test.total)
-        little = test.total <= rest and test.score < _CLEAR_SCORE
-        if little or test.name in model.rejected.union(model.names):
-            continue
-        significant = comparison.naming_p_value(test.name) <= tests.level
-        if not significant and not _explains_gap(model, test):
-            continue
-        found = _to_add(model, test)
-        if found is not None and test.total > _closed_by_probes(model, test.name):
-            return found
-    return None
-
-
-def _to_add(model: NamedEffects, test: EffectTest) -> tuple[str, bool] | None:
-    """Return the effect to add where one is significant: it, or another of its cause set."""
-    tests, comparison = model.study.options.tests, model.last
-    closed = closed_square(model.study, test)
-    members = cause_set(comparison, test.name, tests.level, tests.set_share)
-    members = [name for name in members if name not in model.rejected]
-    absent = _absent_terms(model, test)
-    for name in members:
-        finer = CATALOGUE[name].refines and name not in (*absent, *model.refined_terms)
-        small = closed < (tests.form_tolerance_mm / 1000) ** 2
-        if finer and small and comparison.tests[name].p_value <= tests.level:
-            return name, False
-    if closed < least_closed(model, test.name):
-        return None
-    return (absent or [simplest(comparison, members, tests.level)])[0], True
-
-
-def _explains_gap(model: NamedEffects, test: EffectTest) -> bool:
-    """Return whether a first effect may be named where the gap as a whole is significant.
-
-    The correction for the number of effects guards against a name where nothing is missing. Where
-    that is excluded, an effect must be significant by itself, and close most of a gap that matters.
-    """
-    options, closed = model.study.options, closed_square(model.study, test)
-    large = closed >= max(0.5 * model.gap, (options.target_gap_mm / 1000) ** 2)
-    first = model.certain and not model.names
-    return first and large and test.p_value <= options.tests.level
-
-
-def _closed_by_probes(model: NamedEffects, name: str) -> float:
-    """Return what the probes of a model close that are no part of an effect, m^2.
-
-    They stand for a cause that is in no catalogue. Its form is known least of all, so it may leave
-    as much of itself as they explain: what an effect closes beside them, if it is no more, may be
-    that.
-    """
-    known = model.study.candidates.probes
-    probes = [probe for probe in model.probes if name not in known[probe].part_of]
-    if not probes:
-        return 0.0
-    without = [column for column in model.with_probes if column not in probes]
-    left, all_left = (held_out_squares(model.study, each) for each in (without, model.with_probes))
-    return float((left - all_left).sum())
-
-
-def least_closed(model: NamedEffects, name: str, *, share_of_form: float = 0.25) -> float:
-    """Return what an effect must close to be reported, m^2.
-
-    The first one must close a share of the gap. Beside others, a size in millimetres is enough;
-    but beside one that varies alike, an effect must close what no error in the form of that one
-    would.
-
-    Once a finer form of a base term is in the model, the tolerance for such forms applies: what
-    that form leaves can look like an effect that resembles it. It applies as well where the
-    simulator's error was fitted at other poses, to which that fit has another form error.
-
-    Args:
-        model: The model so far.
-        name: The effect.
-        share_of_form: An effect that varies like a named one closes more than this share of that
-            one's form error, in millimetres, or is not reported. Chosen: what a form misses is
-            rarely of the shape of a single other effect.
-    """
-    tests = model.study.options.tests
-    size, share = model.study.material_mm, tests.material_share
-    others = [other for other in model.names if other != name]
-    if others:
-        errors = (CATALOGUE[other].form_error for other in others if vary_alike(name, other))
-        size, share = tests.further_mm, (share_of_form * max(errors, default=0.0)) ** 2
-    if model.refined_terms:
-        size = tests.form_tolerance_mm
-    return max((size / 1000) ** 2, share * model.gap)
-
-
-def _absent_terms(model: NamedEffects, best: EffectTest, *, as_much: float = 0.6) -> list[str]:
-    """Return error terms that the base model lacks and that close nearly as much as the best.
-
-    Args:
-        model: The model so far.
-        best: The best effect.
-        as_much: Such a term is named first if it closes this share of what the best effect
-            closes. Chosen: every camera has these errors.
-    """
-    tests, least = model.last.tests, as_much * best.total
-    known = [name for name in absent_forms(model.study) if name in tests.keys() - model.rejected]
-    level = model.study.options.tests.level
-    large = [name for name in known if tests[name].total >= least]
-    return [name for name in large if model.last.family_p_value(name) <= level]
-
-
-def simplest(
-    comparison: EffectComparison, members: Sequence[str], level: float, *, equal_share: float = 0.02
-) -> str:
-    """Return the significant effect with the fewest columns among those that close equally much.
-
-    Args:
-        comparison: All effects.
-        members: The effects to choose from; the first one counts as significant.
-        level: Of significance.
-        equal_share: Of effects whose totals differ by less than this share of the best, the
-            simplest is named. Chosen.
-    """
-    others = [name for name in members[1:] if comparison.family_p_value(name) <= level]
-    significant = [comparison.tests[name] for name in (members[0], *others)]
-    least = (1 - equal_share) * max(test.total for test in significant)
-    equal = [test for test in significant if test.total >= least]
-    return min(equal, key=lambda test: (test.size, -test.total)).name
-
-
-def likeliest(study: Study, last: EffectComparison, *, most: int = 3) -> tuple[str, ...]:
-    """Return the effects that may explain what remains, by their score, the likeliest first.
-
-    Each closes at least the square of the target gap, and would be significant if it were the only
-    one tested.
-
-    Args:
-        study: The recording.
-        last: What could be added to the final model.
-        most: At most so many are listed. Chosen: what a reader can follow up.
-    """
-    least, level = (study.options.target_gap_mm / 1000) ** 2, study.options.tests.level
-    ordered = sorted(last.tests.values(), key=lambda test: -test.score)
-    large = (test for test in ordered if closed_square(study, test) >= least)
-    return tuple(test.name for test in large if test.p_value <= level)[:most]
-
-
-def refined(model: NamedEffects, *, swap_share: float = 0.05) -> NamedEffects:
-    """Swap named effects for better ones; drop small ones; report refined terms grown large.
-
-    Args:
-        model: The model.
-        swap_share: An effect is swapped for another that closes more by at least this share of the
-            other's. Chosen, so that noise swaps nothing.
-    """
-    before = model
-    for name in [*before.names, *before.refined_terms]:
-        if name not in model.study.candidates.effects:
-            continue
-        comparison = compare_effects(model.study, model.without(name), flips=False, maps=False)
-        own, best = comparison.tests[name], comparison.ordered()[0]
-        small = closed_square(model.study, own) < least_closed(model, name)
-        if name in before.refined_terms:
-            if not small and _significant(model, name, instead_of=name):
-                model = model.naming(name)
-            continue
-        better = best.name != name and own.total < (1 - swap_share) * best.total
-        if better and _significant(model, best.name, instead_of=name):
-            model = model.naming(best.name, instead_of=name)
-        elif small:
-            model = replace(model, names=tuple(n for n in model.names if n != name))
-    return _reestimated(model) if model is not before else model
-
-
-def _significant(model: NamedEffects, name: str, *, instead_of: str) -> bool:
-    """Return whether an effect is significant in the model beside all others.
-
-    A refined term came into the model in the place of another effect, and an effect that is swapped
-    in was compared by size alone, so nothing has tested them yet.
-    """
-    others = compare_effects(model.study, model.without(instead_of), maps=False)
-    return others.family_p_value(name) <= model.study.options.tests.level
-
-
-def final_sets(
-    model: NamedEffects, compared: Sequence[EffectComparison]
-) -> dict[str, dict[str, float]]:
-    """Return the cause set of each named effect, as in `NamedEffects.sets`.
-
-    The cause of a significant gap is significant where it is added alone. Millimetres do not show
-    that where poses scatter: there an effect that does nothing may close as much as the named one
-    by chance. Each effect is judged as if it were the only one tested, so that few are missed.
-
-    Args:
-        model: The final model.
-        compared: Effects as additions to the base model, to every model since, and to the final
-            one, with null distributions.
-    """
-    level = model.study.options.tests.level
-    every = chain.from_iterable(comparison.tests.values() for comparison in compared)
-    possible = {test.name for test in every if test.p_value <= level}.union(model.names)
-    whole, sets = causes_of_several(model), {}
-    for name in model.names:
-        beside = compared[0]  # Beside a map all effects are additions to the base model.
-        if name not in model.map_sets:
-            beside = compare_effects(model.study, model.without(name), flips=False)
-        members = [*own_set(model, name, beside, compared[-1]), *whole[name]]
-        kept = [m for m in members if m in possible or m in CATALOGUE[name].may_be]
-        tests, own = beside.tests, max(beside.tests[name].total, TINY)
-        sets[name] = {
-            member: tests[member].total / own if member in tests else float("nan")
-            for member in (name, *kept)
-        }
-    return sets
-
-
-def own_set(
-    model: NamedEffects, name: str, beside: EffectComparison, last: EffectComparison
-) -> list[str]:
-    """Return what a named effect may be instead.
-
-    Args:
-        model: The final model.
-        name: The named effect.
-        beside: All effects as additions to the model without it.
-        last: All effects as additions to the model.
-    """
-    if name in model.map_sets:
-        return model.map_sets[name]
-    study, tests = model.study, model.study.options.tests
-    # What a form misses is left, or looks like scatter of the poses.
-    missed = unexplained_squares(study, last, at_least=True) + pose_scatter_squares(study)
-    unexplained = unexplained_squares(study, last)
-    gains = chi_squared(study, model.without(name)).closed
-    members = cause_set(beside, name, tests.level, tests.set_share, missed, unexplained, gains)
-    rivals = [member for member in members if member not in model.names]
-    return rivals + [one for one in CATALOGUE[name].may_be if one in (*beside.tests, *model.names)]
-
-
-def chi_squared(study: Study, chosen: Sequence[str]) -> HeldOutSquares:
-    """Return the chi-squared of held-out poses, by some effects of the model and by one more.
-
-    It knows that poses scatter, and so which part of what an effect closes is a shift of single
-    images, and which part has the effect's own shape within them.
-    """
-    return HeldOutSquares(study.sums.gls, chosen, study.folds)
-
-
-def causes_of_several(model: NamedEffects) -> dict[str, list[str]]:
-    """Return for each named effect the causes of which it and others may be parts."""
-    study, level = model.study, model.study.options.tests.level
-    found: dict[str, list[str]] = {name: [] for name in model.names}
-    named = [name for name in model.names if name in model.with_probes]
-    if len(named) <= 1:
-        return found
-    left = held_out_squares(study, model.with_probes)
-    whole = chi_squared(study, model.with_probes).squares
-    sizes = range(2, len(named) + 1)
-    for parts in chain.from_iterable(combinations(named, size) for size in sizes):
-        rest = [name for name in model.with_probes if name not in parts]
-        comparison = compare_effects(study, rest, flips=False, maps=False)
-        beside, known = chi_squared(study, rest), [comparison.tests[part] for part in parts]
-
-        def excluded(
-            test: EffectTest, beside: HeldOutSquares = beside, known: Sequence[EffectTest] = known
-        ) -> bool:
-            """Return whether an effect fits too badly to be the cause of several parts."""
-            gains, of_cause = beside.closed(test.name), beside.squares - whole
-            return comparable(test, *known) and fits_too_badly(test, gains, of_cause, level)
-
-        causes = one_cause(comparison, comparison.squares - left, level, excluded)
-        for part in parts:
-            found[part] += [cause for cause in causes if vary_alike(cause, part)]
-    return found
+    rest = {other for other in model if other != name}
+    rivals = {
+        next(iter(set(one) - rest)): own
+        for one, own in joint.items()
+        if len(one) == len(model) and rest < set(one)
+    }
+    total, members, held = sum(rivals.values()), {name: rivals[name]}, rivals[name]
+    for other in sorted(rivals.keys() - {name}, key=lambda one: -rivals[one]):
+        if held >= cover * total:
+            break
+        members[other] = rivals[other]
+        held += rivals[other]
+    return {member: own / total for member, own in members.items()}

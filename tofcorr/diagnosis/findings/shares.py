@@ -104,8 +104,6 @@ def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Sh
             name, end = _cause_of(term), start + len(term.symbols)
             members[name] = (*members.get(name, ()), *range(start, end))
             start = end
-        for name in named.refined_terms:
-            members[name] = (*members.get(name, ()), *places.get(name, ()))
         if study.pattern is not None:
             members.setdefault(study.pattern.name, ())
             offsets[study.pattern.name] = study.fit.residual - study.system.residual

@@ -17,10 +17,11 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
-from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
+from tofcorr.diagnosis.sums.linear_system import Sums
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects.inputs import is_clock
+from tofcorr.simulation.effects.numerics import by_frame
 
 Interval = tuple[float, float]
 StageName = Literal["as_given", "recalibrated", "with_effects"]
@@ -122,6 +123,22 @@ class Stage:
 Binned = tuple[str, tuple[float, ...], Tensor, Tensor]
 """Name of a covariate; edges of its bins, in its unit; bin of every pixel, shape (M,), int64; and
 the covariate scaled to a range from 0 to 1, shape (M,)."""
+
+
+def left_out_residual(study: Study, chosen: Sequence[str], sums: Sums) -> Tensor:
+    """Return residuals with the variance of the errors, shape (M,), metres.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        sums: Ordinary or generalised sums of every pose, by which the model is fitted.
+    """
+    parts, left = study.system.of(chosen), study.system.residual
+    theta = sums.left_out_solutions(chosen)[study.observations.unit][:, :, None]
+    of_parts = theta.split([part.shape[1] for part in parts], dim=1)
+    for part, own in zip(parts, of_parts, strict=True):
+        left = left - by_frame(part, own, study.observations.frame)[:, 0]
+    return left
 
 
 def binned_covariates(study: Study) -> list[Binned]:

@@ -1,14 +1,14 @@
 """What to record next, so that more can be concluded, and what would have been found."""
 
+import math
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import replace
-from statistics import NormalDist
 
 import torch
+from scipy import special
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, pose_columns, pose_sums
 from tofcorr.diagnosis.sums.noise import brightness_of
@@ -18,7 +18,7 @@ from tofcorr.diagnosis.sums.observations import (
     effect_inputs,
     predicted_distance,
 )
-from tofcorr.diagnosis.sums.study import Study, absorbed_share, left_over, signal
+from tofcorr.diagnosis.sums.study import Study, absorbed_share, hidden_effects, left_over, signal
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.inputs import is_clock
@@ -203,12 +203,11 @@ def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str
         seed: Of the random directions.
     """
     generator = torch.Generator().manual_seed(seed)
-    critical = named.first.critical_score(0.05)
     found: dict[str, float | None] = {}
-    for name, test in named.first.tests.items():
+    for name in named.closed:
         if name not in study.candidates.effects:  # A map of independent values.
-            least = max((critical + NORMAL_95) * test.spread, 1.0)
-            detectable = (least / float(study.weight.sum())) ** 0.5
+            needed = noncentrality(study, len(study.candidates.maps[name].coefficients))
+            detectable = (needed / float(study.weight.sum())) ** 0.5
             found[name] = max(detectable, study.material_mm * 1e-3)
             continue
         found[name] = None
@@ -216,26 +215,29 @@ def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str
             continue
         size = len(range(*study.sums.layout.effects[name]))
         drawn = torch.randn(64, size, generator=generator, dtype=torch.float64)
-        found[name] = _of_columns(study, test, critical, drawn)
+        found[name] = _of_columns(study, name, drawn)
     return found
 
 
-def noncentrality(test: EffectTest, critical: float, power: float = 0.8) -> float:
-    """Return the noncentrality that lifts the gain above its critical value.
+def noncentrality(study: Study, columns: int, power: float = 0.8) -> float:
+    """Return the noncentrality at which an effect is named.
+
+    The log predictive density of held-out poses rises by half of a noncentral chi-squared, less one
+    for each column; that must exceed the price of an effect.
 
     Args:
-        test: Of an effect, with its null distribution.
-        critical: The score that the gain must exceed.
+        study: The recording.
+        columns: Of the effect.
         power: In which share of cases. The usual choice in the design of experiments.
     """
-    quantile, level = NormalDist().inv_cdf(power), max(critical * test.spread, 1.0)
-    return (quantile + (quantile**2 + level) ** 0.5) ** 2
+    least = 2 * (columns - math.log(study.options.tests.odds))
+    return float(special.chndtrinc(least, columns, 1 - power))
 
 
-def _of_columns(study: Study, test: EffectTest, critical: float, drawn: Tensor) -> float:
+def _of_columns(study: Study, name: str, drawn: Tensor) -> float:
     """Return the median size of an effect that would be found, in directions (D, E), metres."""
     gls, ols = study.sums.gls, study.sums.ols
-    own = torch.arange(*ols.layout.effects[test.name])
+    own = torch.arange(*ols.layout.effects[name])
     members = torch.arange(study.fit.model.num_columns)
     plain = ols.total / (ols.scale * study.sums.count.sum())
     # So that the base model's system can be solved: four digits above the rounding of float64.
@@ -248,10 +250,8 @@ def _of_columns(study: Study, test: EffectTest, critical: float, drawn: Tensor) 
             left_over(plain, members, own, ridge),
         )
     )
-    detectable = (size / signal * noncentrality(test, critical)).sqrt()
-    tests = study.options.tests
-    least = tests.form_tolerance_mm if CATALOGUE[test.name].refines else study.material_mm
-    reportable = (size / remains).sqrt() * least * 1e-3
+    detectable = (size / signal * noncentrality(study, len(own))).sqrt()
+    reportable = (size / remains).sqrt() * study.material_mm * 1e-3
     return float(torch.maximum(detectable, reportable).median())
 
 
@@ -283,21 +283,16 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
     ]
 
 
-def _questions(study: Study, named: NamedEffects, *, absorbed: float = 0.97) -> list[Question]:
+def _questions(study: Study, named: NamedEffects) -> list[Question]:
     """Return the cause sets to be separated, then the effects that calibration absorbs.
 
     Three at most: what a person records in one go.
-
-    Args:
-        study: The recording.
-        named: The effects named.
-        absorbed: From this share on, that calibration absorbs, another recording is needed. Chosen.
     """
     effects = study.candidates.effects
     sets = [(own[0], own[1:]) for own in named.cause_sets if len(own) > 1]
-    hidden = [name for name in effects if absorbed_share(study, name) > absorbed]
     asked = [one for one in sets if effects.keys() >= {one[0], *one[1]}]
-    return [*asked, *((name, ()) for name in hidden if name not in named.names)][:3]
+    hidden = (name for name in hidden_effects(study) if name not in named.names)
+    return [*asked, *((name, ()) for name in hidden)][:3]
 
 
 def _advised(study: Study, named: NamedEffects, candidates: Candidates, question: Question) -> str:
@@ -336,7 +331,7 @@ def _advised(study: Study, named: NamedEffects, candidates: Candidates, question
     advice = f", record {number} more frames: {'; '.join(listed)}. It could then be detected"
     columns = len(total) - len(known)
     raw = signal(study, effect) / (columns * ols.scale * float(study.sums.count.sum()))
-    needed = noncentrality(named.first.tests[effect], named.first.critical_score(0.05))
+    needed = noncentrality(study, len(own))
     now, then = ((raw * needed / max(one, TINY)) ** 0.5 for one in (before, after))
     if before > 0 and now < 1:  # A metre is no error of a depth camera.
         advice += f" from {1e3 * then:.1f} mm on, instead of {1e3 * now:.1f} mm"

@@ -196,32 +196,26 @@ def pose_series(result: "DiagnosisResult") -> Figure:
 
 
 def effect_forest(result: "DiagnosisResult") -> Figure:
-    """Draw what each effect closes, with its interval, and its score."""
-    study, comparison = result.evidence.study, result.evidence.named.first
-    count = float(study.sums.count.sum())
-    tests = comparison.ordered()[::-1]
-    figure, (left, right) = panels(1 + len(tests) / 4, 1, 2, same_rows=True)
+    """Draw what each effect closes, with its interval, and the probability that it is there."""
+    study, found = result.evidence.study, result.evidence.named
+    count, names = float(study.sums.count.sum()), found.ranking[::-1]
+    figure, (left, right) = panels(1 + len(names) / 4, 1, 2, same_rows=True)
     alike = {member for members in result.cause_sets for member in members}
-    critical = comparison.critical_score(result.options.tests.level)
-    right.axvspan(-1e3, critical, color=GREY, alpha=FAINT, linewidth=0)
-    for place, test in enumerate(tests):
-        named = test.name in result.effects
-        colour = RED if named else BLUE if test.name in alike else GREY
-        closed = 1e6 * test.closed.numpy() / count * len(test.closed)
+    for place, name in enumerate(names):
+        colour = RED if name in result.effects else BLUE if name in alike else GREY
+        closed = 1e6 * found.closed[name].numpy() / count * len(found.closed[name])
         error = student_quantile(0.975, math.inf) * closed.std(ddof=1) / len(closed) ** 0.5
         left.errorbar(
             closed.mean(), place, xerr=error, fmt="o", capsize=2, markersize=4, color=colour
         )
-        right.plot(test.score, place, "o", markersize=4, color=colour)
+        right.barh(place, found.probabilities.get(name, 0.0), height=0.6, color=colour)
     line_across(left, vertical=True)
     left.set_xlabel("closes, mm² of the\nheld-out mean square")
-    right.set_xlabel("score: gain above chance,\nin standard deviations")
-    scores = [test.score for test in tests]
-    low, high = min(-3.0, *scores), max(critical + 2.0, *scores)
-    right.set_xlim(low - (high - low) / 25, high + (high - low) / 25)
-    left.set_yticks(range(len(tests)), [effect_words(study, test.name) for test in tests])
-    for label, test in zip(left.get_yticklabels(), tests, strict=True):
-        label.set_fontweight("bold" if test.name in result.effects else "normal")
+    right.set_xlabel("probability\nthat it is there")
+    right.set_xlim(0, 1)
+    left.set_yticks(range(len(names)), [effect_words(study, name) for name in names])
+    for label, name in zip(left.get_yticklabels(), names, strict=True):
+        label.set_fontweight("bold" if name in result.effects else "normal")
     return figure
 
 

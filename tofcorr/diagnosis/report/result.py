@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectTest, closed_gap
 from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.outliers import Outliers
-from tofcorr.diagnosis.findings.shares import Share
+from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
 from tofcorr.diagnosis.findings.where import Estimated, Stage
 from tofcorr.diagnosis.given import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -27,7 +26,6 @@ from tofcorr.diagnosis.report.words import (
     biases_of,
     cause_words,
     effect_words,
-    least_p,
     mm,
     p_words,
     percent,
@@ -38,7 +36,7 @@ from tofcorr.diagnosis.report.words import (
 )
 from tofcorr.diagnosis.rerun.checks import Closure, DegradedStage, Transfer
 from tofcorr.diagnosis.rerun.simulator import Evidence, FittedValue, sensor_of
-from tofcorr.diagnosis.sums.study import Study, absorbed_share
+from tofcorr.diagnosis.sums.study import Study, absorbed_share, hidden_effects
 from tofcorr.digits import decimals, known, known_interval
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.pairs import LEAST_P
@@ -68,18 +66,14 @@ class DiagnosisResult:
         warnings: What was unexpected about the recording, a sentence each.
         detected: Whether simulator and recording differ: an effect is named, or the cause is
             unknown.
-        p_value: The smallest of all effects that close enough to count; 1 if none does.
+        probability: That anything is missing.
         effects: The effects named, in the order added.
         cause_sets: For each of them those that the data cannot distinguish from it, itself first.
-        likeliest: Effects that may explain what remains but are not significant, at most three, the
-            likeliest first.
-        refined_terms: Base terms that a higher-order form was added to, too small to report.
         tested: Whether there were enough poses for a test; if not, effects are only ranked.
         gap: Before and after the effects.
         gap_steps: The gap after each named effect in turn, metres.
         remainder: Whether a gap of unknown cause remains, and what it looks like.
         outliers: Pixels that gap and effects do not describe.
-        ranking: Every tested effect as the first addition to the base model, the best first.
         missing: Untestable effects and their missing inputs.
         detectable: The smallest size of each effect that would have been found, metres; None: the
             effect is not identifiable.
@@ -103,17 +97,14 @@ class DiagnosisResult:
     shares: tuple[Share, ...]
     warnings: tuple[str, ...]
     detected: bool
-    p_value: float
+    probability: float
     effects: tuple[str, ...]
     cause_sets: tuple[tuple[str, ...], ...]
-    likeliest: tuple[str, ...]
-    refined_terms: tuple[str, ...]
     tested: bool
     gap: Gap
     gap_steps: tuple[tuple[str, Estimated], ...]
     remainder: OpenSet
     outliers: Outliers
-    ranking: tuple[EffectTest, ...]
     missing: dict[str, list[str]]
     detectable: dict[str, float | None]
     advice: tuple[str, ...]
@@ -199,13 +190,13 @@ def content_of(result: DiagnosisResult) -> dict[str, Any]:
     gap, remainder, named = result.gap, result.remainder, result.evidence.named
     outliers, transfer, closure = result.outliers, result.transfer, result.closure
     degraded = result.degraded
-    untested = {"closes_mm": None, "closed_fraction": None, "p_value": None, "aliases": []}
+    untested = {"closes_mm": None, "closed_fraction": None, "probability": None, "aliases": []}
     lengths = "before", "after", "floor", "between_images", "fixed_pattern", "within_images"
-    lists = "effects", "likeliest", "causes", "remarks", "warnings"
+    lists = "effects", "causes", "remarks", "warnings"
     trainings = "trained_on_sim", "trained_on_sim_with_effects", "trained_on_real"
     return {
         "format": "tofcorr-diagnosis",
-        "version": 2,
+        "version": 3,
         "simulator": result.simulator_kind,
         "stages": [
             {
@@ -220,6 +211,7 @@ def content_of(result: DiagnosisResult) -> dict[str, Any]:
             {"cause": one.cause, "kind": one.kind, "share": round(one.share, 4)}
             | {"ci": _rounded(one.share.interval)}
             | ({} if one.of_constant is None else {"of_constant": round(one.of_constant, 4)})
+            | ({"aliases": hidden_effects(result.evidence.study)} if one.cause == HAND_EYE else {})
             for one in result.shares
         ],
         "gap_mm": {
@@ -231,15 +223,15 @@ def content_of(result: DiagnosisResult) -> dict[str, Any]:
         },
         "parameter_gap_mm": {"as_given": _mm(gap.as_given), "refitted": _mm(gap.before)},
         "detected": result.detected,
-        "p_value": round(result.p_value, 5),
+        "probability": round(result.probability, 4),
         "cause_sets": [list(members) for members in result.cause_sets],
-        # What members close over what the first one closes.
-        "cause_sets_close": [
-            {name: round(share, 3) for name, share in own.items() if math.isfinite(share)}
-            for own in named.sets.values()
+        "set_probabilities": [round(named.probability_of_any(*s), 4) for s in result.cause_sets],
+        # Of each member to be the one there, given the other effects.
+        "cause_sets_shares": [
+            {name: round(share, 4) for name, share in own.items()} for own in named.sets.values()
         ],
         "unknown": remainder.unknown,
-        "unknown_p_value": round(remainder.p_value, 5),
+        "unknown_probability": round(named.unknown, 4),
         "outliers": {
             "deleted_share": round(outliers.deleted, 6),
             "reduced_share": round(outliers.reduced, 6),
@@ -247,7 +239,7 @@ def content_of(result: DiagnosisResult) -> dict[str, Any]:
             "map": [_rounded(row) for row in outliers.tiles.tolist()],
             "where": outliers.place,
         },
-        "ranking": [_ranked(result.evidence.study, named, test) for test in result.ranking]
+        "ranking": [_ranked(result.evidence.study, named, name) for name in named.ranking]
         + [
             {"effect": name, **untested, "available": False, "missing": missing}
             for name, missing in result.missing.items()
@@ -284,27 +276,25 @@ def content_of(result: DiagnosisResult) -> dict[str, Any]:
         "unknown_score": round(remainder.score, 4),
         "remaining_share": round(remainder.remaining_share, 4),
         "fingerprint": list(remainder.fingerprint),
-        "taken_up": list(result.refined_terms),
     }
 
 
-def _ranked(study: Study, named: NamedEffects, test: EffectTest) -> dict[str, Any]:
+def _ranked(study: Study, named: NamedEffects, name: str) -> dict[str, Any]:
     """Return the entry of a tested effect in `ranking`."""
-    closes, fraction = closed_gap(study, named.first, test)
-    members = next((own for own in named.cause_sets if test.name in own), ())
+    closes, fraction = named.closed_gap(name)
+    members = next((own for own in named.cause_sets if name in own), ())
     absorbed = None
-    if test.name in study.candidates.effects:
-        absorbed = round(absorbed_share(study, test.name), 3)
+    if name in study.candidates.effects:
+        absorbed = round(absorbed_share(study, name), 3)
     return {
-        "effect": test.name,
+        "effect": name,
         "closes_mm": _mm(closes),
         "closed_fraction": round(fraction, 4),
-        "p_value": round(named.first.naming_p_value(test.name), 5),
-        "aliases": [name for name in members if name != test.name],
+        "probability": round(named.probabilities.get(name, 0.0), 4),
+        "aliases": [other for other in members if other != name],
         "available": True,
         "missing": [],
-        "gain": round(test.gain, 2),
-        "score": round(test.score, 3),
+        "gain": round(named.models.gain_of(name), 2),
         "absorbed": absorbed,
     }
 
@@ -386,14 +376,14 @@ def render(result: DiagnosisResult) -> str:
         "share": share_words,
         "small": lambda share: abs(share) < SMALL,
         "negative": lambda share: share < 0 and percent(share) != "0 %",
-        "p": lambda p: "–" if p is None else p_words(p, least_p(result)).removeprefix("= "),
+        "probability": lambda p: "–" if p is None else f"{p:.2f}",
         "effect": partial(effect_words, study),
         "cause": partial(cause_words, study),
         "along": along,
         "p_of_draws": lambda p: p_words(p, LEAST_P),
         "with_digits": _with_digits,
     }
-    folder, tests = files("tofcorr.diagnosis.report"), named.first.tests
+    folder = files("tofcorr.diagnosis.report")
     template, style = (
         folder.joinpath(f"report.{n}").read_text("utf-8") for n in ("html.j2", "css")
     )
@@ -407,7 +397,7 @@ def render(result: DiagnosisResult) -> str:
         recording=study.observations.recording,
         shown=stages_shown(result),
         pose_errors=pose_errors(result),
-        closed={n: closed_gap(study, named.first, test)[1] for n, test in tests.items()},
+        closed={name: named.closed_gap(name)[1] for name in named.ranking},
         catalogue=CATALOGUE,
         pictures={name: Markup(svg_of(own)) for name, own in result.all_figures().items()},
         stage_words=STAGE_WORDS,
@@ -452,7 +442,8 @@ def write_events(result: DiagnosisResult, folder: Path | str) -> None:
     gap, known_stages = result.gap, [one for one in result.stages if one.gap is not None]
     numbers = {f"stage_mm/{stage.name}": 1e3 * (stage.gap or 0.0) for stage in known_stages}
     numbers |= {f"gap_mm/{part}": 1e3 * getattr(gap, part) for part in ("before", "after", "floor")}
-    numbers |= {f"score/{entry.name}": entry.score for entry in result.ranking}
+    named = result.evidence.named
+    numbers |= {f"probability/{name}": own for name, own in named.probabilities.items()}
     numbers |= {f"share/{cause.cause}": cause.share for cause in result.shares}
     curves: dict[str, list[float]] = {}
     for stage in stages_shown(result):

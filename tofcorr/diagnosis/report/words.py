@@ -13,7 +13,7 @@ from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
 from tofcorr.diagnosis.findings.where import Estimated, Interval, Region, Stage
 from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.observations import TINY
-from tofcorr.diagnosis.sums.study import Study, absorbed_share
+from tofcorr.diagnosis.sums.study import Study, absorbed_share, hidden_effects
 from tofcorr.digits import known, known_interval
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
@@ -86,7 +86,7 @@ def stages_shown(result: "DiagnosisResult", *, fitted: bool = False) -> list[Sta
         result: What was found.
         fitted: Whether only those from recalibration on are wanted.
     """
-    stages = result.stages if result.effects or result.refined_terms else result.stages[:2]
+    stages = result.stages if result.effects else result.stages[:2]
     return [stage for stage in stages[fitted:] if stage.gap is not None]
 
 
@@ -171,47 +171,48 @@ def _without_causes(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     said = (
         (remainder.unknown and gap.as_given is not None, "No parameter and no effect explains it."),
         (remainder.unknown, f"None of the effects tested explains it{_nearest(named)}."),
-        (named.likeliest, "No cause of it is significant."),
-        (gap.whole.interval[0] <= 0, "Noise may be all of it."),
+        (gap.whole.interval[0] <= 0, "It may be noise alone."),
         (poses, f"{scatter} would explain it."),
         (
             gap.whole < named.study.options.target_gap_mm / 1000,
             "That is too small to show a cause.",
         ),
-        (True, "None of the effects tested is significant."),
+        (True, "None of the effects tested is probable."),
     )
     return next(sentence for holds, sentence in said if holds)
 
 
-def _nearest(named: NamedEffects, what: str = "nearest") -> str:
-    words = ", ".join(effect_words(named.study, name) for name in named.likeliest)
-    return f" ({what}: {words})" if words else ""
+def probable(probability: float) -> str:
+    """Return a probability in words, and as a number."""
+    words = ((0.95, "almost surely"), (0.8, "very probably"), (0.5, "probably"))
+    said = next((word for least, word in words if probability >= least), "possibly")
+    return f"{said} (probability {probability:.2f})"
+
+
+def _nearest(named: NamedEffects) -> str:
+    """Return what is most probable where nothing is named: at most three effects above 10 %."""
+    likely = [
+        f"{effect_words(named.study, name)} {probability:.2f}"
+        for name, probability in named.probabilities.items()
+        if name in CATALOGUE and probability >= 1 / 10
+    ]
+    return f" (most probable: {', '.join(likely[:3])})" if likely else ""
 
 
 def _something_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     names = {name: effect_words(named.study, name) for name in named.names}
     *first, last = names.values()
     many = f"{', '.join(first)} and {last}" if first else last
-    # Some of these, of another form, may be the cause of several of them.
-    causes = {other for name, own in named.sets.items() for other in own if other != name}
-    fewer = " or ".join(words for name, words in names.items() if name in causes)
-    fewer = f" (or only {fewer}, of another form)" if fewer else ""
     start, advice = "With ", "add"
     if gap.as_given is not None:
         before = sized(gap.before).split(" [")[0]
         start, advice = f"Recalibration leaves {before}; with ", "calibrate it and add"
-    sentence = f"{start}{many}{fewer} added, {sized(gap.after)} remain"
+    sentence = f"{start}{many} added, {sized(gap.after)} remain"
     if remainder.unknown:
         sentence += ", which none of the effects tested explains."
     else:
         sentence += f": {advice} {many}."
-    if not named.certain:
-        return sentence
-    name = names[named.names[0]]
-    return (
-        f"{sentence} The gap is significant as a whole, and {name} explains most of it; but {name} "
-        "would be significant only if no other effect had been tested. More poses would decide."
-    )
+    return sentence
 
 
 def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
@@ -221,11 +222,11 @@ def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     if remainder.unknown:  # Without a simulator that is said already.
         explained = f", and none of the effects tested explains that{_nearest(named)}."
         return start + explained if given else ""
-    start += _nearest(named, f"likeliest, but not {'significant' if named.tested else 'tested'}")
+    start += _nearest(named)
     if not named.tested:
-        return f"{start}; record more poses, for effects are ranked here and not tested."
-    if named.likeliest:
-        return f"{start}; record more poses, for these are too few to show which."
+        return f"{start}; record more poses, for with so few effects are ranked only."
+    if named.anything > named.study.options.tests.named_from:
+        return f"{start}; something is {probable(named.anything)} missing: record more poses."
     nothing = "no effect is missing that this recording could show"
     if not given:
         return f"{nothing.capitalize()}."
@@ -252,6 +253,8 @@ def _cause_line(found: Evidence, one: Share) -> str:
     if one.cause != HAND_EYE or known is None:
         return f"{line}; a parameter of the simulator's error model."
     moved = se3.log(se3.inverse(known.tool_from_camera) @ found.tool_from_camera)
+    if alike := hidden_effects(found.study):
+        line += f", or of {' or '.join(alike)}, which looks the same here"
     return (
         f"{line}; the camera sits {mm(float(moved[:3].norm()))} mm and "
         f"{math.degrees(float(moved[3:].norm())):.2f} degrees from where the simulator has it."
@@ -263,17 +266,16 @@ def effect_line(named: NamedEffects, name: str) -> str:
     study, words = named.study, CATALOGUE[name].summary
     if not study.fit.model.groups.isdisjoint(CATALOGUE[name].refines):
         words = f"the base model's {name} term, and a higher-order form of it"
-    rivals, forms = [], []
-    for member, share in named.sets[name].items():
-        if member in named.names:
-            forms += [] if member == name else [effect_words(study, member)]
-            continue
-        closes = f" (closes {percent(share)} of what this one closes)" if share >= SMALL else ""
-        rivals.append(effect_words(study, member) + closes)
+    rivals = [
+        f"{effect_words(study, other)} ({share:.2f})"
+        for other, share in named.sets[name].items()
+        if other != name
+    ]
     if rivals:
-        words += f", which these data cannot distinguish from {', '.join(rivals)}"
-    if forms:
-        words += f"; it may be an error in the form of {' or '.join(forms)}"
+        own = f"{named.sets[name][name]:.2f}"
+        words += f"; these data cannot tell it ({own}) from {', '.join(rivals)}"
+    there = probable(named.probability_of_any(*named.sets[name]))
+    words += f"; {'one of them' if rivals else 'it'} is {there} there"
     absorbed = absorbed_share(study, name) if name in study.candidates.effects else 0.0
     if absorbed > 0.2:
         words += f"; calibration absorbs about {percent(absorbed)} of such an effect"
@@ -292,22 +294,17 @@ def list_remarks(
         detectable: The smallest size of each effect that would have been found, metres.
     """
     study, named = found.study, found.named
-    options, terms = study.options, named.refined_terms
+    options = study.options
     remarks = [lone_poses(study, gap.floor), _largest_component(gap, named)]
     if not named.tested:
         remarks.append(
-            f"With {study.sums.num_units} poses effects are ranked but not tested; a test needs "
+            f"With {study.sums.num_units} poses effects are ranked and none is named; that needs "
             f"{options.tests.least_images}."
         )
     if named.names:
         remarks.append(_closed(gap))
     elif named.tested and not remainder.unknown:
         remarks.append(_nothing_found(detectable))
-    if len(terms) == 1:
-        remarks.append(f"A higher-order {terms[0]} term was added; too small to report.")
-    elif terms:
-        many = ", ".join(terms)
-        remarks.append(f"Higher-order terms of {many} were added; too small to report.")
     small = remainder.scatter < options.target_gap_mm / 2000
     if named.tested and not remainder.unknown and not small:
         remarks.append(

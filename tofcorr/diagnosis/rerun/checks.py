@@ -162,7 +162,7 @@ def check_in_simulator(found: Evidence) -> Closure:
 
 def _compared(found: Evidence) -> list[Evidence]:
     """Return the model without effects, and with them if they add something."""
-    return [found.without_effects(), *([found] if found.named.adds_something else [])]
+    return [found.without_effects(), *([found] if found.named.names else [])]
 
 
 def _held_out(found: Evidence, frames: list[int]) -> Tensor:

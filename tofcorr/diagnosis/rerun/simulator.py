@@ -20,7 +20,7 @@ from tofcorr.data.recording import Recording, RigidTransform
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE
 from tofcorr.diagnosis.findings.where import Interval, interval_of
-from tofcorr.diagnosis.sums.gains import FittedMap
+from tofcorr.diagnosis.sums.maps import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study, fitted_coefficients
 from tofcorr.error_terms.base import SignalTerm
@@ -135,7 +135,7 @@ class Evidence:
 
     def without_effects(self) -> "Evidence":
         """Return the same of the base model alone."""
-        bare = replace(self.named, names=(), refined_terms=(), study=self.study)
+        bare = replace(self.named, names=(), study=self.study)
         return replace(self, named=bare)
 
     def fitted_to(self, units: Tensor) -> "Evidence":

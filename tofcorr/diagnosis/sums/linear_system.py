@@ -17,11 +17,7 @@ over the variance that independent pixel noise would give. It detects the smalle
 significance is computed from it. It does not measure size: real noise is correlated, and no model
 is complete. Every fold, subset of columns, bootstrap and sign flip is a sum of such matrices.
 
-Poses are the units of every test but that of effects that only a few images show, because one
-disturbance affects a whole image. An effect that only three images show cannot be tested in this
-way: three signs allow only eight flips, and a fit without one of the three hardly determines the
-effect. The images in which the effect would be strongest are therefore cut into tiles. Each tile
-has an uncertain offset and two tilts of its own, so that only what happens inside images counts.
+Poses are the units of every test, because one disturbance affects a whole image.
 """
 
 import math
@@ -33,7 +29,6 @@ from itertools import accumulate, pairwise
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.options import TestOptions
 from tofcorr.diagnosis.sums.base import BaseFit, unknown_amplitude_columns
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.pixels.dataset import in_threads
@@ -461,126 +456,3 @@ def draw_folds(num_units: int, count: int, generator: torch.Generator) -> Tensor
 def draw_signs(flips: int, num_units: int, generator: torch.Generator) -> Tensor:
     """Draw a sign for every unit and flip, shape (flips, U)."""
     return 2.0 * torch.randint(0, 2, (flips, num_units), generator=generator).double() - 1.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tiles:
-    """Poses left whole, then the tiles of the poses that were cut: Q units.
-
-    Attributes:
-        whole: Poses left whole, int64.
-        pixels: Pixels of the other poses, tile after tile, int64.
-        counts: How many of `pixels` each tile holds.
-        pose: Pose of every unit, shape (Q,), int64.
-        folds: Which units each fold of the cross-validation holds out, shape (folds, Q), float64.
-        signs: Sign flips, shape (B, Q).
-    """
-
-    whole: Tensor
-    pixels: Tensor
-    counts: list[int]
-    pose: Tensor
-    folds: Tensor
-    signs: Tensor
-
-    def per_pose(self, values: Tensor, num_poses: int) -> Tensor:
-        """Add up values of the units (..., Q) over the poses, shape (..., U)."""
-        sums = torch.zeros(*values.shape[:-1], num_poses, dtype=values.dtype)
-        return sums.index_add(-1, self.pose, values)
-
-
-def cut_into_tiles(
-    observations: Observations,
-    energy: Tensor,
-    tests: TestOptions,
-    generator: torch.Generator,
-    filtered: bool,
-) -> Tiles:
-    """Cut the eight poses with the most energy into tiles, eight along each side of the image.
-
-    Both are chosen, not derived: 512 tiles are enough units for the sign flips, and each still
-    holds dozens of pixels.
-
-    Args:
-        observations: The pixels.
-        energy: How strongly each pose would show the effects, shape (U,).
-        tests: Numbers of folds and sign flips.
-        generator: Of folds and flips.
-        filtered: Whether neighbouring pixels share noise. No side of a tile is then below eight
-            pixels: after a Gaussian of 1.2 pixels the signs of tiles of six by four allow for half
-            of the variance of slow signals, those of eight for two thirds. Tiles of twelve would
-            allow for four fifths, but are so few in images of 32x24 that saturation of 14 mm was
-            not found.
-    """
-    camera, pose = observations.recording.camera, observations.unit[observations.frame]
-    side, most_poses = 8, 8
-    ranked = energy.sort(descending=True).indices
-    strongest, whole = ranked[:most_poses], ranked[most_poses:].sort().values
-    inside = torch.isin(pose, strongest).nonzero()[:, 0]
-    pixel = observations.pixel[inside]
-    least = 8 if filtered else 1
-    down, across = (min(side, max(1, n // least)) for n in (camera.height, camera.width))
-    row, column = pixel // camera.width * down, pixel % camera.width * across
-    tile = row // camera.height * side + column // camera.width
-    label = pose[inside] * side**2 + tile
-    labels, counts = label.unique(return_counts=True)
-    size = len(whole) + len(labels)
-    return Tiles(
-        whole=whole,
-        pixels=inside[label.argsort(stable=True)],
-        counts=counts.tolist(),
-        pose=torch.cat([whole, labels // side**2]),
-        folds=draw_folds(size, tests.folds, generator),
-        signs=draw_signs(tests.flips, size, generator),
-    )
-
-
-def tile_sums(system: LinearSystem, names: Sequence[str], tiles: Tiles, fit: BaseFit) -> PoseSums:
-    """Return the sums of base model and some effects over whole poses and tiles of others.
-
-    Tiles flip on their own. What the uncertainty of their pose gives all of them is therefore taken
-    off the weighted sums first: the offset and two tilts fitted to the whole pose.
-
-    Args:
-        system: The system; sums of whole poses are taken from here.
-        names: The effects.
-        tiles: The units.
-        fit: Its noise and robust weights.
-    """
-    whole = system.sums.of(names)
-    parts = [*system.of(names), system.pose, system.residual[:, None]]
-    # Tiles are many and small: their columns are joined once.
-    joined = [torch.cat([part[tiles.pixels] for part in parts], dim=1)]
-    weights = fit.weight[tiles.pixels], fit.share[tiles.pixels]
-    places = [slice(low, high) for low, high in pairwise(accumulate([0, *tiles.counts]))]
-    weighted, plain, count = _products(joined, weights, places, threads=1)
-    weighted = _without_pose(weighted, tiles.pose[len(tiles.whole) :])
-    return replace(
-        whole,
-        weighted=torch.cat([whole.weighted[tiles.whole], weighted]),
-        plain=torch.cat([whole.plain[tiles.whole], plain]),
-        count=torch.cat([whole.count[tiles.whole], count]),
-    )
-
-
-def _without_pose(sums: Tensor, pose: Tensor) -> Tensor:
-    """Take each pose's offset and tilts off all columns but those of the pose itself.
-
-    Args:
-        sums: Products of the columns of the model, of the pose, and the residual, over each tile,
-            shape (T, K + 4, K + 4).
-        pose: Pose of every tile, shape (T,), int64.
-    """
-    own = slice(-NUM_POSE - 1, -1)
-    poses, number = pose.unique(return_inverse=True)
-    whole = sums.new_zeros(len(poses), *sums.shape[1:]).index_add(0, number, sums)
-    normal = whole[:, own, own]
-    # Regular where few of its pixels count; far above the rounding of float64.
-    ridge = 1e-9 * normal.diagonal(dim1=1, dim2=2).mean(1)
-    normal = normal + ridge[:, None, None] * torch.eye(NUM_POSE, dtype=torch.float64)
-    fitted = torch.linalg.solve(normal, whole[:, own])
-    fitted[:, :, own] = 0.0
-    # With the columns X, those of the pose Z and the fit F: sums of products of X - Z F.
-    turn = torch.eye(sums.shape[-1], dtype=torch.float64).repeat(len(poses), 1, 1)
-    turn[:, own] -= fitted
-    return turn[number].mT @ sums @ turn[number]

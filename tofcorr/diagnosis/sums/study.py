@@ -23,12 +23,9 @@ from tofcorr.diagnosis.sums.base import BaseFit
 from tofcorr.diagnosis.sums.linear_system import (
     LinearSystem,
     PoseSums,
-    Tiles,
-    cut_into_tiles,
     draw_folds,
     draw_signs,
     linear_system,
-    tile_sums,
 )
 from tofcorr.diagnosis.sums.observations import TINY, Observations
 from tofcorr.geometry.rays import phase_from_radial_distance
@@ -66,6 +63,10 @@ def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
         Probe("frame_period", "repeats every few frames", _frame_period),
         Probe("image_shape", f"has one shape in every image, {shape}", _map, part_of=maps),
     ]
+    found += [
+        Probe("any_smooth", "varies smoothly with distance, angle, place and amplitude", _smooth),
+        Probe("any_time", "changes slowly with time", _slow),
+    ]
     if len(inputs.facts.timestamp) > 2:
         found.append(Probe("previous_frame", "depends on the previous frame", _previous_frame))
     return {probe.name: probe for probe in found}
@@ -96,6 +97,32 @@ def _map(inputs: EffectInputs) -> Tensor:
         if 0 < i + j <= 9
     ]
     return torch.stack(columns, dim=-1)[number]
+
+
+def _smooth(inputs: EffectInputs) -> Tensor:
+    """Return forty random waves over all that is known of a pixel, shape (M, 40).
+
+    They span a Gaussian process of unknown form (random Fourier features; Rahimi and Recht 2007),
+    whose length is about one standard deviation of each quantity. The draws are always the same.
+    """
+    known = [inputs.radial_distance, inputs.rows, inputs.columns]
+    known.append(1 / inputs.incidence_cosine.clamp(min=0.2))
+    if inputs.amplitude_images is not None:
+        amplitude = inputs.known_amplitude
+        known.append(amplitude.clamp(min=1e-3 * float(amplitude.median())).log())
+    scaled = torch.stack([(own - own.mean()) / own.std().clamp(min=TINY) for own in known], dim=1)
+    generator = torch.Generator().manual_seed(0)
+    turns = 0.8 * torch.randn(len(known), 40, generator=generator).double()
+    starts = 2 * torch.pi * torch.rand(40, generator=generator).double()
+    return _SIZE * 20**-0.5 * torch.cos(scaled.double().clamp(-3, 3) @ turns + starts)
+
+
+def _slow(inputs: EffectInputs) -> Tensor:
+    """Return six cosines over the time of the recording, up to three periods, shape (M, 6)."""
+    time = inputs.facts.timestamp.double()
+    share = (time - time.min()) / (time.max() - time.min()).clamp(min=TINY)
+    waves = [torch.cos(torch.pi * count * share) for count in range(1, 7)]
+    return inputs.of_frame(_SIZE * torch.stack(waves, dim=-1))
 
 
 def _previous_frame(inputs: EffectInputs) -> Tensor:
@@ -134,10 +161,6 @@ class CandidateEffects:
     probes: Mapping[str, Probe]
     missing: Mapping[str, list[str]]
 
-    def is_tested_by_tiles(self, name: str) -> bool:
-        """Return whether a few images may hold all of an effect, so that tiles test it."""
-        return name in self.effects and self.effects[name].in_few_images
-
 
 def candidate_effects(options: DiagnosisOptions, inputs: EffectInputs) -> CandidateEffects:
     """Return the effects asked for, sorted by how they are tested, and the probes."""
@@ -165,7 +188,6 @@ class Study:
         system: Columns, residual and sums.
         folds: Which poses each fold of the cross-validation holds out, shape (folds, U), float64.
         signs: Sign flips of the poses, shape (B, U).
-        tiles: The units of effects that few images show; None where no such effect is tested.
         pattern: The base model's fixed pattern, estimated; None if it has none.
     """
 
@@ -177,7 +199,6 @@ class Study:
     system: LinearSystem
     folds: Tensor
     signs: Tensor
-    tiles: Tiles | None
     pattern: MapEffect | None = None
 
     @property
@@ -208,15 +229,8 @@ class Study:
         return self.observations.unit[self.observations.frame]
 
     def left_out_squares(self, names: Sequence[str]) -> Tensor:
-        """Return the ordinary sum of squares of each pose, predicted by all others, (U,), m^2.
-
-        If few images show an effect of the model, each tile and each other pose is predicted by all
-        others of them.
-        """
-        if self.tiles is None or not any(map(self.candidates.is_tested_by_tiles, names)):
-            return self.sums.ols.left_out_squares(names)
-        squares = tile_sums(self.system, names, self.tiles, self.fit).ols.left_out_squares(names)
-        return self.tiles.per_pose(squares, self.sums.num_units)
+        """Return the ordinary sum of squares of each pose, predicted by all others, (U,), m^2."""
+        return self.sums.ols.left_out_squares(names)
 
     def left_out_mean_square(self, names: Sequence[str]) -> float:
         """Return the mean of `left_out_squares` over all pixels, m^2."""
@@ -250,7 +264,7 @@ def build_study(
     sources = {**candidates.effects, **candidates.probes}
     found = in_threads(lambda source: source.scaled_columns(inputs), sources.values())
     system = linear_system(observations, fit, inputs, dict(zip(sources, found, strict=True)))
-    study = Study(
+    return Study(
         options=options,
         observations=observations,
         fit=fit,
@@ -259,15 +273,7 @@ def build_study(
         system=system,
         folds=folds,
         signs=signs,
-        tiles=None,
     )
-    few = [n for n in candidates.effects if candidates.is_tested_by_tiles(n)]
-    if not few:
-        return study
-    gls, base = study.sums.gls, study.sums.layout.base
-    energy = gls.gram.diagonal(dim1=1, dim2=2)[:, gls.layout.of(few)[base:]].sum(1)
-    filtered = max(fit.shared.share.values()) > 0
-    return replace(study, tiles=cut_into_tiles(observations, energy, tests, generator, filtered))
 
 
 def absent_forms(study: Study) -> list[str]:
@@ -377,6 +383,16 @@ def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float
     layout = study.sums.layout
     total, left = signal(study, name), _left(study, name, layout.of(others))
     return float(np.clip(1.0 - left / total, 0.0, 1.0)) if total > 0 else 1.0
+
+
+def hidden_effects(study: Study, *, absorbed: float = 0.97) -> list[str]:
+    """Return the effects that look like the hand-eye transform and the base model.
+
+    Args:
+        study: The recording.
+        absorbed: From this share on, that calibration absorbs, another recording is needed. Chosen.
+    """
+    return [name for name in study.candidates.effects if absorbed_share(study, name) > absorbed]
 
 
 def signal(study: Study, name: str) -> float:

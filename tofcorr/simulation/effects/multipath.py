@@ -139,7 +139,7 @@ class MultipathEffect(SignalEffect):
         ),
         Coefficient("flange", "1", 0.05),
     )
-    form_error = 1.0
+    form_error = 0.7
     shape_type = MultipathShape
 
     @classmethod

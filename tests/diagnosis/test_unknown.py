@@ -9,17 +9,13 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.gap import (
-    OpenSet,
     allowed_scatter,
-    bias_p_value,
-    joined,
     judge_remainder,
     measure_gap,
     resampled,
 )
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.structure import coherence
-from tofcorr.diagnosis.findings.where import Estimated, Region
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.linear_system import pose_columns
@@ -42,7 +38,6 @@ def test_poses_of_a_poor_robot_are_no_unknown_cause_unless_a_better_one_was_stat
     left = judge_remainder(study, named, gap)
     assert named.names == ()
     assert not left.unknown
-    assert left.p_value == joined(left.p_values)
     assert 1e-3 < left.scatter < 4e-3
     stated = study.options.model_copy(update={"pose_repeatability_mm": 0.3})
     assert judge_remainder(replace(study, options=stated), named, gap).unknown
@@ -62,40 +57,6 @@ def test_poses_may_scatter_by_three_millimetres_and_three_milliradians(
     expected = 0.003**2 * (1 + squares)
     after = replace(coherence(nothing_study, nothing_study.fit.residual), between=1.0)
     assert allowed_scatter(nothing_study, after) == pytest.approx(expected, rel=1e-3)
-
-
-def _bins(biases: list[float], p_value: float) -> dict[str, list[Region]]:
-    """Return bins of one covariate; their biases are known to 0.1 mm."""
-    half = 2 * 1.6449 * 1e-4
-    return {
-        "distance_m": [
-            Region(
-                covariate="distance_m",
-                low=place,
-                high=place + 1.0,
-                bias=Estimated(bias, interval=(bias - half, bias + half)),
-                p_value=p_value,
-            )
-            for place, bias in enumerate(biases)
-        ]
-    }
-
-
-def test_a_bias_along_a_covariate_counts_if_it_is_large_enough() -> None:
-    assert bias_p_value(_bins([1e-3, -1e-3], 0.004), 5e-4) == 0.004
-    assert bias_p_value(_bins([3e-4, -3e-4], 0.004), 5e-4) == 1.0
-    assert bias_p_value({}, 5e-4) == 1.0
-
-
-def test_the_tests_share_the_level() -> None:
-    """Each alone may reject at its share of the level; the shares add up to all of it."""
-    assert sum(OpenSet.weights.values()) == pytest.approx(1.0)
-    level = 0.05
-    ones = dict.fromkeys(OpenSet.weights, 1.0)
-    for name, weight in OpenSet.weights.items():
-        assert joined(ones | {name: 0.999 * weight * level}) < level
-        assert joined(ones | {name: 1.001 * weight * level}) > level
-    assert joined(ones) == 1.0
 
 
 def test_pose_columns_are_what_a_small_motion_of_the_target_does(

@@ -1,0 +1,400 @@
+r"""How probable every set of effects is, given the recording: the mathematics of naming.
+
+A *model* m is the base model with a set of effects. It predicts each pose from all others. With the
+sums of the poses, A_u and b_u, and the prior precision Lambda_m of its coefficients, the evidence
+of some poses is a closed form,
+
+.. math:: \log Z_m = \tfrac12\, b^\top (A + \Lambda_m)^{-1} b
+    - \tfrac12 \log \det (A + \Lambda_m) + \mathrm{const},
+
+and the log predictive density of pose u by all others is
+
+.. math:: \ell_{mu} = \log Z_m(\text{all}) - \log Z_m(\text{all but } u) - \tfrac12 y_u^\top W y_u .
+
+Four things keep its sum from being trusted as it stands, and each is a term of the probability:
+
+- Poses depart from a model by more than pixel noise. All densities are divided by a *temperature*
+  T: the variance of the poses' scores over what the model gives, for nine in ten of all effects.
+- The poses that were recorded are a sample. Their weights w_u are drawn from the flat Dirichlet
+  distribution (the Bayesian bootstrap; Rubin 1981), as in the averaging of Yao et al. (2018).
+- The columns of an effect are not quite its form: no two lenses, rooms or robots are alike. What
+  they explain of the true effect falls short by 1 + e^2 z^2, with its form error e and a standard
+  normal z (a model discrepancy; Kennedy and O'Hagan 2001). So a model with gain g_k of effect k may
+  explain up to e^2 z^2 g_k more of what there is: as much as the best model n does, less the odds
+  of each effect that it has more.
+- Few effects are there. Each has the prior odds o.
+
+.. math:: p(m) = \Big\langle \operatorname{softmax}_m \min\big(L_m
+    + \tfrac1T \textstyle\sum_k e_k^2 z_k^2 g_{mk},\;
+    L_n + (|m| - |n|)_+ \log o\big) \Big\rangle_{w, z},
+    \qquad L_m = |m| \log o + \tfrac1T \textstyle\sum_u w_u \ell_{mu} .
+
+The prior standard deviation of an effect is a size a in metres, as a root mean square over all
+pixels that the base model does not absorb; of four sizes the one that predicts best is taken.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.maps import FittedMap
+from tofcorr.diagnosis.sums.observations import TINY
+from tofcorr.diagnosis.sums.study import (
+    Study,
+    absorbed_share,
+    left_over,
+    signal,
+    with_residual,
+)
+from tofcorr.simulation.effects import CATALOGUE
+
+Model = tuple[str, ...]
+"""The names of a model's effects, maps and probes among them, in alphabetical order."""
+
+SIZES = (2.5e-4, 1e-3, 4e-3, 1.6e-2)
+"""Prior standard deviations of an effect, metres: from what hardly matters to what no camera has
+beyond. In steps of four: the evidence changes by less than half a nat between two of them."""
+_MAGNIFIED = 5
+"""What calibration absorbs of an effect magnifies its prior by this at most: nothing would
+otherwise bound an effect of which hardly anything is seen. A prior."""
+
+
+class Evidence:
+    """Predicts each pose of a recording from all others, under any model.
+
+    Args:
+        study: The recording.
+        beside: Effects that explain most of the gap as far as is known: a map of the image is
+            estimated from what they leave.
+    """
+
+    def __init__(self, study: Study, beside: Sequence[str] = ()) -> None:
+        self._study = study
+        sums, base = study.sums.gls, study.sums.layout.base
+        spans = {
+            n: slice(low - base, high - base) for n, (low, high) in sums.layout.effects.items()
+        }
+        left = {name: 1 - absorbed_share(study, name) for name in spans}
+        # Of less than a thousandth nothing can be said but rounding.
+        self._spans = {name: span for name, span in spans.items() if left[name] > 1e-3}
+        pixels = study.sums.ols.scale * float(study.sums.count.sum())
+        # The root mean square of each at one prior standard deviation, metres; see `SIZES`.
+        self._unit = {
+            name: (signal(study, name) * max(left[name], _MAGNIFIED**-2) / pixels) ** 0.5
+            for name in self._spans
+        }
+        some = torch.cat([sums.total[None], sums.total - sums.gram])
+        normal = some[:, :base, :base] + sums.layout.prior[:base, :base]
+        self._factor = torch.linalg.cholesky(_regular(normal))
+        self._beside = torch.linalg.solve_triangular(
+            self._factor, some[:, :base, base:], upper=False
+        )
+        self._gram = some[:, base:, base:] - self._beside.mT @ self._beside
+        residual = study.system.residual_of(beside, gls=True)
+        self.maps = {n: FittedMap(study, e, residual) for n, e in study.candidates.maps.items()}
+        self._studies: dict[str, Study] = {}
+        self._given: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
+        self._densities: dict[tuple[Model, tuple[float, ...]], Tensor] = {}
+
+    @property
+    def effects(self) -> list[str]:
+        """Effects and probes with columns of which calibration leaves something."""
+        return list(self._spans)
+
+    def without(self, of_map: str) -> Study:
+        """Return the study with a map's values subtracted from the residual."""
+        if of_map not in self._studies:
+            study = self._study
+            self._studies[of_map] = with_residual(
+                study, study.system.residual - self.maps[of_map].values
+            )
+        return self._studies[of_map]
+
+    def added(self, sizes: Mapping[str, float]) -> dict[str, float]:
+        """Return what each effect of a model adds that the base model does not absorb, metres.
+
+        The root mean square over all pixels, fitted by likelihood beside the others.
+
+        Args:
+            sizes: As in `density`.
+        """
+        study, layout = self._study, self._study.sums.layout
+        names = [name for name in sizes if name in self._spans]
+        of_map = next((name for name in sizes if name in self.maps), "")
+        fitted = (self.without(of_map) if of_map else study).sums.gls
+        members = layout.of(names)
+        normal = _regular(fitted.total[members][:, members] + self._prior(names, sizes))
+        theta = torch.linalg.solve(normal, fitted.score[:, members].sum(0))
+        plain, base = study.sums.ols.total, torch.arange(layout.base)
+        pixels, found = study.sums.ols.scale * float(study.sums.count.sum()), dict[str, float]()
+        for name, (low, high) in layout.only(names).effects.items():
+            own = torch.arange(*layout.effects[name])
+            left = left_over(plain, base, own, layout.prior_of(base))
+            found[name] = max(float(theta[low:high] @ left @ theta[low:high]) / pixels, 0.0) ** 0.5
+        if of_map:
+            share = study.fit.share
+            square = (share * self.maps[of_map].values ** 2).sum() / share.sum()
+            found[of_map] = float(square) ** 0.5
+        return found
+
+    def _prior(self, names: Sequence[str], sizes: Mapping[str, float]) -> Tensor:
+        """Return the prior precision of the base model and of effects of some sizes, (K, K)."""
+        layout = self._study.sums.layout
+        prior = layout.prior_of(layout.of(names)).clone()
+        for name, (low, high) in layout.only(names).effects.items():
+            prior.diagonal()[low:high] = (self._unit[name] / sizes[name]) ** 2
+        return prior
+
+    def left_out_squares(self, model: Sequence[str]) -> Tensor:
+        """Return the ordinary squares of each pose, predicted by all others, shape (U,), m^2."""
+        study = next((self.without(name) for name in model if name in self.maps), self._study)
+        return study.left_out_squares([name for name in model if name not in self.maps])
+
+    def _response(self, of_map: str) -> tuple[Tensor, Tensor, Tensor]:
+        """Return log evidence of the base model, scores of all effects beside it, and squares.
+
+        The first two are of all poses and of all but one, shapes (1 + U,) and (1 + U, P); the last
+        is y' W y of each pose, shape (U,).
+
+        Args:
+            of_map: Whose values are subtracted from the residual; empty: no map's.
+        """
+        if of_map not in self._given:
+            sums = self._study.sums
+            if of_map:
+                other, known = self.without(of_map).sums, (sums.dispersion, sums.pose_sd)
+                sums = replace(other, dispersion=known[0], pose_sd=known[1])
+            score, base = sums.gls.score, sums.layout.base
+            right = torch.cat([score.sum(0)[None], score.sum(0) - score])
+            inner = torch.linalg.solve_triangular(self._factor, right[:, :base, None], upper=False)
+            own = right[:, base:] - (self._beside.mT @ inner)[..., 0]
+            evidence = inner.square().sum((1, 2)) / 2 - _half_logdet(self._factor)
+            self._given[of_map] = evidence, own, sums.gls.square
+        return self._given[of_map]
+
+    def density(self, sizes: Mapping[str, float]) -> Tensor:
+        """Return the log predictive density of every pose by all others, shape (U,).
+
+        Args:
+            sizes: The prior standard deviation of each effect of the model, metres; that of a map
+                is its own.
+        """
+        names = tuple(name for name in sizes if name in self._spans)
+        of_map = next((name for name in sizes if name in self.maps), "")
+        key = (*names, of_map), tuple(sizes[name] for name in names)
+        if key not in self._densities:
+            evidence, score, square = self._response(of_map)
+            if names:
+                spans = [self._spans[name] for name in names]
+                rows = torch.cat([self._gram[:, span] for span in spans], dim=1)
+                gram = torch.cat([rows[:, :, span] for span in spans], dim=2)
+                right = torch.cat([score[:, span] for span in spans], dim=1)[..., None]
+                width = torch.tensor([span.stop - span.start for span in spans])
+                precision = torch.tensor([(self._unit[n] / sizes[n]) ** 2 for n in names])
+                prior = precision.double().repeat_interleave(width).diag()
+                factor = torch.linalg.cholesky(_regular(gram + prior))
+                inner = torch.linalg.solve_triangular(factor, right, upper=False)
+                evidence = evidence + inner.square().sum((1, 2)) / 2 - _half_logdet(factor)
+            self._densities[key] = evidence[0] - evidence[1:] - square / 2
+        return self._densities[key]
+
+    def temperature(self, sizes: Mapping[str, float]) -> float:
+        """Return the variance of the poses' scores over that by the model, at least 1.
+
+        It is that of nine in ten of the effects that are not in the model.
+
+        Args:
+            sizes: As in `density`.
+        """
+        sums, layout = self._study.sums.gls, self._study.sums.layout
+        names = [name for name in sizes if name in self._spans]
+        members, total = layout.of(names), sums.total
+        known = _regular(total[members][:, members] + self._prior(names, sizes))
+        score = sums.score - sums.gram[:, :, members] @ torch.linalg.solve(
+            known, sums.score.sum(0)[members]
+        )
+        beside = torch.linalg.solve(known, total[members])
+        score = score - score[:, members] @ beside
+        left = (total - total[:, members] @ beside).diagonal()
+        ratios = []
+        for name in self.effects:
+            own = torch.arange(*layout.effects[name])
+            own = own[left[own] > 1e-3 * total.diagonal()[own]]
+            if name not in names and len(own):
+                ratios.append(float((score[:, own].square().sum(0) / left[own]).mean()))
+        return max(1.0, float(torch.tensor(ratios or [1.0]).quantile(0.9)))
+
+
+def _regular(normal: Tensor) -> Tensor:
+    """Return normal matrices that rounding cannot make singular."""
+    ridge = 1e-10 * normal.diagonal(dim1=-2, dim2=-1) + TINY
+    return normal + ridge.diag_embed()
+
+
+def _half_logdet(factor: Tensor) -> Tensor:
+    return factor.diagonal(dim1=1, dim2=2).log().sum(1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Models:
+    """The models that were tried.
+
+    Attributes:
+        models: N of them.
+        densities: Log predictive densities over that of the base model, over the temperature,
+            shape (N, U).
+        sizes: The prior size of each effect of each model.
+        price: Minus the logarithm of the prior odds of an effect.
+        probes: Names of what is in no catalogue.
+    """
+
+    models: tuple[Model, ...]
+    densities: Tensor
+    sizes: tuple[Mapping[str, float], ...]
+    price: float
+    probes: frozenset[str]
+
+    @property
+    def total(self) -> Tensor:
+        """Log predictive density of all poses, shape (N,)."""
+        return self.densities.sum(1)
+
+    def best(self) -> tuple[Model, Mapping[str, float]]:
+        """Return the model of the highest posterior, before poses and forms are drawn."""
+        prices = self.price * torch.tensor([len(model) for model in self.models])
+        at = int((self.total - prices).argmax())
+        return self.models[at], self.sizes[at]
+
+    def sizes_of(self, effects: Model) -> Mapping[str, float]:
+        """Return the prior sizes of the best model with exactly these effects and any probes."""
+        own = [set(model) - self.probes == set(effects) for model in self.models]
+        prices = self.price * torch.tensor([len(model) for model in self.models])
+        level = torch.where(torch.tensor(own), self.total - prices, -torch.inf)
+        return self.sizes[int(level.argmax())]
+
+    def gain_of(self, name: str) -> float:
+        """Return the log predictive density of the model of one effect over the base model's."""
+        return float(self.total[self.models.index((name,))]) if (name,) in self.models else 0.0
+
+    def _gains(self) -> list[dict[str, float]]:
+        """Return what each effect of a known form error adds to each model."""
+        total = dict(zip(self.models, self.total.tolist(), strict=True))
+        gains = []
+        for model in self.models:
+            own = {}
+            for name in model:
+                error = CATALOGUE[name].form_error if name in CATALOGUE else 0.0
+                without = total.get(tuple(other for other in model if other != name))
+                if error > 0 and without is not None:
+                    own[name] = error**2 * max(total[model] - without, 0.0)
+            gains.append(own)
+        return gains
+
+    def posterior(self, weights: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the probability of each model for some weights of the poses, shape (N, D).
+
+        Args:
+            weights: Of the poses, shape (D, U), with mean one.
+            generator: Of the form errors, drawn for each row by itself.
+        """
+        prices = self.price * torch.tensor([len(model) for model in self.models]).double()
+        level = self.densities @ weights.T - prices[:, None]
+        names = sorted({name for model in self.models for name in model})
+        drawn = torch.randn(len(names), len(weights), generator=generator).double().square()
+        missed = torch.zeros_like(level)
+        for row, gains in zip(missed, self._gains(), strict=True):
+            for name, gain in gains.items():
+                row.add_(gain * drawn[names.index(name)])
+        size = torch.tensor([len(model) for model in self.models])
+        best = level.max(0)
+        larger = (size[:, None] - size[best.indices]).clamp(min=0)
+        most = best.values - self.price * larger
+        return torch.softmax(level + torch.minimum(missed, (most - level).clamp(min=0)), 0)
+
+
+class Search:
+    """Tries models of one effect, then with one more as long as the best becomes more probable.
+
+    Args:
+        evidence: Of the recording.
+        odds: Prior odds of an effect.
+        most: How many effects a model may have.
+        width: How many of the best models of one size are enlarged.
+    """
+
+    def __init__(self, evidence: Evidence, odds: float, most: int, width: int = 5) -> None:
+        self._evidence, self._width = evidence, width
+        self._price, self._most = -math.log(odds), most
+        self._base = evidence.density({})
+        self._tried: dict[Model, tuple[float, dict[str, float]]] = {}
+        self._alone: dict[str, float] = {}
+
+    def models(self, probes: Iterable[str]) -> Models:
+        """Return all models tried, and their densities at the temperature of the best.
+
+        At last every effect of the best model is replaced by every other, so that each that may be
+        there in its place is judged.
+
+        Args:
+            probes: Names of what is in no catalogue.
+        """
+        evidence = self._evidence
+        for of_map in ("", *evidence.maps):
+            self._grow({of_map: math.nan} if of_map else {})
+        best = self._best()
+        for name in best:
+            rest = {other: size for other, size in best.items() if other != name}
+            others = [other for other in evidence.effects if other not in best]
+            for sizes in ({}, *({other: self._alone[other]} for other in others)):
+                self._level({**rest, **sizes})
+            for of_map in evidence.maps if evidence.maps.keys().isdisjoint(rest) else ():
+                self._level({**rest, of_map: math.nan})
+        sizes = [own for _, own in self._tried.values()]
+        densities = torch.stack([evidence.density(own) for own in sizes])
+        return Models(
+            models=tuple(self._tried),
+            densities=(densities - self._base) / evidence.temperature(self._best()),
+            sizes=tuple(sizes),
+            price=self._price,
+            probes=frozenset(probes),
+        )
+
+    def _grow(self, start: dict[str, float]) -> None:
+        """Add effects to a model of none, or of one map."""
+        beam, top = [start], self._level(start)
+        if top < -2 * self._price:  # A map that predicts worse than none.
+            return
+        for count in range(1, self._most + 1):
+            grown: dict[Model, dict[str, float]] = {}
+            for sizes in beam:
+                for name in self._evidence.effects:
+                    if name not in sizes:
+                        larger = self._with(sizes, name)
+                        grown[tuple(sorted(larger))] = larger
+            beam = sorted(grown.values(), key=lambda own: -self._level(own))[: self._width]
+            best = self._level(beam[0]) if beam else -math.inf
+            # A pair is tried even where neither of both is probable alone.
+            if best <= top and count > 1:
+                break
+            top = max(best, top)
+
+    def _with(self, sizes: dict[str, float], name: str) -> dict[str, float]:
+        """Return a model with one more effect, at the size that predicts best where it is alone."""
+        if name not in self._alone:
+            self._alone[name] = max(SIZES, key=lambda size: self._level({name: size}))
+        return {**sizes, name: self._alone[name]}
+
+    def _level(self, sizes: dict[str, float]) -> float:
+        """Return the log posterior of a model over that of the base model, and remember it."""
+        model = tuple(sorted(sizes))
+        density = float((self._evidence.density(sizes) - self._base).sum())
+        level = density - self._price * len(model)
+        if model not in self._tried or level > self._tried[model][0]:
+            self._tried[model] = level, sizes
+        return level
+
+    def _best(self) -> dict[str, float]:
+        return max(self._tried.values(), key=lambda one: one[0])[1]
