@@ -55,16 +55,12 @@ class CatalogueEffect(Effect, ABC):
             fitted coefficients.
         contains: Names of the effects whose every shift this effect can describe as well.
         refines: Groups of error terms (`Term.group`) of which this effect is a finer form.
-        in_few_images: Whether the effect can be present in a few images only and differs from an
-            offset there; it is then also tested on parts of the images.
         of_frame: Whether the shift is the same in all pixels of a frame.
-        moves_images: Whether it displaces camera or target, which mostly shifts whole images.
         fixed_terms: The coefficients, where they do not depend on the shape.
         prior: Standard deviation of the priors of its main coefficients, where `terms` names them.
         form_error: What a real effect of this kind may leave of itself, as a share of what these
             columns explain of it (root mean squares): no two lenses, rooms or robots are alike. At
             0.5 they explain four fifths of its squares, if it is as usual.
-        may_be: Effects of which some forms look exactly like this one; they join its cause set.
         reads_light: Whether it reads the light that reached a clipped pixel, not the amplitude.
     """
 
@@ -77,12 +73,9 @@ class CatalogueEffect(Effect, ABC):
     linear: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
     refines: ClassVar[tuple[str, ...]] = ()
-    in_few_images: ClassVar[bool] = False
     of_frame: ClassVar[bool] = False
-    moves_images: ClassVar[bool] = False
     prior: ClassVar[float] = 0.02
     form_error: ClassVar[float] = 0.5
-    may_be: ClassVar[tuple[str, ...]] = ()
     reads_light: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:

@@ -29,7 +29,6 @@ class DistanceEffect(LinearDelay):
 
     name = "distance"
     refines = ("distance", "distance_amplitude")
-    may_be = ("wiggling",)  # Whatever its harmonics, it is a function of the distance.
     summary = "error of the distance alone, of higher order than the base model"
     source = "Lindner and Kolb 2006; Kahlmann et al. 2006"
     remedy = "more distances over the whole range, at one tilt and one reflectivity"

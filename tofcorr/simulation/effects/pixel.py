@@ -34,7 +34,6 @@ class PixelEffect(LinearDelay):
     remedy = "a white wall, frontal, at three or more distances, with the camera rolled"
     shape_type: ClassVar[type[Options]] = PixelShape
     prior, decay = 0.04, 1.3
-    may_be = ("fixed_pattern",)  # A pattern of the sensor may be smooth.
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "PixelEffect":

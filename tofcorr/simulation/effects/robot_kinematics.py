@@ -47,7 +47,6 @@ class RobotKinematicsEffect(GeometryEffect):
     source = "linearised kinematic error of a serial arm (Mooring, Roth and Driels 1991)"
     remedy = "the same camera poses by another configuration of the arm, or a tracker"
     needs = (ROBOT,)
-    moves_images = True
     fixed_terms = (
         *(Coefficient(f"scale_{pair}", "m/m", 0.004) for pair in _PAIRS),
         *(Coefficient(f"sag_{i}", "m/m^2", 0.004) for i in _AXES),
@@ -114,7 +113,6 @@ class BacklashEffect(GeometryEffect):
     source = "ISO 9283, unidirectional against multi-directional pose accuracy"
     remedy = "the same poses, approached from the other side"
     needs = (ROBOT,)
-    moves_images = True
     fixed_terms = tuple(Coefficient(f"play_{axis}", "m", 0.002) for axis in "xyz")
 
     def moved(self, facts: FrameFacts, coefficients: Tensor) -> FrameFacts:

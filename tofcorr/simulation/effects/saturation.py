@@ -95,7 +95,6 @@ class SaturationEffect(CatalogueEffect):
     needs = (AMPLITUDE, FREQUENCY)
     form_error = 0.7
     shape_type: ClassVar[type[Options]] = SaturationShape
-    in_few_images = True
     reads_light = True
 
     @classmethod

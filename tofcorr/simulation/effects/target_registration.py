@@ -55,7 +55,6 @@ class TargetRegistrationEffect(GeometryEffect):
     source = "geometry of a plane"
     remedy = "tilts to both sides and a laser or tracker reference of the plane"
     needs = (FIXED_TARGET, MEASURED_PLANES)
-    moves_images = True
     shape_type: ClassVar[type[Options]] = TargetRegistrationShape
 
     @classmethod
