@@ -178,8 +178,9 @@ def test_two_frames_of_a_pose_leave_the_noise_open_and_the_residual_decides(
     noise = study.fit.noise
     assert noise.repeats == 4
     # Their differences alone would say sqrt(1 - 0.7) = 0.55 of it.
-    assert noise.least * study.fit.floor < 0.7 * SIGMA
-    assert noise.most * study.fit.floor > 0.99 * SIGMA
+    least, likeliest, most = noise.limits(study.fit.shared.level)
+    assert least / likeliest * study.fit.floor < 0.7 * SIGMA
+    assert most / likeliest * study.fit.floor > 0.99 * SIGMA
     assert _floor(study) == pytest.approx(SIGMA, rel=0.05)
 
 

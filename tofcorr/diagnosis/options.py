@@ -16,12 +16,6 @@ Share = Annotated[float, Field(gt=0, lt=1)]
 Positive = Annotated[float, Field(gt=0)]
 
 
-def _paper_model() -> ErrorModelOptions:
-    return ErrorModelOptions(
-        terms=(DistancePolynomialOptions(), PixelPolynomialOptions(), AmplitudePolynomialOptions())
-    )
-
-
 class TestOptions(Options):
     """How effects are named and tested.
 
@@ -95,7 +89,9 @@ class DiagnosisOptions(Options):
     config_folder: ClassVar[str] = "diagnose"
 
     seed: Annotated[int, Field(ge=0)] = 1
-    base: ErrorModelOptions = Field(default_factory=_paper_model)
+    base: ErrorModelOptions = ErrorModelOptions(
+        terms=(DistancePolynomialOptions(), PixelPolynomialOptions(), AmplitudePolynomialOptions())
+    )
     catalogue: tuple[str, ...] | None = None
     leave_out: tuple[str, ...] = ()
     hand_eye: Literal["auto", "estimate", "fixed"] = "auto"

@@ -184,7 +184,9 @@ def squared_gaps(
     after = before.clone()
     if named.names:
         for model, own in _drawn_again(named, resamples).items():
-            squares = _left_by(study, named, model)
+            # A map is taken where it is the one named; another one would have to be fitted again.
+            held = study if named.maps.keys().isdisjoint(model) else named.study
+            squares = held.left_out_squares(named.columns_of(model))
             after[own] = _squared_gap(study, squares, floor.size, resamples[own])
         # A model that predicts worse than none would not be taken.
         after = torch.minimum(after, before)
@@ -222,16 +224,6 @@ def _drawn_again(named: NamedEffects, resamples: Tensor) -> dict[Model, Tensor]:
         for number in drawn.tolist()
     ]
     return {model: torch.tensor([each == model for each in own]) for model in dict.fromkeys(own)}
-
-
-def _left_by(study: Study, named: NamedEffects, model: Model) -> Tensor:
-    """Return what a model leaves of each pose, predicted by all others, shape (U,), m^2.
-
-    A map is taken where it is the one named; another one would have to be fitted again.
-    """
-    columns = named.columns_of(model)
-    own = named.study if not named.maps.keys().isdisjoint(model) else study
-    return own.left_out_squares(columns)
 
 
 def gap_steps(

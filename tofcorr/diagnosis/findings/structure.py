@@ -319,18 +319,16 @@ def noise_floor(named: NamedEffects, *, sure: float = 0.01) -> NoiseFloor:
         named: The final model.
         sure: Waves with at most this p-value are no noise. The usual convention.
     """
-    study, fit = named.study, named.study.fit
-    left, limits = study.system.residual_of(named.columns), (fit.noise.least, fit.noise.most)
-    if named.columns and not fit.shared.from_repeats:
+    study, fit, found = named.study, named.study.fit, named.study.fit.shared
+    left = study.system.residual_of(named.columns)
+    if named.columns and not found.from_repeats:
         found = shared_noise(study.observations, left, fit.sigma, fit.trust)
         if study.observations.is_sample:  # Whole images said more of it.
             found = replace(found, level=fit.shared.level)
         study = replace(study, fit=replace(fit, shared=found))
-        _, assumed, _ = fit.noise.limits(fit.shared.level)
-        least, _, most = fit.noise.limits(found.level)
-        limits = least / assumed, most / assumed
-    least = (1 - FLOOR_ERROR) * limits[0] * fit.floor
-    most = (1 + FLOOR_ERROR) * limits[1] * fit.floor
+    _, assumed, _ = fit.noise.limits(fit.shared.level)
+    least, _, most = (bound / assumed for bound in fit.noise.limits(found.level))
+    least, most = (1 - FLOOR_ERROR) * least * fit.floor, (1 + FLOOR_ERROR) * most * fit.floor
     own_of_images, between = without_pose(study, left)
     structure = coherence_inside(study, own_of_images, between)
     by_poses, alike = shared_by_poses(study, own_of_images), structure.noise_share

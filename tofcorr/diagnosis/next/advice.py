@@ -275,7 +275,7 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
         if others:
             goal = f"To distinguish {effect} from {' and '.join(others)}"
         if candidates is not None:
-            goal += _advised(study, named, candidates, (effect, others)) + " In general"
+            goal += _advised(study, candidates, (effect, others)) + " In general"
         advice.append(f"{goal}: {CATALOGUE[effect].remedy}.")
     return advice + [
         f"{name} could not be tested: it needs {', '.join(wants)}. Best: {CATALOGUE[name].remedy}."
@@ -295,12 +295,11 @@ def _questions(study: Study, named: NamedEffects) -> list[Question]:
     return [*asked, *((name, ()) for name in hidden)][:3]
 
 
-def _advised(study: Study, named: NamedEffects, candidates: Candidates, question: Question) -> str:
+def _advised(study: Study, candidates: Candidates, question: Question) -> str:
     """Choose the most informative frames for one question, one after another; describe them.
 
     Args:
         study: The recording.
-        named: The effects named.
         candidates: What could be recorded.
         question: What the frames should tell.
     """

@@ -405,7 +405,16 @@ def pose_sums(
     unit = observations.unit[observations.frame]
     sizes = torch.bincount(unit, minlength=observations.num_units)  # A pose may have no pixel.
     pixels = unit.argsort(stable=True).split(sizes.tolist())
-    weighted, plain, count = _products(parts, (fit.weight, fit.share), pixels)
+    roots = [weight.sqrt()[:, None] for weight in (fit.weight, fit.share)]
+
+    def of_unit(own: Tensor) -> tuple[Tensor, ...]:
+        everything = torch.cat([part[own] for part in parts], dim=1)
+        # NumPy sees a matrix times itself, and computes half of the products: that takes half of
+        # the time of torch's.
+        scaled = [(everything * root[own]).numpy() for root in roots]
+        return *(torch.from_numpy(one.T @ one) for one in scaled), fit.share[own].sum()
+
+    weighted, plain, count = map(torch.stack, zip(*in_threads(of_unit, pixels), strict=True))
     return PoseSums(
         weighted=weighted,
         plain=plain,
@@ -415,30 +424,6 @@ def pose_sums(
         dispersion=1.0,
         pose_sd=torch.full((NUM_POSE,), OLS_SD, dtype=torch.float64),
     )
-
-
-def _products(
-    parts: Sequence[Tensor],
-    weights: tuple[Tensor, Tensor],
-    units: Sequence[Tensor | slice],
-    threads: int | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the products of columns (M, K) over the pixels of each unit, with both weights.
-
-    Returns:
-        Weighted and plain sums, shape (U, S, S), and the sums of the plain weights, shape (U,).
-    """
-    roots = [weight.sqrt()[:, None] for weight in weights]
-
-    def of_unit(own: Tensor | slice) -> tuple[Tensor, ...]:
-        everything = torch.cat([part[own] for part in parts], dim=1)
-        # NumPy sees a matrix times itself, and computes half of the products: that takes half of
-        # the time of torch's.
-        scaled = [(everything * root[own]).numpy() for root in roots]
-        return *(torch.from_numpy(one.T @ one) for one in scaled), weights[1][own].sum()
-
-    weighted, plain, count = zip(*in_threads(of_unit, units, threads), strict=True)
-    return torch.stack(weighted), torch.stack(plain), torch.stack(count)
 
 
 def draw_folds(num_units: int, count: int, generator: torch.Generator) -> Tensor:
@@ -451,8 +436,3 @@ def draw_folds(num_units: int, count: int, generator: torch.Generator) -> Tensor
     order = torch.randperm(num_units, generator=generator)
     of_unit = (torch.arange(num_units) % count)[order.argsort()]
     return (of_unit == torch.arange(count)[:, None]).double()
-
-
-def draw_signs(flips: int, num_units: int, generator: torch.Generator) -> Tensor:
-    """Draw a sign for every unit and flip, shape (flips, U)."""
-    return 2.0 * torch.randint(0, 2, (flips, num_units), generator=generator).double() - 1.0

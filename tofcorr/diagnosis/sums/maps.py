@@ -88,29 +88,24 @@ class FittedMap:
         return self._study.folds.argmax(0)[self._study.unit_of_pixel]
 
     def _solved(self, system: Tensor, right: Tensor) -> Tensor:
-        """Return the values of right sides (cells, R)."""
+        """Return the values of a right side (cells,)."""
         prior = self.prior_sd**-2
         if system.ndim == 1:
-            return right / (system + prior)[:, None]
+            return right / (system + prior)
         return torch.linalg.solve(system + prior * torch.eye(len(system)).double(), right)
-
-    def _without_folds(self, sums: Tensor) -> list[Tensor]:
-        """Return what every pose adds to the map without each fold, shape (cells, U) each."""
-        systems, kept = self._systems, 1 - self._study.folds
-        whole = systems.sum(0)
-        pairs = zip(systems, kept, strict=True)
-        return [self._solved(whole - own, (sums * inside[:, None]).T) for own, inside in pairs]
 
     def whole(self) -> Tensor:
         """Return the map's values estimated from all poses, shape (cells,), metres."""
-        found = self._solved(self._systems.sum(0), self._sums.sum(0)[:, None])[:, 0]
+        found = self._solved(self._systems.sum(0), self._sums.sum(0))
         every = torch.zeros(len(self._effect.coefficients), dtype=torch.float64)
         return every.index_copy(0, self._used, found)
 
     @cached_property
     def values(self) -> Tensor:
         """The map's value in every pixel, estimated without the pixel's fold, (M,), metres."""
-        of_folds = torch.stack([own.sum(1) for own in self._without_folds(self._sums)])
+        kept, whole = (1 - self._study.folds) @ self._sums, self._systems.sum(0)
+        pairs = zip(self._systems, kept, strict=True)
+        of_folds = torch.stack([self._solved(whole - own, right) for own, right in pairs])
         return of_folds[self._fold[:, None], self._cells].sum(-1)
 
 

@@ -92,7 +92,6 @@ class PixelNoise:
             filter is possible.
         spread: Relative error of these by how much poses differ, two standard errors; 0 of a single
             pose.
-        level: Noise over what differences between neighbours see of it.
     """
 
     knots: np.ndarray
@@ -102,7 +101,6 @@ class PixelNoise:
     repeats: int = 0
     ratios: tuple[float, float, float] = (1.0, 1.0, 1.0)
     spread: float = 0.0
-    level: float = 1.0
 
     def at(self, brightness: Tensor, frame: Tensor) -> Tensor:
         """Return the standard deviation of pixels of this brightness and frame, (M,), metres."""
@@ -132,18 +130,6 @@ class PixelNoise:
         most = max(min(most * (1 + self.spread), bound), ratio, shown if seen else 0.0)
         return least * (1 - self.spread), ratio, most
 
-    @property
-    def least(self) -> float:
-        """Smallest noise that is possible, over this one."""
-        least, ratio, _ = self.limits(self.level)
-        return least / ratio
-
-    @property
-    def most(self) -> float:
-        """Largest noise that is possible, over this one."""
-        _, ratio, most = self.limits(self.level)
-        return most / ratio
-
     def held_to_neighbours(self, level: float, striped: bool = False) -> "PixelNoise":
         """Return the noise within `limits`.
 
@@ -151,7 +137,7 @@ class PixelNoise:
             level: Noise over what differences between neighbours see of it.
             striped: Whether repeats differ by structure too, of which those differences see less.
         """
-        held = replace(self, level=level, repeats=0 if striped else self.repeats)
+        held = replace(self, repeats=0 if striped else self.repeats)
         return replace(held, sigma=held.limits(level)[1] / self.ratios[1] * self.sigma)
 
 

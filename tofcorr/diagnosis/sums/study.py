@@ -24,14 +24,12 @@ from tofcorr.diagnosis.sums.linear_system import (
     LinearSystem,
     PoseSums,
     draw_folds,
-    draw_signs,
     linear_system,
 )
 from tofcorr.diagnosis.sums.observations import TINY, Observations
 from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.pixels.dataset import in_threads
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.base import testable
 from tofcorr.simulation.effects.inputs import MEASURED_PLANES, EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
 
@@ -47,23 +45,18 @@ class Probe:
         name: For programs.
         trace: What it looks like: a clause that follows "It".
         scaled_columns: Computes its columns, (M, K), metres at one prior standard deviation.
-        part_of: Effects of the catalogue that may look like it.
     """
 
     name: str
     trace: str
     scaled_columns: Callable[[EffectInputs], Tensor]
-    part_of: tuple[str, ...] = ()
 
 
 def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
     """Return the probes that a recording allows."""
-    maps, shape = ("fixed_pattern", "row_column_pattern"), "finer than the pixel effect"
     found = [
         Probe("frame_period", "repeats every few frames", _frame_period),
-        Probe("image_shape", f"has one shape in every image, {shape}", _map, part_of=maps),
-    ]
-    found += [
+        Probe("image_shape", "has one shape in every image, finer than the pixel effect", _map),
         Probe("any_smooth", "varies smoothly with distance, angle, place and amplitude", _smooth),
         Probe("any_time", "changes slowly with time", _slow),
     ]
@@ -166,7 +159,8 @@ def candidate_effects(options: DiagnosisOptions, inputs: EffectInputs) -> Candid
     """Return the effects asked for, sorted by how they are tested, and the probes."""
     wanted = options.catalogue if options.catalogue is not None else tuple(CATALOGUE)
     kinds = {name: CATALOGUE[name] for name in wanted if name not in options.leave_out}
-    known, missing = testable(kinds, inputs)
+    missing = {name: wants for name, kind in kinds.items() if (wants := kind.missing(inputs))}
+    known = {n: kind.for_recording(inputs) for n, kind in kinds.items() if n not in missing}
     return CandidateEffects(
         effects={n: each for n, each in known.items() if not isinstance(each, MapEffect)},
         maps={n: each for n, each in known.items() if isinstance(each, MapEffect)},
@@ -259,7 +253,7 @@ def build_study(
     """Compute the linear system of all candidates; draw folds and sign flips."""
     tests, num_units = options.tests, observations.num_units
     folds = draw_folds(num_units, tests.folds, generator)
-    signs = draw_signs(tests.flips, num_units, generator)
+    flips = torch.randint(0, 2, (tests.flips, num_units), generator=generator)
     candidates = candidate_effects(options, inputs)
     sources = {**candidates.effects, **candidates.probes}
     found = in_threads(lambda source: source.scaled_columns(inputs), sources.values())
@@ -272,15 +266,8 @@ def build_study(
         candidates=candidates,
         system=system,
         folds=folds,
-        signs=signs,
+        signs=2.0 * flips.double() - 1.0,
     )
-
-
-def absent_forms(study: Study) -> list[str]:
-    """Return the effects that refine error terms of which the base model has none."""
-    groups = study.fit.model.groups
-    kinds = CATALOGUE.items()
-    return [name for name, kind in kinds if kind.refines and groups.isdisjoint(kind.refines)]
 
 
 def with_poses_reestimated(study: Study, names: Sequence[str]) -> Study:

@@ -37,10 +37,6 @@ class Coefficient(NamedTuple):
     prior_sd: float
 
 
-class NoShape(Options):
-    """The shape of an effect that has coefficients only."""
-
-
 class CatalogueEffect(Effect, ABC):
     """An effect with named coefficients, for simulation and for fitting.
 
@@ -68,7 +64,7 @@ class CatalogueEffect(Effect, ABC):
     source: ClassVar[str] = ""
     remedy: ClassVar[str] = ""
     needs: ClassVar[tuple[Need, ...]] = ()
-    shape_type: ClassVar[type[Options]] = NoShape
+    shape_type: ClassVar[type[Options]] = Options
     fixed_terms: ClassVar[tuple[Coefficient, ...]] = ()
     linear: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
@@ -158,15 +154,6 @@ class CatalogueEffect(Effect, ABC):
         names = [term.name for term in self.terms(self.shape)]
         values = dict(zip(names, self.coefficients.tolist(), strict=True))
         return {"name": self.name, **self.shape.to_mapping(), **values}
-
-
-def testable(
-    kinds: Mapping[str, type[CatalogueEffect]], inputs: EffectInputs
-) -> tuple[dict[str, CatalogueEffect], dict[str, list[str]]]:
-    """Return the effects that a recording can test, and what it lacks for each of the others."""
-    missing = {name: wants for name, kind in kinds.items() if (wants := kind.missing(inputs))}
-    known = {n: kind.for_recording(inputs) for n, kind in kinds.items() if n not in missing}
-    return known, missing
 
 
 class LinearEffect(CatalogueEffect):

@@ -94,12 +94,6 @@ class MapEffect(CatalogueEffect):
         """Return the sum of the values of a pixel's cells, shape (M,), metres."""
         return coefficients[self.cells_of(inputs.pixel)].sum(-1)
 
-    def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return how often each pixel lies in each cell, shape (M, number of cells): large."""
-        cells = self.cells_of(inputs.pixel)
-        one_hot = torch.zeros(len(cells), len(self.coefficients), dtype=torch.float64)
-        return one_hot.scatter_add_(1, cells, torch.ones_like(cells, dtype=torch.float64))
-
     def on_delay(self, state: FrameState) -> None:
         """Delay every pixel by its values."""
         pixel = torch.arange(state.radial_distance.numel())
