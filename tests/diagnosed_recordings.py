@@ -56,6 +56,13 @@ PLAIN: dict[str, Any] = {
 MOVING = {"robot": {"motion": "continuous"}, "conditions": {"frame_interval_s": 0.3}}
 """A robot that never stops."""
 
+STILL: dict[str, Any] = {
+    "shots": [{"target": "white", "poses": 12}],
+    "conditions": {"integration_time_us": [500.0]},
+    "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
+}
+"""A white wall seen at one exposure from poses that are as stated."""
+
 TIME: dict[str, Any] = {"name": "integration_time", "log_1": 0.006}
 """An effect of a few millimetres."""
 

@@ -87,9 +87,9 @@ def test_any_pose_and_time_survive_the_table(
     pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     pose[:3, 3] = metres
     seconds = microseconds * 1e-6
-    plane: dict[str, Any] = {"normal_world": pose[2, :3], "offset": metres, "target": 'a, "b"'}
-    when = {"timestamp": metres, "integration_time": seconds}
-    row = FrameRow(world_from_tool=pose, **plane, **when)
+    of_frame: dict[str, Any] = {"normal_world": pose[2, :3], "offset": metres, "target": 'a, "b"'}
+    of_frame |= {"timestamp": metres, "integration_time": seconds}
+    row = FrameRow(world_from_tool=pose, **of_frame)
     path = tmp_path_factory.mktemp("table") / "frames.csv"
     path.write_text(table_text([row]))
     table = read_table(path)

@@ -50,10 +50,8 @@ def test_the_noise_of_a_pixel_is_known_to_five_per_cent(
     """Against the truth that only a simulator knows."""
     observations, fit = nothing_study.observations, nothing_study.fit
     truth = np.load(nothing_missing.path / "truth" / "radial_distance.npy")
-    error = (
-        observations.measured
-        - torch.from_numpy(truth).flatten(1)[observations.frame, observations.pixel].double()
-    )
+    exact = torch.from_numpy(truth).flatten(1)[observations.frame, observations.pixel]
+    error = observations.measured - exact.double()
     columns = fit.model.error_columns(nothing_study.inputs.radial_distance) / fit.sigma[:, None]
     scaled = error / fit.sigma
     left = scaled - columns @ torch.linalg.lstsq(columns, scaled[:, None]).solution[:, 0]

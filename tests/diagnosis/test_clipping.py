@@ -14,25 +14,13 @@ from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.simulation.effects.saturation import light_of
 
 DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}
-CLIP: dict[str, Any] = {
-    "name": "saturation",
-    "full_counts": 40_000.0,
-    "knees": [1.0],
-    "softness": 0.02,
-    "knee_1": 1.0,
-}
+KNEE = {"knees": [1.0], "softness": 0.02, "knee_1": 1.0}
+CLIP: dict[str, Any] = {"name": "saturation", "full_counts": 40_000.0, **KNEE}
 
 
 @pytest.fixture(scope="module")
-def clipped(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    folder: Path = tmp_path_factory.mktemp("clipped") / "recording"
-    return diagnosed_recordings.recorded(folder, 50, [CLIP], DIM)
-
-
-@pytest.fixture(scope="module")
-def straight(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    folder: Path = tmp_path_factory.mktemp("straight") / "recording"
-    return diagnosed_recordings.recorded(folder, 50, [], DIM)
+def straight(folder: Path) -> Recording:
+    return diagnosed_recordings.recorded(folder / "straight", 50, [], DIM)
 
 
 def _three_images_clipped(folder: Path, seed: int) -> Recording:
@@ -65,10 +53,11 @@ def test_nothing_is_called_saturation_where_nothing_clips(straight: Recording) -
 
 
 def test_the_light_of_clipped_pixels_is_told_from_dim_ones(
-    clipped: Recording, straight: Recording
+    straight: Recording, tmp_path: Path
 ) -> None:
     light = observe(straight, 10_000_000).amplitude_images
     assert light is not None
+    clipped = diagnosed_recordings.recorded(tmp_path / "clipped", 50, [CLIP], DIM)
     study = prepare(clipped, DiagnosisOptions(), None).study
     inputs = study.inputs
     true = light.flatten(1)[inputs.frame, inputs.pixel].double()

@@ -61,13 +61,8 @@ def with_walls_found(recording: Recording) -> Recording:
     with RecordingWriter.with_header_of(out, known) as writer:
         for frame, number in enumerate(image):
             plane = found.frames.row(frame)
-            row = replace(
-                table.row(number),
-                normal_world=plane.normal_world,
-                offset=plane.offset,
-                target=plane.target,
-                pose_id=str(ids[frame]),
-            )
+            seen = {"offset": plane.offset, "target": plane.target, "pose_id": str(ids[frame])}
+            row = replace(table.row(number), normal_world=plane.normal_world, **seen)
             parts = {
                 name: array[number]
                 for name in ("depth", "amplitude", "raw")

@@ -1,4 +1,7 @@
-"""A simulator may come as options, as frames of any program, or as a function: one answer."""
+"""A simulator may come as options, as frames of any program, or as a function: one answer.
+
+What it says of its own error, hand-eye transform and parameters counts.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,6 +15,7 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
+from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.given import (
     GivenSimulator,
     frames_of,
@@ -21,7 +25,7 @@ from tofcorr.diagnosis.given import (
 )
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.observations import Observations, observe
+from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import twin_frames
@@ -236,3 +240,63 @@ def test_a_recording_of_the_built_in_simulator_is_one_once_its_guess_is_exact(
     refuse_mistaken_geometry(replace(guessed, tool_from_camera=true.numpy()))
     exact = few | {"hand_eye": {"guess": {"translation_mm": 0.0, "rotation_deg": 0.0}}}
     refuse_mistaken_geometry(diagnosed_recordings.recorded(tmp_path / "exact", 5, changes=exact))
+
+
+def test_a_fixed_hand_eye_transform_is_that_of_the_simulator(
+    nothing_missing: Recording, options: SimulatorOptions
+) -> None:
+    # It was the recording's guess, which the simulator does not share.
+    fixed = OPTIONS.model_copy(update={"hand_eye": "fixed"})
+    prepared = prepare(nothing_missing, fixed, GivenSimulator(options))
+    assert torch.equal(prepared.study.fit.tool_from_camera, options.hand_eye.tool_from_camera())
+    assert float(prepared.study.fit.residual.abs().median()) < 5e-3
+
+
+def test_the_gap_as_given_is_that_of_the_simulators_own_parameters(
+    nothing_missing: Recording, options: SimulatorOptions, observations: Observations
+) -> None:
+    """An ideal simulator with the true hand-eye transform: all errors of the camera are the gap."""
+    without = options.sensor.model_copy(update={"delays": type(options.sensor.delays)()})
+    ideal = options.model_copy(update={"sensor": without})
+    found = diagnose(nothing_missing, ideal, OPTIONS)
+    error = GivenSimulator(options).simulate(observations, OPTIONS).error
+    truth = float(error.square().mean().sqrt())
+    assert truth > 0.01
+    assert found.gap.as_given is not None
+    assert found.gap.as_given == pytest.approx(truth, rel=0.05)
+    assert found.gap.before < 0.1 * truth
+    assert f"{found.gap.as_given * 1e3:.1f} mm" in ".".join(found.verdict.split(".")[:2])
+    shares = {share.cause: share.share for share in found.shares}
+    assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
+    assert abs(shares["hand_eye"]) < 0.05
+
+
+def test_what_a_simulator_does_elsewhere_is_carried_to_the_recording(
+    nothing_missing: Recording,
+    options: SimulatorOptions,
+    observations: Observations,
+    tmp_path: Path,
+) -> None:
+    """The simulator saw 50 other poses; its error at the recording's own is known from options."""
+    elsewhere = diagnosed_recordings.recorded(tmp_path / "sim", 931, noise=False)
+    exact = options.hand_eye.tool_from_camera().numpy()
+    simulated = rendered_error(replace(elsewhere, tool_from_camera=exact), observations, OPTIONS)
+    truth = GivenSimulator(options).simulate(observations, OPTIONS).error
+    known = simulated.error.isfinite()
+    assert float(known.double().mean()) > 0.9
+    off = (simulated.error - truth)[known]
+    assert float(off.square().mean().sqrt()) < 3e-4
+    assert "other poses" in simulated.limits[0]
+    assert simulated.carried
+
+
+def test_the_truth_of_rendered_frames_is_their_own_plane(observations: Observations) -> None:
+    """An error is simulated less true distance, whatever the hand-eye transform."""
+    pose = torch.from_numpy(observations.recording.tool_from_camera)
+    camera = observations.recording.camera
+    size = camera.height * camera.width
+    truth = torch.zeros(observations.num_frames, size, dtype=torch.float64)
+    truth[observations.frame, observations.pixel] = predicted_distance(observations, pose)
+    depth = (truth + 0.004).reshape(-1, camera.height, camera.width).numpy()
+    error = rendered_error(frames_of(depth, observations.recording), observations, OPTIONS).error
+    assert torch.allclose(error, torch.full_like(error, 0.004), atol=ROUNDING)

@@ -27,11 +27,9 @@ def true_noise(
 ) -> list[float]:
     """Return the noise that the simulator drew, root mean square of each study, metres."""
     folder, sizes = tmp_path_factory.mktemp("without_noise"), []
-    for study, seed, effects in (
-        (time_study, 32, [diagnosed_recordings.TIME]),
-        (nothing_study, 31, []),
-    ):
-        ideal = diagnosed_recordings.recorded(folder / str(seed), seed, effects, noise=False)
+    effects = [diagnosed_recordings.TIME]
+    for study, seed, missing in ((time_study, 32, effects), (nothing_study, 31, [])):
+        ideal = diagnosed_recordings.recorded(folder / str(seed), seed, missing, noise=False)
         images = diagnosed_recordings.measured(ideal).reshape(len(ideal.frames), -1)
         seen = study.observations
         noise = seen.measured - images[seen.frame, seen.pixel]

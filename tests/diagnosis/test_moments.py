@@ -1,9 +1,11 @@
 """Sums over poses say what passes over the pixels would."""
 
+from collections.abc import Mapping
+
 import pytest
 import torch
 
-from tofcorr.diagnosis.sums.linear_system import BASE, draw_folds, pose_sums
+from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, draw_folds, pose_sums
 from tofcorr.diagnosis.sums.study import Study, with_residual
 from tofcorr.pixels.dataset import thread_number
 
@@ -23,6 +25,13 @@ def _brute_force(study: Study, names: list[str], keep: torch.Tensor) -> torch.Te
 def _base_prior(study: Study) -> torch.Tensor:
     count = study.system.columns[BASE].shape[1]
     return study.sums.layout.prior[:count, :count]
+
+
+def _summed(study: Study, residual: torch.Tensor, columns: Mapping[str, torch.Tensor]) -> PoseSums:
+    """Return the sums of a pass over the pixels."""
+    system = study.system
+    prior = _base_prior(study)
+    return pose_sums(study.observations, columns, system.pose, residual, study.fit, prior)
 
 
 def _per_pose(study: Study, residual: torch.Tensor) -> torch.Tensor:
@@ -48,27 +57,16 @@ def test_folds_hold_every_pose_once() -> None:
 def test_another_residual_needs_no_other_sums_than_its_own(nothing_study: Study) -> None:
     other = nothing_study.system.residual + 1e-3 * nothing_study.inputs.rows
     quick = with_residual(nothing_study, other).system.sums
-    whole = pose_sums(
-        nothing_study.observations,
-        nothing_study.system.columns,
-        nothing_study.system.pose,
-        other,
-        nothing_study.fit,
-        _base_prior(nothing_study),
-    )
+    whole = _summed(nothing_study, other, nothing_study.system.columns)
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)
 
 
 def test_other_columns_need_no_other_sums_than_their_own(nothing_study: Study) -> None:
-    plain = nothing_study
-    system = plain.system
-    other = system.columns["wiggling"] * (1 + plain.inputs.rows[:, None])
-    changed = {"wiggling": other}
-    residual, columns = system.residual, {**system.columns, **changed}
-    quick = with_residual(plain, residual, ("wiggling",), changed).sums
-    shared = (plain.observations, columns, system.pose, residual, plain.fit)
-    whole = pose_sums(*shared, _base_prior(plain))
+    system = nothing_study.system
+    changed = {"wiggling": system.columns["wiggling"] * (1 + nothing_study.inputs.rows[:, None])}
+    quick = with_residual(nothing_study, system.residual, ("wiggling",), changed).sums
+    whole = _summed(nothing_study, system.residual, {**system.columns, **changed})
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)
 
@@ -80,16 +78,7 @@ def test_sums_by_two_threads_are_those_of_one_bit_for_bit(time_study: Study) -> 
         for threads in (1, 2):
             torch.set_num_threads(threads)
             with thread_number(1):
-                found.append(
-                    pose_sums(
-                        time_study.observations,
-                        system.columns,
-                        system.pose,
-                        system.residual,
-                        time_study.fit,
-                        _base_prior(time_study),
-                    )
-                )
+                found.append(_summed(time_study, system.residual, system.columns))
     finally:
         torch.set_num_threads(before)
     assert torch.equal(found[0].weighted, found[1].weighted)

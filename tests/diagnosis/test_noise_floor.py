@@ -5,12 +5,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
-from diagnosed_recordings import altered, recorded
+from diagnosed_recordings import STILL, altered, recorded
 from scipy.ndimage import gaussian_filter, uniform_filter
 from torch import Tensor
 
@@ -24,11 +24,6 @@ from tofcorr.diagnosis.sums.study import Study
 SIGMA = 0.002  # metres
 SIZE = 0.001  # metres, root mean square
 KEPT = 0.7  # share that a frame keeps of the noise of the one before
-STILL: dict[str, Any] = {
-    "shots": [{"target": "white", "poses": 12}],
-    "conditions": {"integration_time_us": [500.0]},
-    "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
-}
 
 
 def _floor(study: Study, *columns: str) -> float:

@@ -165,11 +165,7 @@ def test_every_picture_of_every_kind_of_report_has_words(time_diagnosis: Diagnos
             figure = shown[shown.index(f'<figure id="{name}">') :].split("</figure>")[0]
             alt, finding, reading = (
                 re.search(pattern, figure, re.DOTALL)
-                for pattern in (
-                    'aria-label="([^"]*)"',
-                    "<p><b>(.*?)</b></p>",
-                    "</b></p><p>(.*)</p>",
-                )
+                for pattern in ('label="([^"]*)"', "<p><b>(.*?)</b></p>", "</b></p><p>(.*)</p>")
             )
             for words in (alt, finding, reading):
                 assert words is not None
@@ -204,17 +200,10 @@ def test_the_verdict_comes_first_and_the_causes_next(
 def test_what_is_compared_beside_the_gap_is_told_in_figures(
     time_diagnosis: DiagnosisResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = time_diagnosis.to_mapping() | {
-        "noise": {
-            "real_mm": 3.1,
-            "sim_mm": 1.0,
-            "ratio": 3.1,
-            "ratio_ci": [2.9, 3.3],
-            "source": "repeats",
-            "explained_by": [],
-        },
-        "dropouts": {"real_share": 0.021, "sim_share": 0.0, "p_value": 0.003, "explained_by": []},
-    }
+    ratio = {"ratio": 3.1, "ratio_ci": [2.9, 3.3], "source": "repeats"}
+    noise = {"real_mm": 3.1, "sim_mm": 1.0, **ratio, "explained_by": []}
+    lost = {"real_share": 0.021, "sim_share": 0.0, "p_value": 0.003, "explained_by": []}
+    found = time_diagnosis.to_mapping() | {"noise": noise, "dropouts": lost}
     monkeypatch.setattr(DiagnosisResult, "to_mapping", lambda _: found)
     shown = html.unescape(render(time_diagnosis))
     assert "3.1 mm, simulator 1.0 mm: ratio 3.10 [2.90, 3.30]. No difference" in shown

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-import diagnosed_recordings
 import numpy as np
 import pytest
+from diagnosed_recordings import STILL, altered, recorded
 from scipy.ndimage import uniform_filter
 
 from tofcorr.data.recording import Recording
@@ -19,22 +19,17 @@ from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(catalogue=("wiggling",))
 SIGMA = 0.002  # metres
-ONE_WAY: dict[str, Any] = {
-    "shots": [{"target": "white", "poses": 12}],
-    "conditions": {"integration_time_us": [500.0]},
-    "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
-}
 REPEATS = {"repeat_poses": 2, "repeat_frames": 5}
-REPEATED: dict[str, Any] = ONE_WAY | {"robot": ONE_WAY["robot"] | REPEATS}
-both_ways = pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single", "repeats"])
+REPEATED: dict[str, Any] = STILL | {"robot": STILL["robot"] | REPEATS}
+both_ways = pytest.mark.parametrize("changes", [STILL, REPEATED], ids=["single", "repeats"])
 
 
 def _filtered(folder: Path, changes: dict[str, Any], width: int) -> Study:
     """A recording whose noise, of one standard deviation, is a moving average of that width."""
-    recording = diagnosed_recordings.recorded(folder, 48, [], changes, noise=False)
+    recording = recorded(folder, 48, [], changes, noise=False)
     noise = np.random.default_rng(48).normal(size=(recording.num_frames, 40, 48))
     noise = width * SIGMA * np.stack([uniform_filter(own, width) for own in noise])[:, 8:32, 8:40]
-    return prepare(diagnosed_recordings.altered(recording, lambda z: z + noise), OPTIONS).study
+    return prepare(altered(recording, lambda z: z + noise), OPTIONS).study
 
 
 def _shared_in_squares() -> float:
@@ -79,14 +74,14 @@ def test_a_filter_is_measured_from_some_poses_of_a_long_recording(
 
 def test_a_wide_filter_does_not_hide_the_noise_of_single_frames(tmp_path: Path) -> None:
     """Differences over three pixels see half of the variance that a filter of five leaves."""
-    study = _filtered(tmp_path / "wide", ONE_WAY, 5)
+    study = _filtered(tmp_path / "wide", STILL, 5)
     assert study.fit.shared.level > 1.2
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
 
 def test_a_filter_is_seen_where_few_pixels_of_each_image_are_chosen(tmp_path: Path) -> None:
     """Chosen pixels are far apart; their floor was that of differences between neighbours."""
-    recording = _filtered(tmp_path / "wide", ONE_WAY, 5).observations.recording
+    recording = _filtered(tmp_path / "wide", STILL, 5).observations.recording
     options = DiagnosisOptions(catalogue=("wiggling",), most_pixels=2000)
     study = prepare(Recording.open(recording.path), options).study
     assert study.observations.is_sample
@@ -98,13 +93,13 @@ def test_stripes_that_move_from_frame_to_frame_are_no_filtered_noise(
     changes: dict[str, Any], tmp_path: Path
 ) -> None:
     """Neighbours share them, but so do pixels farther apart than a filter reaches."""
-    recording = diagnosed_recordings.recorded(tmp_path / "striped", 48, [], changes, noise=False)
+    recording = recorded(tmp_path / "striped", 48, [], changes, noise=False)
     random = np.random.default_rng(48)
     row, column = np.mgrid[:24, :32]
     start = random.uniform(0, 2 * np.pi, (recording.num_frames, 1, 1))
     stripes = 3 * SIGMA * np.sin(0.2 * column + 0.3 * row + start)
     odd = stripes + SIGMA * random.normal(size=stripes.shape)
-    study = prepare(diagnosed_recordings.altered(recording, lambda z: z + odd), OPTIONS).study
+    study = prepare(altered(recording, lambda z: z + odd), OPTIONS).study
     assert study.fit.shared.striped
     assert study.fit.noise.repeats == 0
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.25)
@@ -126,10 +121,10 @@ def test_repeats_show_a_filter_where_a_recording_is_thinned_out(tmp_path: Path) 
 
 def test_a_smooth_pattern_that_stands_still_is_no_filtered_noise(tmp_path: Path) -> None:
     """In units of the noise it differs from frame to frame, for far frames are noisier."""
-    recording = diagnosed_recordings.recorded(tmp_path / "ring", 48, [], ONE_WAY)
+    recording = recorded(tmp_path / "ring", 48, [], STILL)
     row, column = np.mgrid[:24, :32]
     ring = np.exp(-0.5 * ((np.hypot(row - 11.5, column - 15.5) - 8) / 2) ** 2)
-    recording = diagnosed_recordings.altered(recording, lambda z: z + 0.02 * ring)
+    recording = altered(recording, lambda z: z + 0.02 * ring)
     study = prepare(recording, OPTIONS).study
     assert set(study.fit.shared.share.values()) == {0.0}
 
@@ -159,7 +154,7 @@ def test_independent_noise_shares_nothing(nothing_study: Study) -> None:
 
 
 def test_frames_of_a_pose_keep_the_same_pixels(tmp_path: Path) -> None:
-    recording = diagnosed_recordings.recorded(tmp_path / "thin", 49, [], REPEATED)
+    recording = recorded(tmp_path / "thin", 49, [], REPEATED)
     budget = 200
     observations = observe(recording, budget * recording.num_frames)
     of_pose: dict[int, set[int]] = {}
@@ -172,7 +167,7 @@ def test_frames_of_a_pose_keep_the_same_pixels(tmp_path: Path) -> None:
 
 def test_repeats_have_one_exposure(tmp_path: Path) -> None:
     changes = REPEATED | {"conditions": {"integration_time_us": [250.0, 1000.0]}}
-    recording = diagnosed_recordings.recorded(tmp_path / "exposures", 49, [], changes)
+    recording = recorded(tmp_path / "exposures", 49, [], changes)
     observations = observe(recording, 10_000)
     groups = same_exposure(observations)
     assert sorted(np.concatenate(groups).tolist()) == list(range(recording.num_frames))
