@@ -124,13 +124,10 @@ def _load_array(content: bytes) -> Any:  # noqa: ANN401 - a tensor, or a mapping
     return {k: str(v) if v.dtype.kind == "U" else torch.from_numpy(v) for k, v in loaded.items()}
 
 
-def _saved(save: Callable[[Any, Any], Any]) -> Callable[[Any], bytes]:
-    def dump(values: Any) -> bytes:  # noqa: ANN401 - any value
-        written = io.BytesIO()
-        save(values, written)
-        return written.getvalue()
-
-    return dump
+def _saved(save: Callable[[Any, Any], Any], values: Any) -> bytes:  # noqa: ANN401 - any value
+    written = io.BytesIO()
+    save(values, written)
+    return written.getvalue()
 
 
 def _save_array(values: Any, file: Any) -> None:  # noqa: ANN401 - any value
@@ -145,9 +142,11 @@ FORMATS: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes | str]]] 
     ".yaml": (yaml.safe_load, partial(yaml.safe_dump, allow_unicode=True)),
     ".json": (json.loads, partial(json.dumps, default=str)),
     ".csv": (lambda content: [x.split(",") for x in content.decode().splitlines()], _to_csv),
-    ".npy": (_load_array, _saved(_save_array)),
-    ".npz": (_load_array, _saved(_save_array)),
-    ".pt": (lambda content: torch.load(io.BytesIO(content), weights_only=True), _saved(torch.save)),
+    **dict.fromkeys((".npy", ".npz"), (_load_array, partial(_saved, _save_array))),
+    ".pt": (
+        lambda content: torch.load(io.BytesIO(content), weights_only=True),
+        partial(_saved, torch.save),
+    ),
 }
 
 

@@ -284,8 +284,7 @@ def _off(key: str, a: float, b: float) -> float:
     """Return how far two numbers are apart, in units of the tolerance of their key."""
     if a == b or (math.isnan(a) and math.isnan(b)):
         return 0.0
-    limits = (own for pattern, own in TOLERANCES.items() if fnmatch(key.lower(), pattern))
-    relative, absolute = next(limits)
+    relative, absolute = next(TOLERANCES[one] for one in TOLERANCES if fnmatch(key.lower(), one))
     off = abs(a - b) / (absolute + relative * max(abs(a), abs(b)))
     return math.inf if math.isnan(off) else off
 

@@ -34,13 +34,9 @@ COEFFICIENTS = (0.02, 0.01, -0.006, 0.002, 0.004, -0.001, 0.001, 0.003, -0.001, 
 
 def calibration(height: int, width: int) -> CalibrationState:
     """Return an EA calibration of a camera of this size."""
-    domain = Domain(
-        height=height,
-        width=width,
-        radial_distance=Interval(0.5, 2.0),
-        amplitude=Interval(10.0, 900.0),
-        normalised_amplitude=Interval(10.0, 900.0),
-    )
+    amplitudes = dict.fromkeys(("amplitude", "normalised_amplitude"), Interval(10.0, 900.0))
+    distances = Interval(0.5, 2.0)
+    domain = Domain(height=height, width=width, radial_distance=distances, **amplitudes)
     return CalibrationState(
         name="EA",
         error_model=model_options("ea"),

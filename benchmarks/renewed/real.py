@@ -123,8 +123,11 @@ def real_view(data: Data) -> View:
     )
 
 
-def _added(rng: Random, view: View, form: Form) -> tuple[Form, Array, Array]:
-    """A form with its change of depth (N, H, W), metres, and its factor of the amplitude."""
+Added = tuple[Form, Array, Array]
+"""A form with its change of depth (N, H, W), metres, and its factor of the amplitude."""
+
+
+def _added(rng: Random, view: View, form: Form) -> Added:
     change = form.draw(rng, view.world)
     before = _measured(view, [])
 
@@ -149,13 +152,7 @@ def _measured(view: View, hooks: list[Hook]) -> tuple[Array, Array]:
 
 
 def _write(
-    rng: Random,
-    out: Path,
-    thin: Path,
-    data: Data,
-    *,
-    term: str = "",
-    added: tuple[Form, Array, Array] | None = None,
+    rng: Random, out: Path, thin: Path, data: Data, *, term: str = "", added: Added | None = None
 ) -> Entry:
     """Write one recording of the tier and its sealed answer; return the manifest's entry."""
     name = f"r{rng.integers(2**48):012x}"

@@ -18,6 +18,7 @@ without a refusal:
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ import numpy as np
 
 import tofcorr
 from tofcorr.diagnosis.findings.outliers import LARGEST_GAP
+from tofcorr.drift.offset import Wall
 from tofcorr.errors import TofcorrError
 from tofcorr.options import resolve_options
 from tofcorr.training.calibration import TrainingOptions
@@ -147,24 +149,18 @@ def _models(*names: str) -> list[dict[str, Any]]:
     ]
 
 
-def _error_is_wrong(command: str) -> Callable[[Said, Clean], bool]:
-    def wrong(said: Said, clean: Clean) -> bool:
-        error, right = said["error_mm"], clean.says(command)["error_mm"]
-        return not 0.5 * right <= error <= max(3 * right, right + WRONG_MM)
-
-    return wrong
+def _error_is_wrong(command: str, said: Said, clean: Clean) -> bool:
+    error, right = said["error_mm"], clean.says(command)["error_mm"]
+    return not 0.5 * right <= error <= max(3 * right, right + WRONG_MM)
 
 
-def _check(wall: str) -> Callable[[Path, Clean], Said]:
-    def check(folder: Path, clean: Clean) -> Said:
-        found = tofcorr.check(clean.calibration(), folder, wall=wall)  # type: ignore[arg-type]
-        return {
-            "headline": found.headline,
-            "sentence": repr(found).splitlines()[1 if found.headline is None else 0],
-            "interval_mm": [1e3 * end for end in found.interval],
-        }
-
-    return check
+def _check(wall: Wall, folder: Path, clean: Clean) -> Said:
+    found = tofcorr.check(clean.calibration(), folder, wall=wall)
+    return {
+        "headline": found.headline,
+        "sentence": repr(found).splitlines()[1 if found.headline is None else 0],
+        "interval_mm": [1e3 * end for end in found.interval],
+    }
 
 
 def _check_is_wrong(said: Said, clean: Clean) -> bool:
@@ -186,19 +182,17 @@ def _diagnose(folder: Path, clean: Clean) -> Said:
 
 
 def _diagnose_is_wrong(said: Said, clean: Clean) -> bool:
-    gap = said["gap_mm"]
-    if not gap <= 1e3 * LARGEST_GAP:
-        return True
-    light = set(said["effects"]) - GEOMETRY
-    return gap > clean.says("diagnose")["gap_mm"] + WRONG_MM and bool(light)
+    gap, light = said["gap_mm"], set(said["effects"]) - GEOMETRY
+    most = clean.says("diagnose")["gap_mm"] + WRONG_MM if light else math.inf
+    return not gap <= min(1e3 * LARGEST_GAP, most)
 
 
 COMMANDS: Mapping[str, tuple[Callable[[Path, Clean], Said], Callable[[Said, Clean], bool]]] = {
     "train": (_train, _train_is_wrong),
-    "evaluate": (_evaluate, _error_is_wrong("evaluate")),
-    "select": (_select, _error_is_wrong("select")),
-    "check": (_check("per_image"), _check_is_wrong),
-    "check recorded": (_check("recorded"), _check_is_wrong),
+    "evaluate": (_evaluate, partial(_error_is_wrong, "evaluate")),
+    "select": (_select, partial(_error_is_wrong, "select")),
+    "check": (partial(_check, "per_image"), _check_is_wrong),
+    "check recorded": (partial(_check, "recorded"), _check_is_wrong),
     "diagnose": (_diagnose, _diagnose_is_wrong),
 }
 """What asks each command, and judges it; `check` with unknown and with recorded walls."""

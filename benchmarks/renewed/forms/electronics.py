@@ -98,9 +98,7 @@ def dark_power_law(rng: Random, world: World) -> Change:
 def gain_switch(rng: Random, world: World) -> Change:
     """The converter switches its gain at an amplitude; the two ranges differ by an offset."""
     at, soft, sign = rng.uniform(0.08, 0.35), rng.uniform(0.02, 0.08), rng.choice([-1.0, 1.0])
-    return lambda strength, view, path: (
-        path + sign * strength / (1 + (_shine(view) / at) ** (1 / soft))
-    )
+    return adding(lambda view: sign / (1 + (_shine(view) / at) ** (1 / soft)))
 
 
 @form("amplitude", "path", 0.005)

@@ -41,11 +41,11 @@ def wiggle_of_dark(rng: Random, world: World) -> Change:
     start, fade = rng.uniform(0, 2 * np.pi), rng.uniform(0.15, 0.5)
     turn = 16 * np.pi * world.sensor.frequencies[-1] / SPEED_OF_LIGHT
 
-    def change(strength: float, view: View, path: Array) -> Array:
+    def wave(view: View) -> Array:
         dark = np.exp(-view.amplitude / view.bright / fade)
-        return path + strength * dark * np.sin(turn * view.distance + start)
+        return dark * np.sin(turn * view.distance + start)
 
-    return change
+    return adding(wave)
 
 
 @form("robot_kinematics", "poses", 0.01)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, Random
-from benchmarks.renewed.signal_chain import Change, View, adding, background, form
+from benchmarks.renewed.signal_chain import Change, adding, background, form
 from benchmarks.renewed.world import NOMINAL_US, World, heat
 
 EXPOSED: dict[str, Any] = {"exposure": "random", "logged": ("integration_time_us",)}
@@ -104,24 +104,15 @@ def coarse_sensor(rng: Random, world: World) -> Change:
 def false_correlation(rng: Random, world: World) -> Change:
     """Background light correlates a little, for the taps of a pixel do not match."""
     turn, middle = np.exp(1j * rng.uniform(0, 2 * np.pi)), world.design.near + world.design.far
-
-    def change(strength: float, view: View, phasor: np.ndarray) -> np.ndarray:
-        at = np.exp(2j * np.pi * view.frequency / SPEED_OF_LIGHT * middle)
-        return phasor + strength * background(view) * at * turn
-
-    return change
+    per_hertz = 2j * np.pi / SPEED_OF_LIGHT * middle
+    return adding(lambda view: background(view) * np.exp(per_hertz * view.frequency) * turn)
 
 
 @form("ambient_light", "path", 0.05, **LAMPS)
 def bias_shift(rng: Random, world: World) -> Change:
     """The background's charge delays the gates, by its share of all charge."""
     sign = rng.choice([-1.0, 1.0])
-
-    def change(strength: float, view: View, path: Array) -> Array:
-        light = background(view)
-        return path + sign * strength * light / (light + view.amplitude)
-
-    return change
+    return adding(lambda view: sign * background(view) / (background(view) + view.amplitude))
 
 
 @form("ambient_light", "path", 0.01, **LAMPS)
