@@ -255,18 +255,14 @@ def stages_of(
         gap: Before and after them.
         residual: Of the simulator as given, shape (M,), metres; None: none was given.
     """
-    binned, as_given = binned_covariates(study), Stage(name="as_given")
+    binned, as_given = binned_covariates(study), Stage(name="as_given", gap=gap.as_given)
     if residual is not None:
-        as_given = find_where(study, "as_given", residual=residual, binned=binned)
-    recalibrated = find_where(study, "recalibrated", binned=binned)
-    with_effects = replace(recalibrated, name="with_effects")
+        as_given = find_where(study, as_given, binned, None, residual)
+    recalibrated = find_where(study, Stage(name="recalibrated", gap=gap.before), binned)
+    with_effects = replace(recalibrated, name="with_effects", gap=gap.after)
     if named.names:
-        with_effects = find_where(named.study, "with_effects", named.columns, binned=binned)
-    return (
-        replace(as_given, gap=gap.as_given),
-        replace(recalibrated, gap=gap.before),
-        replace(with_effects, gap=gap.after),
-    )
+        with_effects = find_where(named.study, with_effects, binned, named.columns)
+    return as_given, recalibrated, with_effects
 
 
 @dataclass(frozen=True, kw_only=True)

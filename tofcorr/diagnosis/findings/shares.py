@@ -476,13 +476,9 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     if gap.as_given is None:
         own, drawn = values_beside_base(parts, once)[0], [values_beside_base(parts, weights)]
     else:
-        own, drawn = (
-            best.values,
-            [
-                torch.stack([parts.refitted(w, sparse=sparse).values for w in weights])
-                for sparse in (True, False)
-            ],
-        )
+        own = best.values
+        both = ([parts.refitted(w, sparse=sparse) for w in weights] for sparse in (True, False))
+        drawn = [torch.stack([one.values for one in fits]) for fits in both]
         if total > 0:
             shrunk = [width / total**2 for width in shrinkage_of_values(parts, best)]
     shares, rate = scaled_shares(own, total, gap.after)

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
-from tofcorr.diagnosis.sums.linear_system import Sums
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects.inputs import is_clock
@@ -125,16 +124,10 @@ Binned = tuple[str, tuple[float, ...], Tensor, Tensor]
 the covariate scaled to a range from 0 to 1, shape (M,)."""
 
 
-def left_out_residual(study: Study, chosen: Sequence[str], sums: Sums) -> Tensor:
-    """Return residuals with the variance of the errors, shape (M,), metres.
-
-    Args:
-        study: The recording.
-        chosen: Effects of the model.
-        sums: Ordinary or generalised sums of every pose, by which the model is fitted.
-    """
+def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
+    """Return residuals of a model of some effects with the variance of the errors, (M,), metres."""
     parts, left = study.system.of(chosen), study.system.residual
-    theta = sums.left_out_solutions(chosen)[study.observations.unit][:, :, None]
+    theta = study.sums.ols.left_out_solutions(chosen)[study.observations.unit][:, :, None]
     of_parts = theta.split([part.shape[1] for part in parts], dim=1)
     for part, own in zip(parts, of_parts, strict=True):
         left = left - by_frame(part, own, study.observations.frame)[:, 0]
@@ -247,29 +240,27 @@ def flipped(
 
 def find_where(
     study: Study,
-    name: StageName,
-    chosen: Sequence[str] = (),
-    *,
+    stage: Stage,
+    binned: Sequence[Binned],
+    chosen: Sequence[str] | None = (),
     residual: Tensor | None = None,
-    binned: Sequence[Binned] | None = None,
 ) -> Stage:
-    """Test all covariates and the image map for a bias.
+    """Test all covariates and the image map for a bias; return the stage with what was found.
 
     Args:
         study: The recording.
-        name: Which stage.
-        chosen: Effects of the model whose residual is tested.
-        residual: The residual to test instead, of what was not fitted, shape (M,), metres.
-        binned: The covariates in bins, where they are known; None: they are computed.
+        stage: Which stage, and the gap there.
+        binned: The covariates in bins.
+        chosen: Effects of the model whose residual is tested; None: `residual` is, of no fit.
+        residual: Of what was not fitted, shape (M,), metres.
     """
-    fitted = None if residual is not None else chosen
     if residual is None:
-        residual = left_out_residual(study, chosen, study.sums.ols)
-    flips = flipped(study, residual, fitted)
+        residual = left_out_residual(study, chosen or ())
+    flips = flipped(study, residual, chosen)
     weight, unit, units = study.weight, study.unit_of_pixel, study.sums.num_units
     places, regions = list[tuple[Tensor, int, Tensor]](), list[Region]()
     one_bin, ones = torch.zeros_like(unit), torch.ones_like(weight)
-    for covariate, edges, place, scaled in binned or binned_covariates(study):
+    for covariate, edges, place, scaled in binned:
         # Around the weighted mean, the coefficient of a line is its end minus its start.
         line = scaled - (weight @ scaled) / weight.sum()
         places += [(place, len(edges) - 1, ones), (one_bin, 1, line)]
@@ -291,11 +282,11 @@ def find_where(
         parts.append((own, flips(own, place, along), counts))
     sums, total, counts = (torch.cat(own) for own in zip(*parts, strict=True))
     offsets = sums[-1] / counts[-1].clamp(min=TINY)
-    return _assembled(name, sums[:-1], total[:-1], counts[:-1], regions, offsets)
+    return _assembled(stage, sums[:-1], total[:-1], counts[:-1], regions, offsets)
 
 
 def _assembled(
-    name: StageName,
+    stage: Stage,
     sums: Tensor,
     total: Tensor,
     counts: Tensor,
@@ -307,7 +298,7 @@ def _assembled(
     """Compare all bins that four poses show with their maximum under flips.
 
     Args:
-        name: Which stage.
+        stage: Which stage, and the gap there.
         sums: Weighted residuals of every bin and pose, shape (R, U).
         total: Observed, then of every flip, shape (R, 1 + B).
         counts: Sums of the weights, shape (R, U).
@@ -334,8 +325,8 @@ def _assembled(
         if bool(enough[place]):
             found.append(replace(regions[place], bias=size, p_value=float(p_values[place])))
     tiles = slice(len(regions), None)
-    return Stage(
-        name=name,
+    return replace(
+        stage,
         regions=tuple(found),
         tiles=torch.where(enough, bias, torch.nan)[tiles].reshape(TILES).numpy(),
         tile_p_values=p_values[tiles].reshape(TILES).numpy(),

@@ -325,12 +325,9 @@ def _plain(study: Study) -> SimulatorOptions:
 
 def simulated_frames(recording: Recording) -> list[int]:
     """Return the frames to simulate: all, or as many as do not take long."""
-    frames = recording.num_frames
-    size = recording.camera.height * recording.camera.width
-    most = max(_LEAST_FRAMES, _MOST_PIXELS // size)
-    if frames <= most:
-        return list(range(frames))
-    return torch.linspace(0, frames - 1, most).round().long().unique().tolist()
+    frames, camera = recording.num_frames, recording.camera
+    most = max(_LEAST_FRAMES, _MOST_PIXELS // (camera.height * camera.width))
+    return torch.linspace(0, frames - 1, min(frames, most)).round().long().unique().tolist()
 
 
 def twin_distance(

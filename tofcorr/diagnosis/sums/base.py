@@ -445,7 +445,8 @@ def fit_base(
         of_whole = model.on(whole).residual(pose, coefficients)
         own = noise.at(brightness_of(whole), whole.frame)
         weights = robust_weights(of_whole, own, common_of_neighbours(whole, of_whole))
-        shared = shared.with_level_of(shared_noise(whole, of_whole, own, weights))
+        level = shared_noise(whole, of_whole, own, weights).level
+        shared = replace(shared, level=max(shared.level, level))
     held = noise.held_to_neighbours(shared.level, shared.striped and shared.from_repeats)
     return BaseFit(
         model=model,

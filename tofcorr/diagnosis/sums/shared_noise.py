@@ -9,7 +9,7 @@ edges, unless hardly any others are left.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -169,11 +169,6 @@ class SharedNoise:
     from_repeats: bool
     striped: bool
     whole: float
-
-    def with_level_of(self, other: "SharedNoise") -> "SharedNoise":
-        """Return the same with the level of another estimate, if that is larger."""
-        level = max(self.level, other.level)
-        return replace(self, level=level, whole=self.whole * (self.level / level) ** 2)
 
     @property
     def precise(self) -> bool:

@@ -15,6 +15,7 @@ from tofcorr.simulation.effects.inputs import (
     inputs_from_state,
 )
 from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
+from tofcorr.simulation.effects.surface import LEAST_COSINE
 from tofcorr.simulation.effects.target_shape import AreaShape
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.scene import planes_from_world
@@ -32,9 +33,6 @@ _ASIDE = (-0.25, 0.0, 0.25)
 _WIDTH = 0.25
 # Smallest distance to a patch, metres: nearer patches are not point sources. Set by hand.
 _NEAREST = 0.05
-# Smallest cosine of the incidence angle used (87 degrees; no unit). Set by hand: keeps the ratio to
-# the direct light finite.
-_LEAST_COSINE = 0.05
 
 # Pixels evaluated at once. Chosen: what is computed of them stays in a processor's cache.
 _AT_ONCE = 10_000
@@ -61,7 +59,7 @@ def light_by_surfaces(
     # Along the last axes: where a patch lies along the edge, and how high.
     up, depth, aside = (extent * xy.new_tensor(row) for row in (_BEFORE, _DEPTH, _ASIDE))
     aside, height = aside[:, None], camera[:, 2, None, None] - up
-    direct = (distance**2 / cosine.clamp(min=_LEAST_COSINE))[:, None, None]
+    direct = (distance**2 / cosine.clamp(min=LEAST_COSINE))[:, None, None]
     surfaces = []
     for (_, axis, sign), beyond in itertools.product(SIDES, BEYOND.values()):
         wall = (high[axis] if sign > 0 else -low[axis]) + beyond * extent
@@ -177,7 +175,7 @@ def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor
     flange = torch.polar(cosine / far**2, turn * distance)
     # What bounced more often lights the target evenly; its error grows as the direct light falls.
     x, y = shape.scaled(inputs.target_xy)
-    strength = far**2 / cosine.clamp(min=_LEAST_COSINE)
+    strength = far**2 / cosine.clamp(min=LEAST_COSINE)
     smooth = strength[:, None] * side_by_side(products(x, y, 0, _ROOM_DEGREE))
     room = 1j * turn * torch.cat([smooth, (far - 1)[:, None] * smooth], dim=1)
     return torch.cat([light, room, flange[:, None]], dim=1)

@@ -9,9 +9,9 @@ from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
 
-# Smallest cosine used (87 degrees; no unit). Set by hand: 1 / cosine stays finite, and no camera
-# measures at that angle.
-_LEAST_COSINE = 0.05
+LEAST_COSINE = 0.05
+"""Smallest cosine used (87 degrees; no unit). Set by hand: 1 / cosine stays finite, and no camera
+measures at that angle."""
 
 
 class IncidenceAngleEffect(LinearDelay):
@@ -30,7 +30,7 @@ class IncidenceAngleEffect(LinearDelay):
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the two functions of the angle, shape (M, 2)."""
-        cosine = inputs.incidence_cosine.clamp(min=_LEAST_COSINE)
+        cosine = inputs.incidence_cosine.clamp(min=LEAST_COSINE)
         return torch.stack([1 / cosine - 1, (1 - cosine) ** 2], dim=-1)
 
 
