@@ -16,7 +16,6 @@ from tofcorr.diagnosis.report.words import (
     axis_label,
     cause_words,
     effect_words,
-    least_p,
     mm,
     most_biased,
     p_words,
@@ -129,12 +128,12 @@ def _bars(
     return figure, axes
 
 
-def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figure:
+def covariate_strips(result: "DiagnosisResult", stages: Sequence[Stage], most: int) -> Figure:
     """Draw the bias along the covariates of `most_biased` at the first of the stages.
 
     Args:
+        result: What was found.
         stages: One or more, which are drawn over each other.
-        least_p: The smallest p-value that the test can give.
         most: Covariates that are drawn at most.
     """
     by_stage = [one.by_covariate() for one in stages]
@@ -156,7 +155,8 @@ def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figu
         axes.set_xlabel(axis_label(name))
         best = min(region.p_value for region in regions)
         colour = RED if best <= SIGNIFICANT else GREY
-        axes.set_title(f"p {p_words(best, least_p)}", color=colour, fontsize=9)
+        least = 1 / (result.options.tests.flips + 1)  # That the sign flips can give.
+        axes.set_title(f"p {p_words(best, least)}", color=colour, fontsize=9)
         axes.locator_params(nbins=5)
     figure.supylabel("bias, mm", fontsize=9)
     return figure
@@ -254,8 +254,8 @@ def paired_poses(result: "DiagnosisResult") -> Figure:
 
 
 FIGURES: dict[str, Callable[["DiagnosisResult"], Figure]] = {
-    "where_as_given": lambda r: covariate_strips(stages_shown(r)[:1], least_p(r), most=4),
-    "where": lambda r: covariate_strips(stages_shown(r, fitted=True), least_p(r), most=6),
+    "where_as_given": lambda r: covariate_strips(r, stages_shown(r)[:1], most=4),
+    "where": lambda r: covariate_strips(r, stages_shown(r, fitted=True), most=6),
     "which": effect_forest,
     "aliases": absorption_map,
     "map": image_maps,

@@ -74,11 +74,6 @@ def sized(size: Estimated) -> str:
     return f"{known(1e3 * size, in_mm)} mm [{', '.join(known_interval(in_mm))}]"
 
 
-def least_p(result: "DiagnosisResult") -> float:
-    """Return the smallest p-value that the sign flips can give."""
-    return 1 / (result.options.tests.flips + 1)
-
-
 def stages_shown(result: "DiagnosisResult", *, fitted: bool = False) -> list[Stage]:
     """Return the stages that differ: no first one without simulator, no last without effects.
 
