@@ -14,7 +14,7 @@ from benchmarks.renewed.geometry import Array, Random
 from benchmarks.renewed.recording import Recorded, Truth, record, write_recording
 from benchmarks.renewed.signal_chain import Change, Form, Hook, noise_of, scaled
 from benchmarks.renewed.world import World, draw_world
-from benchmarks.sealed.answers import seal
+from benchmarks.sealed.answers import Entry, seal
 
 TIERS = {"E": INSIDE, "N": (), "O": OUTSIDE}  # an effect, nothing, one outside any catalogue
 
@@ -113,7 +113,7 @@ def turn(seed: int, forms: Sequence[Form], index: int) -> Form:
     return forms[order[index % len(forms)]]
 
 
-def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
+def write_case(seed: int, tier: str, index: int, out: Path) -> Entry:
     """Write one case; return the manifest's entry. It depends on seed, tier and index alone."""
     rng = np.random.default_rng([seed, list(TIERS).index(tier), index])
     case = make_case(rng, [turn(seed, TIERS[tier], index)] if TIERS[tier] else ())
@@ -121,13 +121,8 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
 
 
 def write_sealed(
-    rng: Random,
-    case: Case,
-    out: Path,
-    about: Mapping[str, Any],
-    role: Mapping[str, Any],
-    without: Collection[str] = (),
-) -> dict[str, Any]:
+    rng: Random, case: Case, out: Path, about: Entry, role: Entry, without: Collection[str] = ()
+) -> Entry:
     """Write a recording `without` some columns or files, and its answer; return its entry."""
     name = f"r{rng.integers(2**48):012x}"
     write_recording(out / "recordings" / name, case.recorded, without)

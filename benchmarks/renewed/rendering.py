@@ -61,12 +61,8 @@ def scene_of(room: Room, camera: np.ndarray) -> dict[str, Any]:
     import mitsuba as mi
 
     diffuse = {"type": "diffuse", "reflectance": _grey(room.albedo)}
-    glossy = {
-        "type": "roughplastic",
-        "distribution": "ggx",
-        "alpha": room.gloss,
-        "diffuse_reflectance": _grey(room.albedo),
-    }
+    rough = {"type": "roughplastic", "distribution": "ggx", "alpha": room.gloss}
+    glossy = {**rough, "diffuse_reflectance": _grey(room.albedo)}
     parts: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "transient_path", "max_depth": 8, "rr_depth": 5},

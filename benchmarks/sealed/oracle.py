@@ -84,7 +84,8 @@ class Problem:
     @property
     def coefficients(self) -> Array:
         """Coefficients (P,) of the weighted fit."""
-        return solve(*self.fitted()[:2])
+        fit = self.fitted()
+        return solve(fit.gram.sum(0), fit.right.sum(0))
 
 
 def ask(data: Data, fields: Mapping[str, Array], expected: Array) -> Oracle:
@@ -157,13 +158,11 @@ def _step(problem: Problem) -> Array:
 
 
 def solve(gram: Array, right: Array, size: Array | None = None) -> Array:
-    """Coefficients (P,) of moments, summed or per image; columns may be collinear.
+    """Coefficients (P,) of summed moments; columns may be collinear.
 
     `size` (P,), the diagonal of the moments of all images, tells which columns are as good as
     absent from these.
     """
-    if gram.ndim == 3:
-        gram, right = gram.sum(0), right.sum(0)
     size = np.diag(gram) if size is None else size
     present = np.diag(gram) > 1e-9 * size
     scale = np.sqrt(np.diag(gram)[present])
