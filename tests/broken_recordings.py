@@ -152,7 +152,7 @@ TEXTS: dict[str, Damage] = {
     r"mask\.npy: not a readable \.npy file": content("mask.npy", ""),
 }
 TABLES: dict[str, Damage] = {
-    r"frame 5 has 18 cells; the header has 19": table(lambda t: t.rstrip().rsplit(",", 1)[0]),
+    r"frame 5: 18 of 19 cells": table(lambda t: t.rstrip().rsplit(",", 1)[0]),
     r"frames\.csv: a recording of no frame": table(lambda text: text.splitlines()[0] + "\n"),
     r"column 'tx' appears twice": table(lambda text: text.replace("ambient", "tx", 1)),
     r"frames\.csv: column 'qw' is missing": without_column("qw"),
@@ -189,7 +189,7 @@ ARRAYS: dict[str, Damage] = {
     r"depth\.npy: .*\(frames, 5, 7\), got \(6, 5, 6\)": array("depth", lambda a: a[:, :, :-1]),
     r"got \(6, 35\)": array("depth", lambda a: a.reshape(6, -1)),
     r"depth\.npy: is in Fortran order": array("depth", np.asfortranarray),
-    r"raw\.npy: expected shape \(frames, 4, 5, 7\)": array("raw", lambda a: a[:, :3]),
+    r"raw\.npy: recording\.yaml needs \(frames, 4, 5, 7\)": array("raw", lambda a: a[:, :3]),
     r"amplitude\.npy: has 5 frames": array("amplitude", lambda a: a[:5]),
     r"mask\.npy: has 12 frames.* 6 rows": array("mask", lambda a: np.concatenate([a, a])),
     r"depth\.npy: not a readable \.npy file": array("depth", lambda a: a.astype(object)),

@@ -168,7 +168,7 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
         (corrector, garbage, "garbage.ts: is a file; a recording is a folder"),
         (garbage, source, "garbage.ts: is not the corrector.ts of a run"),
         (pickled, source, "weights.pt: not a TorchScript module"),
-        (nameless, source, "nameless.ts: a TorchScript module, but without a corrector's meta"),
+        (nameless, source, "nameless.ts: without a corrector's metadata"),
         (along_axis, source, "depth is of kind 'radial', but"),
         (corrector, turned, "frames are 5x7 pixels, but"),
         (needs_amplitude, without_amplitude, "amplitude.npy is missing; the corrector"),

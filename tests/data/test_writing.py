@@ -94,8 +94,8 @@ def _with_row(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"depth": np.ones((6, 4, 7))}, r"frame 0, depth: expected shape \(5, 7\), got \(4, 7\)"),
-        ({"depth": np.ones((5, 5, 7))}, r"depth has 5 frames, but there are 6 rows"),
+        ({"depth": np.ones((6, 4, 7))}, r"frame 0, depth: expected \(5, 7\), got \(4, 7\)"),
+        ({"depth": np.ones((5, 5, 7))}, r"5 frames of depth, 6 rows"),
         (
             dict.fromkeys(("amplitude", "mask", "raw")) | {"depth": np.ones((0, 5, 7)), "rows": []},
             r"a recording of no frame",
@@ -125,7 +125,7 @@ def test_what_the_reader_would_refuse_is_not_written(
 
 
 def test_an_image_given_for_some_frames_only_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationDataError, match="frame 1: amplitude must be given for all"):
+    with pytest.raises(CalibrationDataError, match="frame 1: give amplitude in all frames"):
         write(tmp_path / "recording", {"amplitude": np.ones((5, 7))}, {})
     assert contents(tmp_path) == []
 

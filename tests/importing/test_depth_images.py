@@ -70,6 +70,6 @@ def test_depth_is_the_channel_of_an_exr_file_that_is_called_so(
 
 def test_layers_without_depth_are_refused_with_their_names(tmp_path: Path) -> None:
     _write_exr(tmp_path / "a.exr", ("ViewLayer.Normal.X", "ViewLayer.Normal.Z"))
-    said = r"^a.exr holds the channels ViewLayer.Normal.X, ViewLayer.Normal.Z; expected"
+    said = r"^a.exr holds channels ViewLayer.Normal.X, ViewLayer.Normal.Z; expected"
     with pytest.raises(RefusedViewError, match=said):
         read_array(tmp_path / "a.exr")

@@ -84,9 +84,7 @@ def read_lut(path: Path | str) -> LookupTable:
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
     except UNREADABLE:
-        raise CalibrationDataError(
-            f"{path}: is not a look-up table that tofcorr export wrote."
-        ) from None
+        raise CalibrationDataError(f"{path}: is not a look-up table of tofcorr export.") from None
     known = LutMetadata.from_mapping(metadata, f"{path}, metadata", CalibrationDataError)
     _refuse_other_arrays(arrays, known, path)
     return LookupTable(**arrays, metadata=metadata)
@@ -120,9 +118,7 @@ def _refuse_other_arrays(
         and all(one.dtype.kind == "f" and np.isfinite(one).all() for one in arrays.values())
     )
     if not fits:
-        raise CalibrationDataError(
-            f"{path}: is damaged: its arrays do not fit each other, or are not finite: {shapes}."
-        )
+        raise CalibrationDataError(f"{path}: is damaged, arrays misfit or not finite: {shapes}.")
     if metadata.lut.sha256 not in (None, digest_of(arrays)):
         raise CalibrationDataError(f"{path}: its arrays were changed after they were written.")
 

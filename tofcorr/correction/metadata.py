@@ -89,8 +89,6 @@ def load_corrector(path: Path) -> tuple[ScriptModule, CorrectorMetadata]:
     except (AttributeError, TypeError, ValueError, RuntimeError, RecursionError):
         metadata = None
     if not isinstance(metadata, dict):
-        raise CalibrationDataError(
-            f"{path}: a TorchScript module, but without a corrector's metadata; expected {_WHAT}."
-        )
+        raise CalibrationDataError(f"{path}: without a corrector's metadata; expected {_WHAT}.")
     known = CorrectorMetadata.from_mapping(metadata, f"{path}, metadata", CalibrationDataError)
     return corrector, known

@@ -153,9 +153,7 @@ def refuse_other_than_tensor(name: str, frame: object) -> None:
         FrameError: It is something else; the message says how to make a tensor of it.
     """
     if not isinstance(frame, Tensor):
-        raise FrameError(
-            f"{name}: expected a torch tensor, got {type(frame).__name__}: use torch.as_tensor."
-        )
+        raise FrameError(f"{name}: expected a torch tensor, got {type(frame).__name__}.")
 
 
 class CameraGeometry(nn.Module):
@@ -211,8 +209,7 @@ class CameraGeometry(nn.Module):
             refuse_other_than_tensor(name, frame)
             if not frame.dtype.is_floating_point:
                 raise FrameError(
-                    f"{name}: expected a floating-point type, got {frame.dtype}. Convert with "
-                    f"{name}.float(), and depth to metres."
+                    f"{name}: expected a floating-point type, got {frame.dtype}; convert to metres."
                 )
         size = list(self.radial_of_depth.shape)
         if depth.dim() < 2 or list(depth.shape[-2:]) != size:
@@ -459,7 +456,5 @@ def required_amplitude(amplitude: Tensor | None) -> Tensor:
         FrameError: There are none.
     """
     if amplitude is None:
-        raise FrameError(
-            "amplitude: the model has a term of the amplitude; pass it, or choose other terms."
-        )
+        raise FrameError("amplitude: the model has a term of the amplitude; pass or drop it.")
     return amplitude

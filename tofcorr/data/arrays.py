@@ -114,16 +114,10 @@ def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
         reason = " ".join(str(error).split())[:200]
         raise CalibrationDataError(f"{path}: not a readable .npy file ({reason}).") from None
     if array.dtype != np.dtype(dtype):
-        raise CalibrationDataError(
-            f"{path}: expected {np.dtype(dtype).name} ({np.dtype(dtype).str}), "
-            f"got {array.dtype.name} ({array.dtype.str})."
-        )
+        raise CalibrationDataError(f"{path}: expected {np.dtype(dtype)}, got {array.dtype}.")
     if array.ndim != len(frame_shape) + 1 or array.shape[1:] != frame_shape:
         expected = ", ".join(["frames", *map(str, frame_shape)])
-        raise CalibrationDataError(
-            f"{path}: expected shape ({expected}), got {array.shape}. "
-            "Does recording.yaml describe this camera?"
-        )
+        raise CalibrationDataError(f"{path}: recording.yaml needs ({expected}), got {array.shape}.")
     if not array.flags.c_contiguous:
         raise CalibrationDataError(f"{path}: is in Fortran order; C order is needed.")
     return array
@@ -159,9 +153,7 @@ def read_frames(array: np.ndarray, indices: np.ndarray) -> np.ndarray:
             part, place = frames[start:stop], array.offset + int(indices[start]) * frame_bytes
             part[:] = np.fromfile(path, array.dtype, part.size, offset=place).reshape(part.shape)
     except ValueError:
-        raise CalibrationDataError(
-            f"{path}: cannot be read (it has become shorter since it was opened)."
-        ) from None
+        raise CalibrationDataError(f"{path}: cannot be read (it became shorter).") from None
     except OSError as error:
         raise CalibrationDataError(f"{path}: cannot be read ({error.strerror or error}).") from None
     return frames
@@ -203,9 +195,7 @@ class ArrayStream:
                 the message begins with `where`.
         """
         if frame.shape != self._frame_shape:
-            raise CalibrationDataError(
-                f"{where}: expected shape {self._frame_shape}, got {frame.shape}."
-            )
+            raise CalibrationDataError(f"{where}: expected {self._frame_shape}, got {frame.shape}.")
         with np.errstate(over="ignore", invalid="ignore"):
             converted = np.ascontiguousarray(frame, dtype=self._dtype)
         if self._dtype.kind in "biu" and not np.array_equal(converted, frame):

@@ -187,9 +187,7 @@ def _read_cells(path: Path) -> dict[str, list[str]]:
         raise CalibrationDataError(f"{path}: column {_names(doubled)} appears twice.")
     for frame, line in enumerate(lines[1:]):
         if len(line) != len(names):
-            raise CalibrationDataError(
-                f"{path}: frame {frame} has {len(line)} cells; the header has {len(names)}."
-            )
+            raise CalibrationDataError(f"{path}: frame {frame}: {len(line)} of {len(names)} cells.")
     return {name: [line[i].strip() for line in lines[1:]] for i, name in enumerate(names)}
 
 

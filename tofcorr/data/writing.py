@@ -140,9 +140,7 @@ class RecordingWriter:
             CalibrationDataError: A shape or value is not allowed, or the files cannot be written.
         """
         if (row is None) != (self._rows_from is not None):
-            raise CalibrationDataError(
-                f"{self._here()}: expected a row of each frame, or of none after `like`."
-            )
+            raise CalibrationDataError(f"{self._here()}: expected a row, or none after `like`.")
         if row is not None:
             self._check_pose(row)
         given = {"depth": depth, "amplitude": amplitude, "mask": mask, "raw": raw}
@@ -204,9 +202,7 @@ class RecordingWriter:
                 self._stack.callback(self._streams[name].abandon)
         if images.keys() != self._streams.keys():
             differing = ", ".join(sorted(images.keys() ^ self._streams.keys()))
-            raise CalibrationDataError(
-                f"{self._here()}: {differing} must be given for all frames or for none."
-            )
+            raise CalibrationDataError(f"{self._here()}: give {differing} in all frames or none.")
         frames = {}
         for name, image in images.items():
             frames[name] = self._streams[name].convert(image, f"{self._here()}, {name}")
@@ -256,9 +252,7 @@ def write_recording(
     given = {name: array for name, array in images.items() if array is not None}
     for name, array in given.items():
         if len(array) != len(rows):
-            raise CalibrationDataError(
-                f"{path}: {name} has {len(array)} frames, but there are {len(rows)} rows."
-            )
+            raise CalibrationDataError(f"{path}: {len(array)} frames of {name}, {len(rows)} rows.")
     with RecordingWriter(path, **of_header) as writer:
         for frame, row in enumerate(rows):
             writer.append(row=row, **{name: array[frame] for name, array in given.items()})

@@ -489,6 +489,4 @@ def solvable(
     try:
         yield
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
-        raise CalibrationDataError(
-            f"{path}: the equations of the {task} have no solution: {reason}"
-        ) from None
+        raise CalibrationDataError(f"{path}: the {task} has no solution: {reason}") from None

@@ -190,8 +190,7 @@ def fit_noise(
     differences, amplitude = differences[usable], amplitude[usable]
     if len(differences) < _FEWEST_PER_BIN:
         raise CalibrationDataError(
-            f"The noise cannot be estimated: {len(differences)} usable differences of pixels, "
-            f"{_FEWEST_PER_BIN} are needed."
+            f"The noise needs more than {len(differences)} usable differences: {_FEWEST_PER_BIN}."
         )
     bins = brightness_bins(amplitude.numpy(), _FEWEST_PER_BIN)
     centre = np.array([float(amplitude[part].median()) for part in bins])
@@ -202,8 +201,7 @@ def fit_noise(
     variance = np.square(spread) / 2
     if not variance.min() > 0:
         raise CalibrationDataError(
-            "The noise cannot be estimated: most pixels repeat exactly. Are the distances rounded, "
-            "or copies of one frame?"
+            "The noise cannot be estimated: most pixels repeat: rounded, or copies of one frame?"
         )
     floor, shot, readout = fit_law(centre[:, None] ** [0.0, -1.0, -2.0], variance).tolist()
     return DistanceNoise(floor, shot, readout, source)

@@ -86,9 +86,7 @@ def jackknife_covariance(
     """
     each = joint_image_equations(moments, optimum, walls).by_pose(poses)
     if len(each.gradient) < 3:
-        raise CalibrationDataError(
-            f"Standard errors need at least 3 poses, got {len(each.gradient)}."
-        )
+        raise CalibrationDataError(f"Deviations need at least 3 poses, got {len(each.gradient)}.")
     size = optimum.size
     own = None if prior is None else prior.equations(optimum)
     shift, curvature = left_out_steps(each, each.total().plus(own).hessian)

@@ -66,9 +66,7 @@ def matching_files(folder: Path, pattern: str, what: str) -> dict[str, Path]:
         raise CalibrationDataError(f"{folder}: there is no such folder.")
     parts = re.split(r"(\{view\}|\*|\?)", pattern)
     if len(parts) == 1:
-        raise CalibrationDataError(
-            f"the {what} pattern '{pattern}' names one file; put {{view}} or * where names differ."
-        )
+        raise CalibrationDataError(f"{what} pattern '{pattern}' names one file; put {{view}} or *.")
     wildcards = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
     regex = re.compile("".join(wildcards.get(part, re.escape(part)) for part in parts))
     found: dict[str, Path] = {}
@@ -79,9 +77,7 @@ def matching_files(folder: Path, pattern: str, what: str) -> dict[str, Path]:
     if not found:
         names = sorted((path.name for path in folder.iterdir()), key=_natural_order)
         held = f"it holds '{names[0]}', ..., '{names[-1]}'" if names else "the folder is empty"
-        raise CalibrationDataError(
-            f"{folder}: no file matches the {what} pattern '{pattern}'; {held}."
-        )
+        raise CalibrationDataError(f"{folder}: no file matches {what} pattern '{pattern}'; {held}.")
     return {view: found[view] for view in sorted(found, key=_natural_order)}
 
 
@@ -169,9 +165,7 @@ def _one_channel(array: np.ndarray, path: Path) -> np.ndarray:
     if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
         array = array.squeeze()
     if array.ndim != 2 or not array.size:
-        raise RefusedViewError(
-            f"{path.name} has shape {array.shape}; one channel of shape (rows, columns) is needed"
-        )
+        raise RefusedViewError(f"{path.name} has shape {array.shape}; one channel is needed")
     return array
 
 
@@ -224,9 +218,7 @@ def _exr(path: Path) -> np.ndarray:
     except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise RefusedViewError(f"{path.name} is not a readable EXR file ({error})") from None
     listed = one_line(", ".join(names))
-    raise RefusedViewError(
-        f"{path.name} holds the channels {listed}; expected Z, depth.Z or depth.V"
-    )
+    raise RefusedViewError(f"{path.name} holds channels {listed}; expected Z, depth.Z or depth.V")
 
 
 @contextmanager
@@ -299,9 +291,7 @@ def coded_image(coding: DepthCoding, depth: Counts, amplitude: Counts | None = N
 
 def _refuse_preview(image: Counts, kind: str) -> None:
     if image[0].dtype.itemsize == 1:
-        raise RefusedViewError(
-            f"{image[1]} has 8 bits a pixel; expected 16 bits or floats as {kind}"
-        )
+        raise RefusedViewError(f"{image[1]} has 8 bits a pixel; expected 16 or floats as {kind}")
 
 
 def of_size(image: DepthImage, camera: CameraIntrinsics) -> DepthImage:

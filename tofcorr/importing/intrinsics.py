@@ -153,9 +153,7 @@ def _matrix(values: Mapping[str, Any], source: str) -> Matrix3:
         return (a, b, c), (d, e, f), (g, h, i)
     if not {"fx", "fy", "cx", "cy"} <= values.keys():
         keys = one_line(", ".join(f"'{key}'" for key in list(values)[:8])) or "none"
-        raise CalibrationDataError(
-            f"{source}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got {keys}."
-        )
+        raise CalibrationDataError(f"{source}: no camera matrix (K or fx, fy, cx, cy), got {keys}.")
     return _pinhole(*_numbers([values[k] for k in ("fx", "fy", "cx", "cy")], source, (4,)))
 
 
@@ -183,9 +181,7 @@ def _read(path: Path) -> Mapping[str, Any]:
     else:
         values = parse_yaml(text, str(path), CalibrationDataError)
     if not isinstance(values, Mapping):
-        raise CalibrationDataError(
-            f"{path}: expected keys and values, got {type(values).__name__}."
-        )
+        raise CalibrationDataError(f"{path}: expected keys, got {type(values).__name__}.")
     return values
 
 
@@ -245,16 +241,12 @@ def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[
     if camera not in cameras and not (camera is None and len(cameras) == 1):
         listed = ", ".join(f"{name} ({one.get('rostopic', '?')})" for name, one in cameras.items())
         first = one_line(str(next(iter(cameras))))
-        raise CalibrationDataError(
-            f"{source}: it holds the cameras {one_line(listed)}. Name one: 'FILE#{first}'."
-        )
+        raise CalibrationDataError(f"{source} holds {one_line(listed)}. Name one: 'FILE#{first}'.")
     entry = cameras[camera] if camera in cameras else next(iter(cameras.values()))
     models = str(entry["camera_model"]), str(entry.get("distortion_model", "none"))
     if models not in (("pinhole", "radtan"), ("pinhole", "none")):
         said = one_line("', '".join(models))
-        raise CalibrationDataError(
-            f"{source}: Kalibr's '{said}' is not supported; calibrate with pinhole-radtan."
-        )
+        raise CalibrationDataError(f"{source}: '{said}' is not supported; take pinhole-radtan.")
     fx, fy, cx, cy = _numbers(entry["intrinsics"], f"{source}: 'intrinsics'", (4,))
     found = {"K": _pinhole(fx, fy, cx, cy), "distortion": entry.get("distortion_coeffs", [])}
     if "resolution" in entry:

@@ -164,9 +164,7 @@ def _rows(path: Path, counts: tuple[int, ...]) -> np.ndarray:
     if path.suffix.lower() == ".npy":
         values = load_numbers(path, lambda why: CalibrationDataError(f"{path}: {why}."))
         if not values.size or values.size // len(np.atleast_1d(values)) not in counts:
-            raise CalibrationDataError(
-                f"{path}: expected (P, 4, 4) or (P, 16), got {values.shape}."
-            )
+            raise CalibrationDataError(f"{path}: expected (P, 4, 4) or (P, 16), is {values.shape}.")
         return values.astype(np.float64).reshape(len(values), -1)
     rows = [numbers_in(line, path, counts) for line in lines_of(read_text(path))]
     widths = {len(row) for row in rows} or {16}
@@ -208,18 +206,14 @@ def _read_table(path: Path) -> PoseTrack:
         if wanted and not found:
             euler = any(name.startswith(("roll", "pitch", "yaw")) for name in columns)
             advice = " Turn roll, pitch and yaw into quaternions: their order has no standard."
-            raise CalibrationDataError(
-                f"{path}: expected the columns {wanted}, got {one_line(', '.join(columns))}."
-                + advice * euler
-            )
+            held = one_line(", ".join(columns))
+            raise CalibrationDataError(f"{path}: expected {wanted}, got {held}.{advice * euler}")
         return found
 
     def numbers(name: str) -> np.ndarray:
         """Return the numbers of a column, shape (P,)."""
         if columns.count(name) > 1:
-            raise CalibrationDataError(
-                f"{path}: two columns are '{one_line(name)}'; expected the poses of one frame."
-            )
+            raise CalibrationDataError(f"{path}: two columns are '{one_line(name)}'; expected one.")
         texts = [cell if delimiter == "," else cell.replace(",", ".") for cell in cells[name]]
         found = any_numbers(texts)
         if len(found) < len(texts):

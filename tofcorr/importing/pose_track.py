@@ -135,14 +135,11 @@ def _without_repeats(time: np.ndarray, poses: np.ndarray, source: str) -> np.nda
     before = np.concatenate([[-np.inf], time[:-1]])
     for place in np.flatnonzero(~(time >= before) | ~np.isfinite(time)):
         stamps = f"{before[place]:.6f} s, then {time[place]:.6f} s"
-        raise CalibrationDataError(
-            f"{source}: pose {place}: expected times that increase, {stamps}."
-        )
+        raise CalibrationDataError(f"{source}: pose {place}: expected increasing times, {stamps}.")
     same = np.flatnonzero(time == before)
     for place in same:
         if not np.allclose(poses[place], poses[place - 1], atol=1e-6):
             raise CalibrationDataError(
-                f"{source}: poses {place - 1} and {place} differ and carry the same time stamp, "
-                f"{time[place]:.6f} s. Are stamps rounded? At least milliseconds are needed."
+                f"{source}: pose {place} repeats the time {time[place]:.6f} s; are stamps rounded?"
             )
     return np.setdiff1d(np.arange(len(time)), same)

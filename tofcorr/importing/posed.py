@@ -203,9 +203,7 @@ class PosedImport:
         reason = f"its stop has {options.images_per_stop} images already"
         refused |= {names[int(k)]: reason for k in images[(stop >= 0) & ~take]}
         if not take.any():
-            raise CalibrationDataError(
-                f"{track.source}: the tool moves in all {len(images)} images. Add --keep-moving?"
-            )
+            raise CalibrationDataError(f"{track.source}: the tool always moves. Add --keep-moving?")
         return Chosen(
             images=images[take],
             world_from_tool=poses[take],
@@ -463,9 +461,7 @@ def _refuse_impossible_depth(median_depth: np.ndarray, origin: str) -> None:
     if not _NEAREST <= typical <= _FARTHEST:
         unit = "millimetres? Add --depth-unit-mm 1"
         unit = unit if typical > _FARTHEST else "metres? Add --depth-unit-mm 1000"
-        raise CalibrationDataError(
-            f"{origin}: the median depth is {typical:.4g} m. Is it in {unit}."
-        )
+        raise CalibrationDataError(f"{origin}: median depth is {typical:.4g} m. Is it in {unit}.")
 
 
 def _refuse_impossible_poses(world_from_tool: np.ndarray, origin: str) -> None:
@@ -482,9 +478,7 @@ def _refuse_impossible_poses(world_from_tool: np.ndarray, origin: str) -> None:
             "Expected metres (in CSV, columns tx_mm, ty_mm, tz_mm are scaled)."
         )
     if 1000 * max(extent, turned) < 1:
-        raise CalibrationDataError(
-            f"{origin}: all poses are the same to {1000 * extent:.2g} mm; expected a moving robot."
-        )
+        raise CalibrationDataError(f"{origin}: all poses are the same to {1000 * extent:.2g} mm.")
 
 
 def _amplitudes(image: DepthImage) -> np.ndarray:

@@ -156,9 +156,7 @@ class ImagesOfPlanes:
         try:
             return of_size(self.source.read(number), self.camera)
         except RefusedViewError as refusal:
-            raise CalibrationDataError(
-                f"{self.source.origin}: {refusal}; it was readable before. Was the file changed?"
-            ) from None
+            raise CalibrationDataError(f"{self.source.origin} was changed: {refusal}.") from None
 
     def planes(self, number: int) -> list[ImagePlane]:
         """Return the planes of an image, found once."""

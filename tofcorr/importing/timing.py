@@ -94,9 +94,8 @@ def pair(
     if track.names is not None:
         return *_by_name(names, track, track.names), "name"
     if len(names) != len(track):
-        raise CalibrationDataError(
-            f"{track.source}: {len(track)} poses and {len(names)} images, without times or names."
-        )
+        counts = f"{len(track)} poses and {len(names)} images"
+        raise CalibrationDataError(f"{track.source}: {counts}, without times or names.")
     return np.arange(len(names)), track.world_from_tool, {}, "order"
 
 
@@ -121,9 +120,7 @@ def _by_time(
     }
     if not used.any():
         first = next(iter(refused.values()))
-        raise CalibrationDataError(
-            f"{track.source}: none of {len(names)} images has a pose: {first}."
-        )
+        raise CalibrationDataError(f"{track.source}: no image of {len(names)} has a pose: {first}.")
     return np.flatnonzero(used), poses[used], refused
 
 

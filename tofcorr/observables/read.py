@@ -122,9 +122,7 @@ def observe(recording: Recording) -> Observed:
         counts.append([len(residual), images.missing.any(), images.saturated.sum()])
     table = np.concatenate(tables).view(np.recarray)
     if not np.isfinite(table.distance).any():
-        raise CalibrationDataError(
-            f"{recording.path}: no image has 100 usable pixels on the target, as noise needs."
-        )
+        raise CalibrationDataError(f"{recording.path}: no image has 100 usable target pixels.")
     repeats, losing, saturated = np.array(counts).T
     temporal, within = np.stack(sums, axis=1)
     return Observed(

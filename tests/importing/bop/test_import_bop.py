@@ -49,13 +49,13 @@ def test_a_scene_without_poses_with_two_cameras_or_none_is_refused(
 ) -> None:
     few, out = scene.take(np.arange(3)), tmp_path / "out"
     bare = scene_files.write_bop(few, tmp_path / "bare", poses=False)
-    assert "no image has a pose of the camera" in run_import("bop", bare, out=out).text
+    assert "no image has a pose ('cam_R_w2c', 'cam_t_w2c')" in run_import("bop", bare, out=out).text
     folder = scene_files.write_bop(few, tmp_path / "scene")
     path = folder / "scene_camera.json"
     cameras = json.loads(path.read_text())
     cameras["1"]["cam_K"][0] = 99.0
     path.write_text(json.dumps(cameras))
-    assert "'cam_K' of image 1 differs" in run_import("bop", folder, out=out).text
+    assert "'cam_K' of images 0 and 1 differ" in run_import("bop", folder, out=out).text
     path.unlink()
     assert "scene_camera.json: there is no such file" in run_import("bop", folder, out=out).text
 

@@ -95,12 +95,12 @@ def leave_two(folder: Path) -> None:
         (
             leave,
             {"lens": (*LENS, "--depth-unit-mm", "0.1")},
-            "times the distance at which the",
+            "times the board's distance",
         ),
         (
             leave,
             {"lens": (*LENS, "--depth", "{view}_range.png")},
-            "no file matches the depth",
+            "no file matches depth",
         ),
         (leave, {"lens": (*LENS, "--square-mm", "-1")}, "square_length"),
         (leave, {"lens": (*LENS, "--max-reprojection-px", "0.001")}, "0.001 px are allowed"),

@@ -125,7 +125,7 @@ def test_a_missing_frame_or_transform_is_named(at_stops: Recorded, tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("encoding", "said"),
-    [("mono8", "'mono8'; expected one channel of 16 bits"), ("rgb8", "the encoding 'rgb8'")],
+    [("mono8", "'mono8'; expected one channel of 16 bits"), ("rgb8", "has encoding 'rgb8'")],
 )
 def test_previews_are_refused(at_stops: Recorded, tmp_path: Path, encoding: str, said: str) -> None:
     def write(bag: bags.Bag, time: float, depth: np.ndarray) -> None:
@@ -142,7 +142,7 @@ def test_previews_are_refused(at_stops: Recorded, tmp_path: Path, encoding: str,
     [
         ("equidistant", 1.0, "equidistant"),
         (None, 1.0, "no topic holds camera intrinsics"),
-        ("plumb_bob", 0.0, "a matrix K of zeros"),
+        ("plumb_bob", 0.0, "holds K of zeros"),
     ],
 )
 def test_a_fisheye_lens_and_a_camera_that_is_missing_or_unknown_are_refused(

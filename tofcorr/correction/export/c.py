@@ -56,9 +56,7 @@ def export_c(corrector: DepthCorrector, path: Path | str, reference: Calibration
     path = Path(path)
     name = c_name(path.stem)
     if path.suffix != ".c" or name != path.stem:
-        raise ConfigError(
-            f"{path}: expected a name such as {name}.c, of letters, digits and underscores."
-        )
+        raise ConfigError(f"{path}: expected a name such as {name}.c, of letters, digits and _.")
     compiler = c_compiler()
     sources = c_sources(reference, corrector.metadata(), name)
     with ExitStack() as stack:
@@ -80,9 +78,7 @@ def c_compiler() -> str:
     given = os.environ.get("CC", "").split()
     found = next(filter(None, map(shutil.which, (*given[:1], "cc", "gcc", "clang"))), None)
     if found is None:
-        raise ConfigError(
-            "The c export is compiled, and no C compiler was found: install gcc or clang."
-        )
+        raise ConfigError("For the c export, no C compiler was found: install gcc or clang.")
     return found
 
 
@@ -288,9 +284,7 @@ def pieces_of(term: SignalTerm, limits: Domain, most_pieces: int = 4096) -> Piec
         if _error(term, found) < AGREEMENT / 5:
             return found
     name = term.options.kind
-    raise ConfigError(
-        f"The term {name} changes too quickly for the c export: export torchscript, pt2 or onnx."
-    )
+    raise ConfigError(f"Term {name} changes too quickly for c: export torchscript, pt2 or onnx.")
 
 
 def _smooth(term: SignalTerm, limits: Domain) -> tuple[Axis, ...]:

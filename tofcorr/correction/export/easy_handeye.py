@@ -35,9 +35,7 @@ def export_easy_handeye(
     """
     path = Path(path)
     if path.suffix not in (".yaml", ".calib"):
-        raise ConfigError(
-            f"{path}: expected .yaml, which easy_handeye loads, or .calib, for easy_handeye2."
-        )
+        raise ConfigError(f"{path}: expected .yaml (easy_handeye) or .calib (easy_handeye2).")
     mount = Mount(reference, "easy_handeye")
     frames, still = mount.frames, mount.frames.eye_to_hand
     base, effector = (frames.tool, frames.world) if still else (frames.world, frames.tool)

@@ -38,10 +38,7 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
         ExportError: The table differs from the model by more than `TOLERANCE`; nothing is written.
     """
     if reference.residual is not None:
-        raise ConfigError(
-            f"A look-up table cannot hold the residual network of {reference.name}: export "
-            "torchscript, pt2 or onnx instead."
-        )
+        raise ConfigError(f"{reference.name}'s network needs torchscript, pt2 or onnx.")
     metadata = json.loads(corrector.metadata())
     arrays = {
         "offset": reference.model().error.pixel_error().detach().numpy().astype(np.float32),

@@ -114,9 +114,7 @@ def write_pose(
             raise ExportError(f"{path}: holds no transform after writing; nothing was written.")
         apart = float(np.abs(found - mount.transform).max())
         if not apart < _TOLERANCE:
-            raise ExportError(
-                f"{path}: would state a transform that is off by {apart:.1e}; nothing was written."
-            )
+            raise ExportError(f"{path}: the transform is off by {apart:.1e}; nothing was written.")
 
 
 def decimals(values: Iterable[float]) -> list[str]:

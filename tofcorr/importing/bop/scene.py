@@ -88,14 +88,10 @@ def read_scene_camera(path: Path) -> tuple[GivenIntrinsics, float, PoseTrack]:
             raise CalibrationDataError(f"{path}: image {lacking} has no '{key}'.")
         other = next((n for n, i in images.items() if i[key] != images[first][key]), None)
         if other is not None:
-            raise CalibrationDataError(
-                f"{path}: '{key}' of image {other} differs from that of image {first}."
-            )
+            raise CalibrationDataError(f"{path}: '{key}' of images {first} and {other} differ.")
     posed = {n: i for n, i in images.items() if "cam_R_w2c" in i and "cam_t_w2c" in i}
     if not posed:
-        raise CalibrationDataError(
-            f"{path}: no image has a pose of the camera ('cam_R_w2c', 'cam_t_w2c')."
-        )
+        raise CalibrationDataError(f"{path}: no image has a pose ('cam_R_w2c', 'cam_t_w2c').")
     poses = np.tile(np.eye(4), (len(posed), 1, 1))
     for pose, (name, image) in zip(poses, posed.items(), strict=True):
         # The pose is inverted; its translation is in millimetres.
@@ -141,14 +137,11 @@ def _open_hdf5(folder: Path, intrinsics: GivenIntrinsics | None) -> tuple[RobotI
     with opened_hdf5(paths[0]) as file:
         keys, matrix = list(file), _value(file, ("cam_K", "K"))
     if not {"depth", "distance"} & {*keys}:
-        raise CalibrationDataError(
-            f"{paths[0]}: expected 'depth' or 'distance', found {', '.join(keys) or 'nothing'}."
-        )
+        held = ", ".join(keys) or "nothing"
+        raise CalibrationDataError(f"{paths[0]}: expected 'depth' or 'distance', found {held}.")
     if intrinsics is None:
         if matrix is None:
-            raise CalibrationDataError(
-                f"{paths[0]}: no 'cam_K'; name intrinsics: --intrinsics FILE."
-            )
+            raise CalibrationDataError(f"{paths[0]}: no 'cam_K'; name --intrinsics FILE.")
         values = {"K": np.asarray(matrix).tolist()}
         intrinsics = intrinsics_from_mapping(values, str(paths[0]))
     track = PoseTrack.checked(np.stack([_world_from_camera(p) for p in paths]), str(folder))

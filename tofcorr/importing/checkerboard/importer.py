@@ -285,9 +285,7 @@ class BoardImport:
             usable &= amplitude < options.saturation_counts
         seen = area & usable
         if seen.sum() < max(_FEWEST_PIXELS, area.sum() / 5):
-            raise RefusedViewError(
-                f"only {seen.sum()} of {area.sum()} board pixels have depth below saturation"
-            )
+            raise RefusedViewError(f"only {seen.sum()} of {area.sum()} pixels have usable depth")
         rays = self._rays[seen]
         cosine, true = rays[:, 2], pose.distance(rays)
         along = cosine if options.depth_kind == "z" else 1.0
@@ -300,9 +298,7 @@ class BoardImport:
             normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2]
             tilt = float(np.degrees(np.arccos(min(abs(float(normal @ pose.plane()[0])), 1.0))))
             if tilt > _LARGEST_TILT_DEG:
-                raise RefusedViewError(
-                    f"the depth shows a plane {tilt:.0f} degrees off the board; {_SAME_VIEW}"
-                )
+                raise RefusedViewError(f"depth is {tilt:.0f} degrees off the board; {_SAME_VIEW}")
         columns = np.stack([np.ones_like(true), true, true * (1.0 - cosine), errors])
         return BoardView(
             name=view,
@@ -363,8 +359,7 @@ def typical_ratio(views: Sequence[BoardView]) -> float:
     ratio = float(np.median([view.ratio for view in views]))
     if not 0.5 < ratio < 2:
         raise CalibrationDataError(
-            f"the depth images read {ratio:.3g} times the distance at which the corners place the "
-            "board; correct the unit of depth or the square length."
+            f"the depth is {ratio:.3g} times the board's distance; correct its unit or the square."
         )
     return ratio
 
@@ -377,8 +372,7 @@ def refuse_mixed_up(view: BoardView, ratio: float) -> BoardView:
     """
     if abs(view.ratio / ratio - 1.0) > _TENTH:
         raise RefusedViewError(
-            f"the depth is {view.ratio:.3f} times the board's distance, in other views {ratio:.3f} "
-            f"times; {_SAME_VIEW}"
+            f"the depth is {view.ratio:.3f} times the distance, elsewhere {ratio:.3f}; {_SAME_VIEW}"
         )
     return view
 

@@ -115,9 +115,7 @@ def estimate_pose(
         if np.array_equal(inliers, used):
             break
         if inliers.sum() < _SMALLEST_SHARE_OF_CORNERS * seen.sum():
-            raise RefusedViewError(
-                f"only {inliers.sum()} of {seen.sum()} corners fit one pose of the board"
-            )
+            raise RefusedViewError(f"only {inliers.sum()} of {seen.sum()} corners fit one pose")
         used = inliers
         best, *others = poses_of(corners, board, camera, used)
     if not best.reprojection_rms <= max_reprojection:
@@ -129,9 +127,7 @@ def estimate_pose(
         # Poses whose normals differ by less than 3 degrees are the same pose.
         same = best.plane()[0] @ other.plane()[0] > np.cos(np.radians(3))
         if not same and other.reprojection_rms < _AMBIGUOUS_RATIO * best.reprojection_rms:
-            raise RefusedViewError(
-                "two different poses explain the corners; move the board nearer or tilt it more"
-            )
+            raise RefusedViewError("two different poses fit; move the board nearer or tilt it more")
     return best
 
 
@@ -196,10 +192,9 @@ def calibrate(
     Raises:
         CalibrationDataError: There are too few views, or they do not determine the camera.
     """
-    if len(corner_sets) < _FEWEST_VIEWS:
-        raise CalibrationDataError(
-            f"{len(corner_sets)} views show the board; at least {_FEWEST_VIEWS} calibrate a camera."
-        )
+    views = len(corner_sets)
+    if views < _FEWEST_VIEWS:
+        raise CalibrationDataError(f"{views} views show the board; at least {_FEWEST_VIEWS} must.")
     chosen = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
     most = 5
     while True:
@@ -223,9 +218,7 @@ def calibrate(
     if len(keep) == len(corner_sets):
         return camera, about
     if len(keep) < _FEWEST_VIEWS:
-        raise CalibrationDataError(
-            f"only {len(keep)} of {len(corner_sets)} views fit one camera. Is the board flat?"
-        )
+        raise CalibrationDataError(f"only {len(keep)} views fit one camera. Is the board flat?")
     return _solve([corner_sets[i] for i in keep], [chosen[i] for i in keep], board, size)[:2]
 
 

@@ -96,16 +96,12 @@ def open_distances(
     tracks = [read_poses(path, pose_format).world_from_tool for path in paths]
     for path, track, table in zip(paths, tracks, tables, strict=True):
         if len(track) != len(table):
-            raise CalibrationDataError(
-                f"{path}: {len(track)} poses beside {len(table)} rows of distances."
-            )
+            raise CalibrationDataError(f"{path}: {len(track)} poses beside {len(table)} rows.")
     typical = [float(np.nanmedian(table)) for table in tables]
     # No such sensor sees 20 m.
     units = {1.0 if one >= 20 else 1000.0 for one in typical} if unit_mm is None else {unit_mm}
     if len(units) > 1:
-        raise CalibrationDataError(
-            f"The sources' units differ: typical numbers are {typical}. State --depth-unit-mm."
-        )
+        raise CalibrationDataError(f"Units differ: typically {typical}. State --depth-unit-mm.")
     (unit,) = units
     warnings = []
     if unit_mm is None:
@@ -145,9 +141,7 @@ def _wall_names(
 ) -> Sequence[str]:
     for what, given in (("--poses", poses), ("--wall", names)):
         if given and len(given) != len(sources):
-            raise ConfigError(
-                f"{what} is needed once for each of {len(sources)} sources, got {len(given)}."
-            )
+            raise ConfigError(f"expected one {what} per source ({len(sources)}), got {len(given)}.")
     names = [*names] or [source.stem for source in sources]
     if len(set(names)) < len(names):
         raise ConfigError(f"Two walls have one name: {', '.join(names)}. Name them with --wall.")
@@ -162,9 +156,7 @@ def _file_in(source: Path, what: str) -> Path:
         return source
     found = next((source / name for name in _NAMES[what] if (source / name).exists()), None)
     if found is None:
-        raise CalibrationDataError(
-            f"{source}: no file of {what}; expected one of {', '.join(_NAMES[what])}."
-        )
+        raise CalibrationDataError(f"{source}: no file of {what}: {', '.join(_NAMES[what])}.")
     return found
 
 

@@ -68,8 +68,6 @@ def _times_of(path: Path) -> dict[str, float]:
     for number, fields in lines_of(read_text(path)):
         time = any_numbers(fields[0])
         if time.shape:
-            raise CalibrationDataError(
-                f"{path}, line {number}: expected a time and a name, got '{fields[0][:60]}'."
-            )
+            raise CalibrationDataError(f"{path}, line {number}: '{fields[0][:60]}' is not a time.")
         found[Path(fields[-1]).name] = float(time)
     return found

@@ -116,10 +116,8 @@ def damage_reported(path: Path) -> Iterator[None]:
     except TofcorrError:
         raise
     except Exception as error:  # noqa: BLE001 - the reader raises whatever its bytes lead it to
-        detail = (str(error).splitlines() or [""])[0][:150]
-        raise CalibrationDataError(
-            f"{path}: not a readable ROS bag ({type(error).__name__}: {detail})."
-        ) from None
+        detail = f"{type(error).__name__}: {error}".splitlines()[0][:150]
+        raise CalibrationDataError(f"{path}: not a readable ROS bag ({detail}).") from None
 
 
 def seconds(stamp: Any) -> float:  # noqa: ANN401 - of rosbags
@@ -171,9 +169,7 @@ class TopicMessages:
         message = next((one for _, one in islice(self._iterator, number - self._next, None)), None)
         self._next = number + 1
         if message is None:
-            raise CalibrationDataError(
-                f"{self.bag.path}: message {number} of {self.topic} is gone. Was the bag changed?"
-            )
+            raise CalibrationDataError(f"{self.bag.path}: lost message {number} of {self.topic}.")
         if hasattr(message, "encoding"):
             return _plain(message, self.topic)
         return _compressed(str(message.format), bytes(message.data), self.topic)
@@ -183,9 +179,7 @@ def _plain(message: Any, topic: str) -> np.ndarray:  # noqa: ANN401 - of rosbags
     kind = _TYPES.get(message.encoding)
     if kind is None:
         known = f"one channel of 16 bits or more: {', '.join(_TYPES)}"
-        raise RefusedViewError(
-            f"{topic} has the encoding '{message.encoding[:40]}'; expected {known}"
-        )
+        raise RefusedViewError(f"{topic} has encoding '{message.encoding[:40]}'; expected {known}")
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * np.dtype(kind).itemsize
     if not height or not width or step < row or len(message.data) < height * step:
@@ -200,9 +194,7 @@ def _compressed(coding: str, content: bytes, topic: str) -> np.ndarray:
     """Undo compression; compressedDepth is a PNG of counts, or of inverse depth for floats."""
     of_depth, lossy = "compressedDepth" in coding, "jpeg" in coding or "jpg" in coding
     if "rvl" in coding.lower() or (lossy and not of_depth):
-        raise RefusedViewError(
-            f"{topic} is coded as '{coding[:60]}'; expected PNG. Record the raw topic"
-        )
+        raise RefusedViewError(f"{topic} is coded as '{coding[:60]}'; record it raw or as PNG")
     image = decoded(content[_DEPTH_HEADER:] if of_depth else content)
     if image is None or image.ndim != 2:
         raise RefusedViewError(f"{topic}: a compressed image cannot be decoded to one channel")
@@ -350,9 +342,7 @@ def _camera_info_topic(bag: Bag, depth: str, given: str | None) -> str:
         return (near or found)[0]
     many = f"several topics hold camera intrinsics: {', '.join(sorted(found))}"
     said = many if found else "no topic holds camera intrinsics (CameraInfo)"
-    raise CalibrationDataError(
-        f"{bag.path}: {said}. Name --camera-info TOPIC or --intrinsics FILE."
-    )
+    raise CalibrationDataError(f"{bag.path}: {said}. Name --camera-info or --intrinsics.")
 
 
 def _read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics, list[str]]:
@@ -370,9 +360,7 @@ def _read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics
         for name in "kdp"
     )
     if not any(matrix):
-        raise CalibrationDataError(
-            f"{bag.path}: {topic} holds a matrix K of zeros. Name a file with --intrinsics."
-        )
+        raise CalibrationDataError(f"{bag.path}: {topic} holds K of zeros. Name --intrinsics.")
     model = str(message.distortion_model) or "none"
     values: dict[str, Any] = {"K": matrix, "distortion": lens, "distortion_model": model}
     if message.width and message.height:
@@ -464,16 +452,12 @@ def _base_from_tool(
     common = next((name for name in down if name in up), None)
     if common is None:
         roots = f"'{base}' (under '{up[-1]}') with '{tool}' (under '{down[-1]}')"
-        raise CalibrationDataError(
-            f"{source}: tf does not connect {roots}. Is /tf_static recorded?"
-        )
+        raise CalibrationDataError(f"{source}: tf does not connect {roots}. Record /tf_static?")
     to_tool = down[: down.index(common)][::-1]
     to_base = up[: up.index(common)][::-1]
     moving = [child for child in (*to_tool, *to_base) if tracks[child].timestamp is not None]
     if not moving:
-        raise CalibrationDataError(
-            f"{source}: tf between '{base}' and '{tool}' is static. Is --tool-frame the arm's tool?"
-        )
+        raise CalibrationDataError(f"{source}: '{tool}' is static in '{base}': name --tool-frame.")
     # The stamps of all tracks within the time that all of them cover.
     stamps = [np.asarray(tracks[child].timestamp) for child in moving]
     times = np.unique(np.concatenate(stamps))
