@@ -248,7 +248,7 @@ def _cause_line(found: Evidence, one: Share) -> str:
     if one.cause != HAND_EYE or known is None:
         return f"{line}; a parameter of the simulator's error model."
     moved = se3.log(se3.inverse(known.tool_from_camera) @ found.tool_from_camera)
-    if alike := hidden_effects(found.study):
+    if one.share > SMALL and (alike := hidden_effects(found.study)):
         line += f", or of {' or '.join(alike)}, which looks the same here"
     return (
         f"{line}; the camera sits {mm(float(moved[:3].norm()))} mm and "
