@@ -192,9 +192,8 @@ class Evidence:
                 rows = torch.cat([self._gram[:, span] for span in spans], dim=1)
                 gram = torch.cat([rows[:, :, span] for span in spans], dim=2)
                 right = torch.cat([score[:, span] for span in spans], dim=1)[..., None]
-                width = torch.tensor([span.stop - span.start for span in spans])
-                precision = torch.tensor([(self._unit[n] / sizes[n]) ** 2 for n in names])
-                prior = precision.double().repeat_interleave(width).diag()
+                base = self._study.sums.layout.base
+                prior = self._prior(names, sizes)[base:, base:]
                 factor = torch.linalg.cholesky(_regular(gram + prior))
                 inner = torch.linalg.solve_triangular(factor, right, upper=False)
                 evidence = evidence + inner.square().sum((1, 2)) / 2 - _half_logdet(factor)
