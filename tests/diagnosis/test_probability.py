@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.probability import Evidence, Model, Models, Search
+from tofcorr.diagnosis.findings.probability import Beside, Evidence, Model, Models, Search
 from tofcorr.diagnosis.sums.study import Study, absorbed_share, signal, with_residual
 
 
@@ -48,7 +48,7 @@ def test_densities_are_those_of_the_normal_distribution(time_study: Study) -> No
             pixels = ols.scale * float(time_study.sums.count.sum())
             unit_size = (signal(time_study, name) * max(left, 1 / 25) / pixels) ** 0.5
             prior[low:high, low:high] = (unit_size / sizes[name]) ** 2 * torch.eye(high - low)
-        found.append(float(evidence.density(sizes)[unit]))
+        found.append(float(Beside(evidence, sizes).density[unit]))
         expected.append(_density(time_study, sizes, unit, prior))
     assert found[1] - found[0] == pytest.approx(expected[1] - expected[0], rel=1e-3)
 

@@ -129,7 +129,7 @@ def name_effects(study: Study) -> NamedEffects:
     options, probes, tests = study.options, study.candidates.probes, study.options.tests
     tested = study.sums.num_units >= tests.least_images
     evidence = Evidence(study)
-    model, _ = Search(evidence, tests.odds**0.5, tests.most_effects).models(probes).best()
+    model = tuple(Search(evidence, tests.odds**0.5, tests.most_effects, width=1).best())
     if model:
         study = _beside(study, model, evidence)
         evidence = Evidence(study, [name for name in model if name in study.sums.layout.effects])

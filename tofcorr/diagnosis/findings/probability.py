@@ -74,35 +74,28 @@ class Evidence:
     def __init__(self, study: Study, beside: Sequence[str] = ()) -> None:
         self._study = study
         sums, base = study.sums.gls, study.sums.layout.base
-        spans = {
-            n: slice(low - base, high - base) for n, (low, high) in sums.layout.effects.items()
-        }
-        left = {name: 1 - absorbed_share(study, name) for name in spans}
+        left = {name: 1 - absorbed_share(study, name) for name in sums.layout.effects}
         # Of less than a thousandth nothing can be said but rounding.
-        self._spans = {name: span for name, span in spans.items() if left[name] > 1e-3}
+        self.columns = {
+            name: slice(low - base, high - base)
+            for name, (low, high) in sums.layout.effects.items()
+            if left[name] > 1e-3
+        }
         pixels = study.sums.ols.scale * float(study.sums.count.sum())
         # The root mean square of each at one prior standard deviation, metres; see `SIZES`.
         self._unit = {
             name: (signal(study, name) * max(left[name], _MAGNIFIED**-2) / pixels) ** 0.5
-            for name in self._spans
+            for name in self.columns
         }
         some = torch.cat([sums.total[None], sums.total - sums.gram])
         normal = some[:, :base, :base] + sums.layout.prior[:base, :base]
         self._factor = torch.linalg.cholesky(_regular(normal))
-        self._beside = torch.linalg.solve_triangular(
-            self._factor, some[:, :base, base:], upper=False
-        )
-        self._gram = some[:, base:, base:] - self._beside.mT @ self._beside
+        self._base = _solved(self._factor, some[:, :base, base:])
+        self.gram = some[:, base:, base:] - self._base.mT @ self._base
         residual = study.system.residual_of(beside, gls=True)
         self.maps = {n: FittedMap(study, e, residual) for n, e in study.candidates.maps.items()}
         self._studies: dict[str, Study] = {}
         self._given: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
-        self._densities: dict[tuple[Model, tuple[float, ...]], Tensor] = {}
-
-    @property
-    def effects(self) -> list[str]:
-        """Effects and probes with columns of which calibration leaves something."""
-        return list(self._spans)
 
     def without(self, of_map: str) -> Study:
         """Return the study with a map's values subtracted from the residual."""
@@ -122,11 +115,10 @@ class Evidence:
             sizes: As in `density`.
         """
         study, layout = self._study, self._study.sums.layout
-        names = [name for name in sizes if name in self._spans]
         of_map = next((name for name in sizes if name in self.maps), "")
         fitted = (self.without(of_map) if of_map else study).sums.gls
-        members = layout.of(names)
-        normal = _regular(fitted.total[members][:, members] + self._prior(names, sizes))
+        names = self.with_columns(sizes)
+        members, normal = layout.of(names), self._normal(sizes)
         theta = torch.linalg.solve(normal, fitted.score[:, members].sum(0))
         plain, base = study.sums.ols.total, torch.arange(layout.base)
         pixels, found = study.sums.ols.scale * float(study.sums.count.sum()), dict[str, float]()
@@ -140,20 +132,33 @@ class Evidence:
             found[of_map] = float(square) ** 0.5
         return found
 
-    def _prior(self, names: Sequence[str], sizes: Mapping[str, float]) -> Tensor:
-        """Return the prior precision of the base model and of effects of some sizes, (K, K)."""
-        layout = self._study.sums.layout
-        prior = layout.prior_of(layout.of(names)).clone()
-        for name, (low, high) in layout.only(names).effects.items():
-            prior.diagonal()[low:high] = (self._unit[name] / sizes[name]) ** 2
-        return prior
+    def with_columns(self, model: Iterable[str]) -> list[str]:
+        """Return the effects of a model that have columns, in their order."""
+        return [name for name in self.columns if name in model]
+
+    def precision(self, sizes: Mapping[str, float]) -> Tensor:
+        """Return the prior precision of the coefficients of effects of some sizes, shape (K,)."""
+        own = [torch.empty(0, dtype=torch.float64)]
+        for name in self.with_columns(sizes):
+            number = self.columns[name].stop - self.columns[name].start
+            own.append(own[0].new_full((number,), (self._unit[name] / sizes[name]) ** 2))
+        return torch.cat(own)
+
+    def _normal(self, sizes: Mapping[str, float]) -> Tensor:
+        """Return the normal matrix of the base model and of effects of some sizes, (K, K)."""
+        sums, base = self._study.sums.gls, self._study.sums.layout.base
+        members = sums.layout.of(self.with_columns(sizes))
+        normal = sums.total[members][:, members]
+        normal[:base, :base] += sums.layout.prior[:base, :base]
+        normal.diagonal()[base:] += self.precision(sizes)
+        return _regular(normal)
 
     def left_out_squares(self, model: Sequence[str]) -> Tensor:
         """Return the ordinary squares of each pose, predicted by all others, shape (U,), m^2."""
         study = next((self.without(name) for name in model if name in self.maps), self._study)
         return study.left_out_squares([name for name in model if name not in self.maps])
 
-    def _response(self, of_map: str) -> tuple[Tensor, Tensor, Tensor]:
+    def response(self, of_map: str) -> tuple[Tensor, Tensor, Tensor]:
         """Return log evidence of the base model, scores of all effects beside it, and squares.
 
         The first two are of all poses and of all but one, shapes (1 + U,) and (1 + U, P); the last
@@ -168,37 +173,11 @@ class Evidence:
                 other, known = self.without(of_map).sums, (sums.dispersion, sums.pose_sd)
                 sums = replace(other, dispersion=known[0], pose_sd=known[1])
             score, base = sums.gls.score, sums.layout.base
-            right = torch.cat([score.sum(0)[None], score.sum(0) - score])
-            inner = torch.linalg.solve_triangular(self._factor, right[:, :base, None], upper=False)
-            own = right[:, base:] - (self._beside.mT @ inner)[..., 0]
-            evidence = inner.square().sum((1, 2)) / 2 - _half_logdet(self._factor)
-            self._given[of_map] = evidence, own, sums.gls.square
+            right = torch.cat([score.sum(0)[None], score.sum(0) - score])[..., None]
+            inner = _solved(self._factor, right[:, :base])
+            own = (right[:, base:] - self._base.mT @ inner)[..., 0]
+            self._given[of_map] = _evidence(self._factor, inner), own, sums.gls.square
         return self._given[of_map]
-
-    def density(self, sizes: Mapping[str, float]) -> Tensor:
-        """Return the log predictive density of every pose by all others, shape (U,).
-
-        Args:
-            sizes: The prior standard deviation of each effect of the model, metres; that of a map
-                is its own.
-        """
-        names = tuple(name for name in sizes if name in self._spans)
-        of_map = next((name for name in sizes if name in self.maps), "")
-        key = (*names, of_map), tuple(sizes[name] for name in names)
-        if key not in self._densities:
-            evidence, score, square = self._response(of_map)
-            if names:
-                spans = [self._spans[name] for name in names]
-                rows = torch.cat([self._gram[:, span] for span in spans], dim=1)
-                gram = torch.cat([rows[:, :, span] for span in spans], dim=2)
-                right = torch.cat([score[:, span] for span in spans], dim=1)[..., None]
-                base = self._study.sums.layout.base
-                prior = self._prior(names, sizes)[base:, base:]
-                factor = torch.linalg.cholesky(_regular(gram + prior))
-                inner = torch.linalg.solve_triangular(factor, right, upper=False)
-                evidence = evidence + inner.square().sum((1, 2)) / 2 - _half_logdet(factor)
-            self._densities[key] = evidence[0] - evidence[1:] - square / 2
-        return self._densities[key]
 
     def temperature(self, sizes: Mapping[str, float]) -> float:
         """Return the variance of the poses' scores over that by the model, at least 1.
@@ -209,9 +188,8 @@ class Evidence:
             sizes: As in `density`.
         """
         sums, layout = self._study.sums.gls, self._study.sums.layout
-        names = [name for name in sizes if name in self._spans]
-        members, total = layout.of(names), sums.total
-        known = _regular(total[members][:, members] + self._prior(names, sizes))
+        names = self.with_columns(sizes)
+        members, total, known = layout.of(names), sums.total, self._normal(sizes)
         score = sums.score - sums.gram[:, :, members] @ torch.linalg.solve(
             known, sums.score.sum(0)[members]
         )
@@ -219,7 +197,7 @@ class Evidence:
         score = score - score[:, members] @ beside
         left = (total - total[:, members] @ beside).diagonal()
         ratios = []
-        for name in self.effects:
+        for name in self.columns:
             own = torch.arange(*layout.effects[name])
             own = own[left[own] > 1e-3 * total.diagonal()[own]]
             if name not in names and len(own):
@@ -227,14 +205,66 @@ class Evidence:
         return max(1.0, float(torch.tensor(ratios or [1.0]).quantile(0.9)))
 
 
+class Beside:
+    """Predicts each pose of a recording from all others, with some effects and one more.
+
+    Args:
+        evidence: Of the recording.
+        sizes: The prior standard deviation of each effect of the model, metres; that of a map is
+            its own.
+    """
+
+    def __init__(self, evidence: Evidence, sizes: Mapping[str, float]) -> None:
+        self.sizes, self._evidence = sizes, evidence
+        of_map = next((name for name in sizes if name in evidence.maps), "")
+        self._log_evidence, self._score, self._square = evidence.response(of_map)
+        own = [evidence.columns[name] for name in evidence.with_columns(sizes)]
+        # The columns of no effect, for a model without one.
+        own, gram = own or [slice(0)], evidence.gram
+        rows = torch.cat([gram[:, each] for each in own], dim=1)
+        normal = torch.cat([rows[:, :, each] for each in own], dim=2)
+        factor = torch.linalg.cholesky(_regular(normal + evidence.precision(sizes).diag()))
+        right = torch.cat([self._score[:, each] for each in own], dim=1)
+        self._rows, self._inner = _solved(factor, rows), _solved(factor, right[..., None])
+        self._log_evidence = self._log_evidence + _evidence(factor, self._inner)
+
+    @property
+    def density(self) -> Tensor:
+        """The log predictive density of every pose by all others, shape (U,)."""
+        return self._density(self._log_evidence)
+
+    def density_with(self, name: str, size: float) -> Tensor:
+        """Return the same with one more effect, shape (U,).
+
+        Args:
+            name: The effect.
+            size: Its prior standard deviation, metres.
+        """
+        own = self._evidence.columns[name]
+        rows, right = self._rows[:, :, own], self._score[:, own, None]
+        gram = self._evidence.gram[:, own, own] - rows.mT @ rows
+        prior = self._evidence.precision({name: size}).diag()
+        factor = torch.linalg.cholesky(_regular(gram + prior))
+        inner = _solved(factor, right - rows.mT @ self._inner)
+        return self._density(self._log_evidence + _evidence(factor, inner))
+
+    def _density(self, evidence: Tensor) -> Tensor:
+        return evidence[0] - evidence[1:] - self._square / 2
+
+
+def _solved(factor: Tensor, right: Tensor) -> Tensor:
+    return torch.linalg.solve_triangular(factor, right, upper=False)
+
+
+def _evidence(factor: Tensor, inner: Tensor) -> Tensor:
+    """Return what columns add to the log evidence, by their factor and their scores over it."""
+    return inner.square().sum((1, 2)) / 2 - factor.diagonal(dim1=1, dim2=2).log().sum(1)
+
+
 def _regular(normal: Tensor) -> Tensor:
     """Return normal matrices that rounding cannot make singular."""
     ridge = 1e-10 * normal.diagonal(dim1=-2, dim2=-1) + TINY
     return normal + ridge.diag_embed()
-
-
-def _half_logdet(factor: Tensor) -> Tensor:
-    return factor.diagonal(dim1=1, dim2=2).log().sum(1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,75 +355,81 @@ class Search:
     """
 
     def __init__(self, evidence: Evidence, odds: float, most: int, width: int = 5) -> None:
-        self._evidence, self._width = evidence, width
-        self._price, self._most = -math.log(odds), most
-        self._base = evidence.density({})
-        self._tried: dict[Model, tuple[float, dict[str, float]]] = {}
-        self._alone: dict[str, float] = {}
+        self._evidence, self._most, self._width = evidence, most, width
+        self._price = -math.log(odds)
+        self._tried: dict[Model, tuple[float, dict[str, float], Tensor]] = {}
+        self._enlarged: set[Model] = set()
+        for of_map in ("", *evidence.maps):
+            self._grow({of_map: math.nan} if of_map else {})
+
+    def best(self) -> dict[str, float]:
+        """Return the sizes of the effects of the most probable model."""
+        return max(self._tried.values(), key=lambda one: one[0])[1]
 
     def models(self, probes: Iterable[str]) -> Models:
         """Return all models tried, and their densities at the temperature of the best.
 
-        At last every effect of the best model is replaced by every other, so that each that may be
+        Before, every effect of the best model is replaced by every other, so that each that may be
         there in its place is judged.
 
         Args:
             probes: Names of what is in no catalogue.
         """
-        evidence = self._evidence
-        for of_map in ("", *evidence.maps):
-            self._grow({of_map: math.nan} if of_map else {})
-        best = self._best()
+        evidence, best = self._evidence, self.best()
         for name in best:
             rest = {other: size for other, size in best.items() if other != name}
-            others = [other for other in evidence.effects if other not in best]
-            for sizes in ({}, *({other: self._alone[other]} for other in others)):
-                self._level({**rest, **sizes})
+            self._enlarge(rest)
             for of_map in evidence.maps if evidence.maps.keys().isdisjoint(rest) else ():
-                self._level({**rest, of_map: math.nan})
-        sizes = [own for _, own in self._tried.values()]
-        densities = torch.stack([evidence.density(own) for own in sizes])
+                self._keep({**rest, of_map: math.nan})
+        densities = torch.stack([density for _, _, density in self._tried.values()])
         return Models(
             models=tuple(self._tried),
-            densities=(densities - self._base) / evidence.temperature(self._best()),
-            sizes=tuple(sizes),
+            densities=(densities - self._base) / evidence.temperature(best),
+            sizes=tuple(sizes for _, sizes, _ in self._tried.values()),
             price=self._price,
             probes=frozenset(probes),
         )
 
     def _grow(self, start: dict[str, float]) -> None:
         """Add effects to a model of none, or of one map."""
-        beam, top = [start], self._level(start)
+        beam, top = [start], self._keep(start)
         if top < -2 * self._price:  # A map that predicts worse than none.
             return
         for count in range(1, self._most + 1):
-            grown: dict[Model, dict[str, float]] = {}
             for sizes in beam:
-                for name in self._evidence.effects:
-                    if name not in sizes:
-                        larger = self._with(sizes, name)
-                        grown[tuple(sorted(larger))] = larger
-            beam = sorted(grown.values(), key=lambda own: -self._level(own))[: self._width]
-            best = self._level(beam[0]) if beam else -math.inf
+                self._enlarge(sizes)
+            grown = [
+                (level, sizes)
+                for level, sizes, _ in self._tried.values()
+                if len(sizes) == len(start) + count and start.keys() <= sizes.keys()
+            ]
+            grown.sort(key=lambda one: -one[0])
             # A pair is tried even where neither of both is probable alone.
-            if best <= top and count > 1:
+            if not grown or (grown[0][0] <= top and count > 1):
                 break
-            top = max(best, top)
+            beam, top = [sizes for _, sizes in grown[: self._width]], max(grown[0][0], top)
 
-    def _with(self, sizes: dict[str, float], name: str) -> dict[str, float]:
-        """Return a model with one more effect, at the size that predicts best where it is alone."""
-        if name not in self._alone:
-            self._alone[name] = max(SIZES, key=lambda size: self._level({name: size}))
-        return {**sizes, name: self._alone[name]}
-
-    def _level(self, sizes: dict[str, float]) -> float:
-        """Return the log posterior of a model over that of the base model, and remember it."""
+    def _enlarge(self, sizes: dict[str, float]) -> None:
+        """Try a model with each effect more, at the size that predicts best where it is alone."""
         model = tuple(sorted(sizes))
-        density = float((self._evidence.density(sizes) - self._base).sum())
-        level = density - self._price * len(model)
-        if model not in self._tried or level > self._tried[model][0]:
-            self._tried[model] = level, sizes
-        return level
+        if model in self._enlarged:
+            return
+        self._enlarged.add(model)
+        beside = Beside(self._evidence, sizes)
+        for name in self._evidence.columns:
+            if name not in sizes:
+                alone = self._tried.get((name,))
+                for size in SIZES if alone is None else (alone[1][name],):
+                    self._keep({**sizes, name: size}, beside.density_with(name, size))
 
-    def _best(self) -> dict[str, float]:
-        return max(self._tried.values(), key=lambda one: one[0])[1]
+    def _keep(self, sizes: dict[str, float], density: Tensor | None = None) -> float:
+        """Remember a model, and return its log posterior over that of the base model."""
+        if density is None:
+            density = Beside(self._evidence, sizes).density
+        if not sizes:
+            self._base = density
+        model = tuple(sorted(sizes))
+        level = float((density - self._base).sum()) - self._price * len(model)
+        if model not in self._tried or level > self._tried[model][0]:
+            self._tried[model] = level, sizes, density
+        return self._tried[model][0]
