@@ -21,9 +21,8 @@ class TestOptions(Options):
 
     Attributes:
         odds: Prior odds that an effect is missing. Small: a recording is tested for some thirty. A
-            third or twice as much named the same (`benchmarks.levels`, seed 4242).
-        named_from: Probability from which on something is said to be there. Of effects stated at
-            0.6 to 0.8 half were there (`benchmarks.levels`, seed 4242).
+            half or twice as much named the same (`benchmarks.levels`, seed 4242).
+        named_from: Probability from which on something is said to be there: more probable than not.
         cover: Probability that a cause set holds, given the other effects. By convention.
         level: Significance level of biases along covariates. 5 % by convention.
         flips: Number of sign flips of that test. 299 resolve p-values to 1/300.
@@ -39,8 +38,8 @@ class TestOptions(Options):
             simulator's error was fitted at other poses, to which it is carried with a form error.
     """
 
-    odds: Share = 0.0005
-    named_from: Share = 0.7
+    odds: Share = 0.001
+    named_from: Share = 0.5
     cover: Share = 0.9
     level: Share = 0.05
     folds: Annotated[int, Field(ge=2)] = 10

@@ -130,7 +130,9 @@ def measure_gap(
             simulator was given. The gap as given is that and what they leave, so that no noise must
             be subtracted.
     """
-    left = study.left_out_mean_square(()), named.study.left_out_mean_square(named.columns)
+    base = study.left_out_mean_square(())
+    # A model that predicts worse than none would not be taken.
+    left = base, min(base, named.study.left_out_mean_square(named.columns))
     noise = noise_floor(named)
     noise = noise._replace(size=min(noise.size, left[1] ** 0.5))
     squares = np.array(left)[None] - noise.size**2
@@ -188,7 +190,6 @@ def squared_gaps(
             held = study if named.maps.keys().isdisjoint(model) else named.study
             squares = held.left_out_squares(named.columns_of(model))
             after[own] = _squared_gap(study, squares, floor.size, resamples[own])
-        # A model that predicts worse than none would not be taken.
         after = torch.minimum(after, before)
     random, most = np.random.default_rng(study.options.seed), floor.size**2
     excess = floor.error * random.standard_normal(len(before))

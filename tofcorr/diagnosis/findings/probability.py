@@ -20,14 +20,12 @@ Four things keep its sum from being trusted as it stands, and each is a term of 
 - The columns of an effect are not quite its form: no two lenses, rooms or robots are alike. What
   they explain of the true effect falls short by 1 + e^2 z^2, with its form error e and a standard
   normal z (a model discrepancy; Kennedy and O'Hagan 2001). So a model with gain g_k of effect k may
-  explain up to e^2 z^2 g_k more of what there is: as much as the best model n does, less the odds
-  of each effect that it has more.
+  explain up to e^2 z^2 g_k more of what there is: at most as much as the best model does.
 - Few effects are there. Each has the prior odds o.
 
-.. math:: p(m) = \Big\langle \operatorname{softmax}_m \min\big(L_m
-    + \tfrac1T \textstyle\sum_k e_k^2 z_k^2 g_{mk},\;
-    L_n + (|m| - |n|)_+ \log o\big) \Big\rangle_{w, z},
-    \qquad L_m = |m| \log o + \tfrac1T \textstyle\sum_u w_u \ell_{mu} .
+.. math:: p(m) = \Big\langle \operatorname{softmax}_m \Big[ |m| \log o
+    + \min\big(D_m + \tfrac1T \textstyle\sum_k e_k^2 z_k^2 g_{mk},\; \max_n D_n\big) \Big]
+    \Big\rangle_{w, z}, \qquad D_m = \tfrac1T \textstyle\sum_u w_u \ell_{mu} .
 
 The prior standard deviation of an effect is a size a in metres, as a root mean square over all
 pixels that the base model does not absorb; of four sizes the one that predicts best is taken.
@@ -329,19 +327,16 @@ class Models:
             weights: Of the poses, shape (D, U), with mean one.
             generator: Of the form errors, drawn for each row by itself.
         """
-        prices = self.price * torch.tensor([len(model) for model in self.models]).double()
-        level = self.densities @ weights.T - prices[:, None]
+        density = self.densities @ weights.T
         names = sorted({name for model in self.models for name in model})
         drawn = torch.randn(len(names), len(weights), generator=generator).double().square()
-        missed = torch.zeros_like(level)
+        missed = torch.zeros_like(density)
         for row, gains in zip(missed, self._gains(), strict=True):
             for name, gain in gains.items():
                 row.add_(gain * drawn[names.index(name)])
-        size = torch.tensor([len(model) for model in self.models])
-        best = level.max(0)
-        larger = (size[:, None] - size[best.indices]).clamp(min=0)
-        most = best.values - self.price * larger
-        return torch.softmax(level + torch.minimum(missed, (most - level).clamp(min=0)), 0)
+        explained = torch.minimum(density + missed, density.max(0).values)
+        prices = self.price * torch.tensor([len(model) for model in self.models])
+        return torch.softmax(explained - prices[:, None], 0)
 
 
 class Search:

@@ -71,7 +71,7 @@ class CatalogueEffect(Effect, ABC):
     refines: ClassVar[tuple[str, ...]] = ()
     of_frame: ClassVar[bool] = False
     prior: ClassVar[float] = 0.02
-    form_error: ClassVar[float] = 0.5
+    form_error: ClassVar[float] = 0.65
     reads_light: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:

@@ -46,7 +46,6 @@ class MixedPixelsEffect(CatalogueEffect):
     source = "Abdo and Borgeat 2010 (square edges); Lindner et al. 2010"
     remedy = "a checkerboard in focus and out of focus, shifted by parts of a pixel"
     needs = (AMPLITUDE, FREQUENCY)
-    form_error = 0.7
     shape_type: ClassVar[type[Options]] = MixedPixelsShape
 
     @classmethod

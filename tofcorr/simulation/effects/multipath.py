@@ -137,7 +137,6 @@ class MultipathEffect(SignalEffect):
         ),
         Coefficient("flange", "1", 0.05),
     )
-    form_error = 0.7
     shape_type = MultipathShape
 
     @classmethod

@@ -93,7 +93,6 @@ class SaturationEffect(CatalogueEffect):
     source = "four-tap demodulation with a bent characteristic; Lange 2000"
     remedy = "a bright target at three integration times, one of them short"
     needs = (AMPLITUDE, FREQUENCY)
-    form_error = 0.7
     shape_type: ClassVar[type[Options]] = SaturationShape
     reads_light = True
 

@@ -47,7 +47,6 @@ class StrayLightEffect(SignalEffect):
     source = "Kavli et al. 2008; Mure-Dubois and Huegli 2007"
     remedy = "the same pose with and without a bright object near the camera"
     needs = (AMPLITUDE, FREQUENCY)
-    form_error = 0.7
     shape_type: ClassVar[type[Options]] = StrayLightShape
 
     @classmethod
