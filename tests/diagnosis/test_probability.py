@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.probability import Beside, Evidence, Model, Models, Search
 from tofcorr.diagnosis.sums.study import Study, absorbed_share, signal, with_residual
+from tofcorr.simulation.effects import CATALOGUE
 
 
 def _density(study: Study, sizes: dict[str, float], unit: int, prior: Tensor) -> float:
@@ -127,7 +128,8 @@ def test_a_rival_remains_as_far_as_its_form_may_fall_short(rival: str) -> None:
     expected = 0.0
     if rival == "incidence_angle":
         random = np.random.default_rng(1)
-        reach = np.clip(0.25 * random.standard_normal(100_000) ** 2 * 950, 0, 50)
+        square = CATALOGUE[rival].form_error ** 2 * random.standard_normal(100_000) ** 2
+        reach = np.clip(square * 950, 0, 50)
         expected = float((np.exp(reach - 50) / (1 + np.exp(reach - 50))).mean())
     assert share == pytest.approx(expected, abs=0.02)
 
@@ -137,6 +139,13 @@ def test_a_form_error_of_one_effect_makes_no_other_effect_probable() -> None:
     more: dict[Model, float] = {("wiggling", name): 1000.5 for name in ("gloss", "lens", "pixel")}
     found = _posterior(_models({(): 0.0, ("wiggling",): 1000.0, **more}))
     assert found["wiggling",] > 0.9
+
+
+def test_a_second_effect_is_named_for_what_the_form_of_the_first_cannot_be() -> None:
+    """It adds 50 of 1050 nats, and is there unless the form error of the first is as large."""
+    found = _posterior(_models({(): 0.0, ("wiggling",): 1000.0, ("lens", "wiggling"): 1050.0}))
+    least = math.sqrt(50 / 1000) / CATALOGUE["wiggling"].form_error
+    assert found["lens", "wiggling"] == pytest.approx(2 * (norm.cdf(least) - 0.5), abs=0.03)
 
 
 def test_a_form_error_names_nothing_where_there_is_no_signal() -> None:
