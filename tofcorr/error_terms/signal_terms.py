@@ -4,7 +4,6 @@ import math
 from typing import ClassVar, Literal
 
 import torch
-from numpy.polynomial import Polynomial
 from pydantic import Field, PositiveInt
 from torch import Tensor
 
@@ -140,9 +139,12 @@ def unscale(coefficients: Tensor, centre: float, half_width: float) -> list[floa
     Returns:
         Coefficients of 1, x, x^2, ...: one more than were given.
     """
-    scaled = Polynomial([0.0, *coefficients.detach().double().cpu().tolist()])
-    found = scaled(Polynomial([-centre / half_width, 1.0 / half_width])).coef.tolist()
-    return found + [0.0] * (len(coefficients) + 1 - len(found))
+    terms = list(enumerate([0.0, *coefficients.detach().double().cpu().tolist()]))
+    slope, start = 1.0 / half_width, -centre / half_width
+    return [
+        slope**k * sum(own * math.comb(n, k) * start ** (n - k) for n, own in terms[k:])
+        for k, _ in terms
+    ]
 
 
 def rescale(raw: list[float], centre: float, half_width: float) -> tuple[list[float], float]:
