@@ -89,7 +89,8 @@ class LinearResiduals:
         d = np.where(used, scene.distance, 1.0)
         cosine = self.cosine = np.einsum("fpa,fa->fp", rays, self.normal)
         self.residual = cosine * ((1 - found.slope) * d - found.constant) + offset[:, None]
-        typical = np.maximum(found.rms, found.misfit)[:, None]
+        # A simulator's frames may fit exactly; no recording tells distances more finely than this.
+        typical = np.maximum(found.rms, found.misfit).clip(np.finfo(np.float32).eps)[:, None]
         used = self.used = used & (np.abs(self.residual) < 4 * typical)
         self.weight = np.where(used, 1.0, 0.0) / typical**2
         # Errors are looked for over the distance to the plane, not over the one measured: that has

@@ -46,7 +46,7 @@ from tofcorr.diagnosis.findings.where import Estimated, interval_of
 from tofcorr.diagnosis.sums.linear_system import BASE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import predicted_distance
-from tofcorr.diagnosis.sums.study import Study, fitted_coefficients
+from tofcorr.diagnosis.sums.study import Study, fitted_coefficients, hidden_effects
 from tofcorr.error_terms.base import Term
 from tofcorr.estimation.robust import student_quantile
 from tofcorr.geometry import se3
@@ -81,6 +81,20 @@ class Share:
     fixed: int | None = None
     share: Estimated = field(default_factory=Estimated)
     of_constant: float | None = None
+
+
+def alike(study: Study, cause: str) -> list[str]:
+    """Return the causes that look the same as one in this recording.
+
+    They are the hand-eye transform and the effects of which calibration leaves hardly anything,
+    but for finer forms of base terms.
+    """
+    model, hidden = study.fit.model, hidden_effects(study)
+    hidden = [name for name in hidden if model.groups.isdisjoint(CATALOGUE[name].refines)]
+    hidden = hidden if model.num_hand_eye else []
+    if cause == HAND_EYE:
+        return hidden
+    return [HAND_EYE] if cause in hidden else []
 
 
 def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Share]:

@@ -15,7 +15,7 @@ import torch
 from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.outliers import Outliers
-from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
+from tofcorr.diagnosis.findings.shares import Share, alike
 from tofcorr.diagnosis.findings.where import Estimated, Stage
 from tofcorr.diagnosis.given import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -36,7 +36,7 @@ from tofcorr.diagnosis.report.words import (
 )
 from tofcorr.diagnosis.rerun.checks import Closure, DegradedStage, Transfer
 from tofcorr.diagnosis.rerun.simulator import Evidence, FittedValue, sensor_of
-from tofcorr.diagnosis.sums.study import Study, absorbed_share, hidden_effects
+from tofcorr.diagnosis.sums.study import Study, absorbed_share
 from tofcorr.digits import decimals, known, known_interval
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.pairs import LEAST_P
@@ -211,7 +211,7 @@ def content_of(result: DiagnosisResult) -> dict[str, Any]:
             {"cause": one.cause, "kind": one.kind, "share": round(one.share, 4)}
             | {"ci": _rounded(one.share.interval)}
             | ({} if one.of_constant is None else {"of_constant": round(one.of_constant, 4)})
-            | ({"aliases": hidden_effects(result.evidence.study)} if one.cause == HAND_EYE else {})
+            | {"aliases": alike(result.evidence.study, one.cause)}
             for one in result.shares
         ],
         "gap_mm": {

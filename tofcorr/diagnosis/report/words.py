@@ -9,11 +9,11 @@ import numpy as np
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.diagnosis.findings.gap import Gap, OpenSet
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
+from tofcorr.diagnosis.findings.shares import HAND_EYE, Share, alike
 from tofcorr.diagnosis.findings.where import Estimated, Interval, Region, Stage
 from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.observations import TINY
-from tofcorr.diagnosis.sums.study import Study, absorbed_share, hidden_effects
+from tofcorr.diagnosis.sums.study import Study, absorbed_share
 from tofcorr.digits import known, known_interval
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
@@ -242,14 +242,15 @@ def _cause_line(found: Evidence, one: Share) -> str:
     line = f"{cause_words(found.study, one)}: {share} of the squared gap"
     if one.of_constant is not None and one.of_constant > SMALL:
         line += f" ({percent(one.of_constant)} by a constant offset, which any cause may have)"
+    known = found.study.fit.known
+    if known is not None and one.share > SMALL and (others := alike(found.study, one.cause)):
+        same = [cause_words(found.study, Share(other, "effect")) for other in others]
+        line += f", or of the {' or the '.join(same)}, which looks the same here"
     if one.kind == "effect":
         return f"{line}; {effect_line(found.named, one.cause)}."
-    known = found.study.fit.known
     if one.cause != HAND_EYE or known is None:
         return f"{line}; a parameter of the simulator's error model."
     moved = se3.log(se3.inverse(known.tool_from_camera) @ found.tool_from_camera)
-    if one.share > SMALL and (alike := hidden_effects(found.study)):
-        line += f", or of {' or '.join(alike)}, which looks the same here"
     return (
         f"{line}; the camera sits {mm(float(moved[:3].norm()))} mm and "
         f"{math.degrees(float(moved[3:].norm())):.2f} degrees from where the simulator has it."
