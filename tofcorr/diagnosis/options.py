@@ -21,7 +21,7 @@ class TestOptions(Options):
 
     Attributes:
         odds: Prior odds that an effect is missing. Small: a recording is tested for some thirty. A
-            half or twice as much named the same (`benchmarks.levels`, seed 4242).
+            third or three times as much named the same (`benchmarks.levels`, seed 4242).
         named_from: Probability from which on something is said to be there: more probable than not.
         cover: Probability that a cause set holds, given the other effects. By convention.
         level: Significance level of biases along covariates. 5 % by convention.
@@ -38,7 +38,7 @@ class TestOptions(Options):
             simulator's error was fitted at other poses, to which it is carried with a form error.
     """
 
-    odds: Share = 0.001
+    odds: Share = 0.0003
     named_from: Share = 0.5
     cover: Share = 0.9
     level: Share = 0.05
