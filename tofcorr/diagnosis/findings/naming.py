@@ -229,7 +229,7 @@ def _in_place_of(
         if len(one) == len(model) and rest < set(one)
     }
     total, members, held = sum(rivals.values()), {name: rivals[name]}, rivals[name]
-    for other in sorted(rivals.keys() - {name}, key=lambda one: -rivals[one]):
+    for other in sorted(rivals.keys() - {name}, key=lambda one: (-rivals[one], one)):
         if held >= cover * total:
             break
         members[other] = rivals[other]
