@@ -126,8 +126,7 @@ def name_effects(study: Study) -> NamedEffects:
     Args:
         study: The recording.
     """
-    options, probes, tests = study.options, study.candidates.probes, study.options.tests
-    tested = study.sums.num_units >= tests.least_images
+    options, tests, probes = study.options, study.options.tests, study.candidates.probes
     evidence = Evidence(study)
     model = tuple(Search(evidence, tests.odds**0.5, tests.most_effects, width=1).best())
     if model:
@@ -138,41 +137,43 @@ def name_effects(study: Study) -> NamedEffects:
     shape = options.bootstraps, study.sums.num_units
     weights = torch.empty(shape).exponential_(generator=generator).double()
     weights *= shape[1] / weights.sum(1, keepdim=True)
-    probability = models.posterior(weights, generator).mean(1)
-    joint = _without_probes(models, probability)
-    chosen = max(joint, key=lambda one: joint[one])
-    least_probable = tests.named_from
-    if tested and 1.0 - joint[()] > least_probable:
-        chosen = max((one for one in joint if one), key=lambda one: joint[one])
     base = study.left_out_squares(())
-    large = _large_enough(study, evidence, models.sizes_of(chosen)) if tested else ()
-    named = NamedEffects(
+    found = NamedEffects(
         study=study,
         names=(),
         sets={},
         models=models,
-        probability=probability,
+        probability=models.posterior(weights, generator).mean(1),
         probes=tuple(name for name in models.best()[0] if name in probes),
         closed={
             name: base - evidence.left_out_squares((name,))
             for name in (*study.candidates.effects, *evidence.maps)
         },
         squares=float(base.sum()),
-        tested=tested,
+        tested=shape[1] >= tests.least_images,
     )
-    order = named.probabilities
+    return _with_names(found, evidence)
+
+
+def _with_names(found: NamedEffects, evidence: Evidence) -> NamedEffects:
+    """Name the effects of the most probable set that add enough, each with its cause set."""
+    study, tests, order = found.study, found.study.options.tests, found.probabilities
+    joint = _without_probes(found.models, found.probability)
+    anything = 1.0 - joint[()] > tests.named_from
+    chosen = max((one for one in joint if one or not anything), key=lambda one: joint[one])
+    sizes = found.models.sizes_of(chosen)
+    large = _large_enough(study, evidence, sizes) if found.tested else ()
     sets = {
         name: _in_place_of(name, chosen, joint, tests.cover)
         for name in sorted(large, key=lambda name: -order[name])
     }
-    names = tuple(n for n, s in sets.items() if named.probability_of_any(*s) > least_probable)
-    sets = {name: sets[name] for name in names}
-    maps = {name: evidence.maps[name].values for name in names if name in evidence.maps}
+    sets = {n: own for n, own in sets.items() if found.probability_of_any(*own) > tests.named_from}
+    maps = {name: evidence.maps[name].values for name in sets if name in evidence.maps}
     for name, values in maps.items():
         spent = {name, *study.candidates.maps[name].contains}
         study = without_map(study, values, spent)
-    study = with_poses_reestimated(study, named.columns_of(names))
-    return replace(named, study=study, names=names, maps=maps, sets=sets)
+    study = with_poses_reestimated(study, found.columns_of(tuple(sets)))
+    return replace(found, study=study, names=tuple(sets), maps=maps, sets=sets)
 
 
 def _beside(study: Study, model: Model, evidence: Evidence) -> Study:
