@@ -26,7 +26,7 @@ from tofcorr.diagnosis.sums.study import absorbed_share
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import load_options
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 

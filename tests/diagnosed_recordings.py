@@ -10,7 +10,7 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.sums.observations import effect_inputs, observe
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 

@@ -52,8 +52,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import Coefficient, EffectInputs, LinearDelay
 
 
 class StripesEffect(LinearDelay):

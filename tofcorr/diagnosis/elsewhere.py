@@ -31,7 +31,7 @@ from tofcorr.diagnosis.sums.observations import (
 from tofcorr.diagnosis.sums.study import Study, build_study, relinearised, with_poses_reestimated
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 
 
 def true_distance(frames: Observations) -> Tensor:

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from tofcorr.conditions import condition
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.sensor.scene import SceneFrames
-from tofcorr.simulation.effects.base import CatalogueEffect
-from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
+from tofcorr.simulation.effects.base import AMPLITUDE, FREQUENCY, CatalogueEffect, EffectInputs
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.hooks import Effect
 

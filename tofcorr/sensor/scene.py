@@ -13,7 +13,7 @@ from tofcorr.errors import ConfigError, FrameError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.sensor_file import SensorFile
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.hooks import FrameFacts
 
 # Conditions count up to this share of their range beyond it (no unit). Derived: a parabola that

@@ -3,7 +3,7 @@
 import pytest
 from simulation.effects.scenes import FEW, Scene, plain_inputs
 
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 
 
 @pytest.fixture(scope="session")

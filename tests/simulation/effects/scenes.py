@@ -8,7 +8,7 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.options import SimulatorOptions
 
 # The plain sensor has no delays here: an effect that moves edges would change those of amplitude.

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.effects.robot_kinematics import BacklashEffect, sides_of_approach
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from tofcorr.simulation.effects.image_filters import blur
+from tofcorr.simulation.effects.base import blur
 
 
 @pytest.mark.parametrize("sigma", [0.6, 1.2, 2.5])

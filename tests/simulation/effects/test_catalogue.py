@@ -8,9 +8,9 @@ import torch
 from simulation.effects.scenes import Scene
 
 from tofcorr.errors import ConfigError
+from tofcorr.geometry.se3 import by_frame
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect
-from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs
-from tofcorr.simulation.effects.numerics import by_frame
+from tofcorr.simulation.effects.base import VELOCITY, EffectInputs
 
 NAMES_AGREED = {
     *("distance", "pixel", "amplitude", "wiggling", "integration_time", "warm_up"),

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.simulation.effects.image_filters import ghost
+from tofcorr.simulation.effects.stray_light import ghost
 
 WIDTH, HEIGHT = 41, 31
 

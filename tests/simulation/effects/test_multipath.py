@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.effects.multipath import (
     MultipathEffect,
     MultipathShape,

@@ -7,8 +7,7 @@ import torch
 from simulation.effects.scenes import Scene
 from torch import Tensor
 
-from tofcorr.simulation.effects.image_filters import blur
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs, blur
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect
 
 FREQUENCY = 200e6  # Phases of neighbours then differ by up to 0.1 rad on tilted targets.

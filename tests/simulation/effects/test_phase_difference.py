@@ -2,7 +2,7 @@
 
 import torch
 
-from tofcorr.simulation.effects.numerics import by_parameters, phase_difference
+from tofcorr.simulation.effects.base import by_parameters, phase_difference
 
 
 def test_a_pixel_without_light_has_no_shift_and_no_slope() -> None:

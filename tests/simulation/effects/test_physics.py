@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tofcorr.geometry.rays import distance_along_rays
 from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
-from tofcorr.simulation.effects.base import CatalogueEffect
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import CatalogueEffect, EffectInputs
 from tofcorr.simulation.effects.lens import true_rays
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
 from tofcorr.simulation.effects.motion import MotionEffect, radial_speed

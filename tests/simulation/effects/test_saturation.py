@@ -4,9 +4,8 @@ import pytest
 import torch
 from simulation.effects.scenes import plain_inputs
 
-from tofcorr.simulation.effects.image_filters import spilled
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.saturation import SaturationEffect, SaturationShape
+from tofcorr.simulation.effects.base import EffectInputs
+from tofcorr.simulation.effects.saturation import SaturationEffect, SaturationShape, spilled
 
 
 @pytest.fixture(scope="module")

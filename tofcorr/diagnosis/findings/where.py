@@ -19,8 +19,8 @@ from torch import Tensor
 from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.simulation.effects.inputs import is_clock
-from tofcorr.simulation.effects.numerics import by_frame
+from tofcorr.geometry.se3 import by_frame
+from tofcorr.simulation.effects.base import is_clock
 
 Interval = tuple[float, float]
 StageName = Literal["as_given", "recalibrated", "with_effects"]

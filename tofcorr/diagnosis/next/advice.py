@@ -21,7 +21,7 @@ from tofcorr.diagnosis.sums.observations import (
 from tofcorr.diagnosis.sums.study import Study, absorbed_share, hidden_effects, left_over, signal
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
-from tofcorr.simulation.effects.inputs import is_clock
+from tofcorr.simulation.effects.base import is_clock
 from tofcorr.simulation.hooks import FrameFacts
 
 Change = tuple[str, str, Tensor]

@@ -58,7 +58,7 @@ from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.spread import sigma_from_mad
 
 

@@ -32,7 +32,7 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.base import BaseFit, unknown_amplitude_columns
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.pixels.dataset import in_threads
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.spread import sigma_from_mad
 
 BASE = "base"

@@ -29,9 +29,9 @@ from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.walls import name_walls
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance, tangents
+from tofcorr.geometry.se3 import by_frame
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.numerics import by_frame
+from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.hooks import FrameFacts
 from tofcorr.simulation.scene import planes_from_world
 from tofcorr.simulation.simulator import facts_of

@@ -28,10 +28,10 @@ from tofcorr.diagnosis.sums.linear_system import (
 )
 from tofcorr.diagnosis.sums.observations import TINY, Observations
 from tofcorr.geometry.rays import phase_from_radial_distance
+from tofcorr.geometry.se3 import by_frame
 from tofcorr.pixels.dataset import in_threads
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.inputs import MEASURED_PLANES, EffectInputs
-from tofcorr.simulation.effects.numerics import by_frame
+from tofcorr.simulation.effects.base import MEASURED_PLANES, EffectInputs
 
 # Prior standard deviation of a probe, metres. Chosen.
 _SIZE = 0.01

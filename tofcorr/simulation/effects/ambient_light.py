@@ -6,8 +6,14 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import AMBIENT, AMPLITUDE, EffectInputs, known
+from tofcorr.simulation.effects.base import (
+    AMBIENT,
+    AMPLITUDE,
+    Coefficient,
+    EffectInputs,
+    LinearDelay,
+    known,
+)
 
 
 class AmbientLightShape(Options):

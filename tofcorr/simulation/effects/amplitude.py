@@ -7,9 +7,14 @@ from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import AMPLITUDE, EffectInputs
-from tofcorr.simulation.effects.numerics import legendre, side_by_side
+from tofcorr.simulation.effects.base import (
+    AMPLITUDE,
+    Coefficient,
+    EffectInputs,
+    LinearDelay,
+    legendre,
+    side_by_side,
+)
 
 
 class AmplitudeShape(Options):

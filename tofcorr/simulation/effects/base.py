@@ -1,4 +1,4 @@
-"""The interface of every effect: an equation, its coefficients, and what it needs to know.
+"""What an effect is: an equation, its coefficients, what it may use, and what it needs to know.
 
 The simulator and the diagnosis use the same class. The simulator calls its hooks at the stages of
 `tofcorr.simulation.hooks`. The diagnosis uses `shift`, the change of the measured distance in
@@ -6,20 +6,296 @@ metres, and `columns`, the derivative of `shift` at zero: the effect's columns i
 (For an effect that is never small, `columns` holds chords instead of tangents.)
 """
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from pydantic import create_model
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
-from tofcorr.geometry.rays import distance_along_rays, plane_in_frame
+from tofcorr.conditions import condition
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.rays import (
+    distance_along_rays,
+    phase_from_radial_distance,
+    plane_in_frame,
+    unambiguous_range,
+)
+from tofcorr.geometry.se3 import by_frame
 from tofcorr.options import FiniteNumber, Options
-from tofcorr.simulation.effects.inputs import EffectInputs, Need, inputs_from_state
-from tofcorr.simulation.effects.numerics import by_frame, by_parameters
 from tofcorr.simulation.hooks import Effect, FrameFacts, FrameState
+
+# Largest number of pixels in one batch of images. Set by hand: bounds the memory to some 100 MB.
+_CHUNK_PIXELS = 500_000
+_OfImages = Callable[..., Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectInputs:
+    """M chosen pixels of F frames, float64 unless stated otherwise.
+
+    Attributes:
+        camera: Intrinsics as recorded.
+        modulation_frequency: Hz; None if unknown.
+        tool_from_camera: Hand-eye transform, shape (4, 4).
+        facts: What is known of the F frames.
+        frame: Which frame a pixel belongs to, shape (M,), int64.
+        pixel: Flat index row * width + column, shape (M,), int64.
+        rays: Unit viewing rays in the camera frame, shape (M, 3).
+        radial_distance: Predicted from geometry, never measured, shape (M,), metres.
+        incidence_cosine: Shape (M,), in (0, 1].
+        points_world: Shape (M, 3), metres.
+        target_xy: The same points in the target's own coordinates, shape (M, 2), metres.
+        amplitude: Counts, shape (M,); None if unknown.
+        amplitude_images: Counts, shape (F, H, W), zero where there is no return; None if unknown.
+            Float32 or float64.
+        amplitude_noise: Standard deviation of the amplitude's noise where neighbouring pixels share
+            noise, counts, shape (M,); None: they share none.
+        distance_images: Radial distances of the same pixels, shape (F, H, W), metres.
+        planes_are_measured: Whether the target's planes were measured by other means than by the
+            depth itself.
+        light: Amplitude that no tap has clipped, counts, shape (M,); None: only what was measured.
+        normals_camera: Unit normals of any surfaces in the camera frame, shape (M, 3); None: each
+            frame shows one plane, that of `facts`.
+    """
+
+    camera: CameraIntrinsics
+    modulation_frequency: float | None
+    tool_from_camera: Tensor
+    facts: FrameFacts
+    frame: Tensor
+    pixel: Tensor
+    rays: Tensor
+    radial_distance: Tensor
+    incidence_cosine: Tensor
+    points_world: Tensor
+    target_xy: Tensor
+    amplitude: Tensor | None = None
+    amplitude_images: Tensor | None = None
+    amplitude_noise: Tensor | None = None
+    distance_images: Tensor | None = None
+    planes_are_measured: bool = True
+    light: Tensor | None = None
+    normals_camera: Tensor | None = None
+    _remembered: dict[Hashable, Tensor] = field(default_factory=dict, repr=False, init=False)
+
+    def of_frame(self, values: Tensor) -> Tensor:
+        """Return the values of frames (F, ...) for each pixel, shape (M, ...)."""
+        return values[self.frame]
+
+    @cached_property
+    def rows(self) -> Tensor:
+        """Rows scaled to [-1, 1] from the top to the bottom edge, shape (M,)."""
+        row = torch.div(self.pixel, self.camera.width, rounding_mode="floor")
+        return 2 * row.to(self.radial_distance) / max(self.camera.height - 1, 1) - 1
+
+    @cached_property
+    def columns(self) -> Tensor:
+        """Columns scaled to [-1, 1] from the left to the right edge, shape (M,)."""
+        column = torch.remainder(self.pixel, self.camera.width)
+        return 2 * column.to(self.radial_distance) / max(self.camera.width - 1, 1) - 1
+
+    @cached_property
+    def phase(self) -> Tensor:
+        """Phase of the predicted distance, not wrapped, shape (M,), radians."""
+        return phase_from_radial_distance(self.radial_distance, self.known_frequency)
+
+    @cached_property
+    def turn(self) -> Tensor:
+        """Phasor of length one at the phase, shape (M,), complex."""
+        return torch.polar(torch.ones_like(self.phase), self.phase)
+
+    @property
+    def known_frequency(self) -> float:
+        """Modulation frequency in Hz; an effect that uses it lists it among its needs."""
+        return known(self, "modulation_frequency")
+
+    @property
+    def metres_per_radian(self) -> float:
+        """Distance per radian of phase."""
+        return unambiguous_range(self.known_frequency) / (2 * torch.pi)
+
+    @property
+    def known_amplitude(self) -> Tensor:
+        """Amplitudes in counts; an effect that uses them lists them among its needs."""
+        return known(self, "amplitude")
+
+    def signal(self) -> Tensor:
+        """Return the fundamental's phasor in every chosen pixel, shape (M,), complex."""
+        return torch.polar(self.known_amplitude, self.phase)
+
+    def from_signal(self, function: _OfImages, *arguments: Hashable) -> Tensor:
+        """Apply a function to images of the phasor, and return its value in the chosen pixels.
+
+        Args:
+            function: Takes complex images (B, H, W), then the arguments; returns (B, H, W, ...).
+            arguments: Of the function.
+        """
+        return self.from_images(_from_signal, self.known_frequency, function, *arguments)
+
+    def from_images(
+        self, function: _OfImages, *arguments: Hashable, of_frames: Tensor | None = None
+    ) -> Tensor:
+        """Apply a function to whole images and return its value in the chosen pixels, kept.
+
+        Args:
+            function: Takes amplitudes and distances (B, H, W), then the values of these frames if
+                there are any, then the arguments; returns (B, H, W, ...). Large images are given in
+                single precision.
+            arguments: Of the function.
+            of_frames: Values of the frames, shape (F, ...).
+
+        Returns:
+            Shape (M, ...).
+        """
+        key = (function, *arguments)
+        if key not in self._remembered:
+            whole = [known(self, "amplitude_images"), known(self, "distance_images")]
+            whole += [] if of_frames is None else [of_frames]
+            size = whole[0][0].numel()
+            step, values = max(1, _CHUNK_PIXELS // size), []
+            for start in range(0, len(whole[0]), step):
+                images = function(*(each[start : start + step] for each in whole), *arguments)
+                inside = (self.frame >= start) & (self.frame < start + step)
+                place = (self.frame[inside] - start) * size + self.pixel[inside]
+                values.append(images.flatten(0, 2)[place])
+            self._remembered[key] = torch.cat(values)
+        return self._remembered[key]
+
+    def remembered(self, function: _OfImages, *arguments: Hashable) -> Tensor:
+        """Return `function(self, *arguments)`, computed on the first call."""
+        key = (function, *arguments)
+        if key not in self._remembered:
+            self._remembered[key] = function(self, *arguments)
+        return self._remembered[key]
+
+
+def known(holder: "EffectInputs | FrameFacts", name: str) -> Any:  # noqa: ANN401 - of any attribute
+    """Return what an effect uses; it lists it among its needs.
+
+    Raises:
+        ValueError: It is unknown.
+    """
+    value = getattr(holder, name)
+    if value is None:
+        raise ValueError(f"{name} is unknown; an effect needs it.")
+    return value
+
+
+def _from_signal(
+    amplitude: Tensor, distance: Tensor, frequency: float, function: _OfImages, *more: Hashable
+) -> Tensor:
+    signal = torch.polar(amplitude, phase_from_radial_distance(distance, frequency))
+    return function(signal, *more)
+
+
+def inputs_from_state(state: FrameState) -> EffectInputs:
+    """Return what an effect may use of a frame that has passed stage geometry.
+
+    Amplitudes are known from stage light on.
+    """
+    count = state.radial_distance.numel()
+    counts = None
+    if state.amplitude.numel() == count:
+        counts = state.amplitude / state.electrons_per_count
+    return EffectInputs(
+        camera=state.camera,
+        modulation_frequency=state.modulation_frequency,
+        tool_from_camera=state.tool_from_camera,
+        facts=state.facts.at(slice(-1, None)),
+        frame=torch.zeros(count, dtype=torch.int64),
+        pixel=torch.arange(count),
+        rays=state.ray_directions.reshape(-1, 3),
+        radial_distance=state.radial_distance.reshape(-1),
+        incidence_cosine=state.incidence_cosine.reshape(-1),
+        points_world=state.points_world.reshape(-1, 3),
+        target_xy=state.target_xy.reshape(-1, 2),
+        amplitude=None if counts is None else counts.reshape(-1),
+        amplitude_images=None if counts is None else counts.nan_to_num(0.0)[None],
+        distance_images=state.radial_distance.nan_to_num(0.0)[None],
+    )
+
+
+# What an effect can need to know before it can be tested, and whether it is known.
+
+
+class Need(NamedTuple):
+    """Something that an effect needs to know.
+
+    Attributes:
+        words: What it is called: the file, column or key of the recording format that holds it.
+        known: Whether it is known for every frame.
+        condition: Attribute of `Conditions`, where it is a condition of the frames.
+        beyond_image: Why depth images of any scene do not hold it; empty where they do.
+    """
+
+    words: str
+    known: Callable[[EffectInputs], bool]
+    condition: str = ""
+    beyond_image: str = ""
+
+
+def _complete(values: Tensor | None) -> bool:
+    return values is not None and bool(torch.isfinite(values).all())
+
+
+def _condition(name: str) -> Need:
+    """Return the need of a condition in every frame."""
+    column = condition(name).column
+    return Need(column, lambda inputs: _complete(getattr(inputs.facts, name)), condition=name)
+
+
+def _moves(inputs: EffectInputs) -> bool:
+    poses = inputs.facts.world_from_tool
+    return bool((poses - poses[:1]).abs().amax() > 0)
+
+
+def is_clock(times: Tensor) -> bool:
+    """Return whether time stamps (F,) are times: those that merely count the frames are none."""
+    counts = torch.arange(len(times), dtype=times.dtype, device=times.device)
+    return bool(times.max() > times.min()) and not torch.equal(times, counts)
+
+
+AMPLITUDE = Need("amplitude.npy", lambda inputs: inputs.amplitude is not None)
+FREQUENCY = Need(
+    "modulation_frequency_hz in recording.yaml",
+    lambda inputs: inputs.modulation_frequency is not None,
+)
+INTEGRATION_TIME = _condition("integration_time")
+ROOM_TEMPERATURE = _condition("room_temperature")
+AMBIENT = _condition("ambient")
+TIMESTAMP = Need(
+    f"{condition('timestamp').column} of a clock",
+    lambda inputs: is_clock(inputs.facts.timestamp),
+    condition="timestamp",
+)
+ROBOT = Need(
+    "poses of a moving tool",
+    _moves,
+    beyond_image="it belongs to the robot, not to the camera: render the scene from the true poses",
+)
+VELOCITY = Need(
+    "velocity of the tool",
+    lambda inputs: _complete(inputs.facts.tool_twist),
+    beyond_image="an image does not hold how fast the camera moves",
+)
+# If the tool never moves, nothing shows whether target and room stay in place.
+FIXED_TARGET = Need(
+    "a target that stays in place",
+    _moves,
+    beyond_image="it belongs to the target and the room of the recording, which an image of "
+    "another scene does not hold",
+)
+# A plane that the fit has to estimate is wherever the depth says.
+MEASURED_PLANES = Need("measured planes", lambda inputs: inputs.planes_are_measured)
+
+
+# The effect itself, and the kinds of it.
 
 
 class Coefficient(NamedTuple):
@@ -289,3 +565,131 @@ class SignalEffect(CatalogueEffect):
         shares = self.shares(inputs)
         light = 1 + shares @ coefficients.to(shares.dtype)
         return inputs.metres_per_radian * (shares / light[:, None]).imag
+
+
+# What the equations of several effects share: derivatives, phases, ranges, polynomials, blur.
+
+
+def by_parameters(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """Return the derivatives of a function's values (M,) by its parameters (K,), shape (M, K).
+
+    The gradient of u . f is linear in u, so that its own derivative by u is what is asked for. Each
+    of the K columns then takes one pass backwards, and the function is evaluated once. (torch's
+    forward mode evaluates it K times, and imports torch.compile, which takes as long as torch.)
+
+    Args:
+        function: Takes parameters (K,) and returns values (M,); differentiable twice by torch.
+        at: Where to differentiate, shape (K,).
+    """
+    with torch.enable_grad():
+        parameters = at.detach().clone().requires_grad_()
+        values = function(parameters)
+        if not values.requires_grad:
+            return values.new_zeros(*values.shape, len(at))
+        u = torch.zeros_like(values, requires_grad=True)
+        # Sums and single numbers: given weights, torch would import SymPy to compare their shape.
+        (gradient,) = torch.autograd.grad((values * u).sum(), parameters, create_graph=True)
+        columns = [
+            torch.autograd.grad(one, u, retain_graph=True, materialize_grads=True)[0]
+            for one in gradient.unbind()
+        ]
+    return torch.stack(columns, dim=-1)
+
+
+def phase_difference(signal: Tensor, own: Tensor) -> Tensor:
+    """Return the phase of complex signals (M,) less that of others, radians; 0 without light.
+
+    A signal of zero has no phase, and its derivative would be no number.
+    """
+    product = signal * own.conj()
+    # Apart and in one piece each: `angle` of complex numbers takes three times as long.
+    return torch.atan2(product.imag.contiguous(), product.real + (product == 0))
+
+
+def inner_range(values: Tensor, beyond: float) -> tuple[float, float]:
+    """Return the ends of what values (M,) lie between, but for a share of them at either end."""
+    ordered, last = values.sort().values, len(values) - 1
+    return float(ordered[int(beyond * last)]), float(ordered[int((1 - beyond) * last)])
+
+
+# Legendre polynomials on [-1, 1], in one and two variables.
+
+
+def legendre(scaled: Tensor, degree: int) -> list[Tensor]:
+    """Return the Legendre polynomials P_0 ... P_degree of values (M,), each (M,)."""
+    found = [torch.ones_like(scaled), scaled]
+    for k in range(1, degree):
+        found.append(((2 * k + 1) * scaled * found[-1] - k * found[-2]) / (k + 1))
+    return found[: degree + 1]
+
+
+def products(x: Tensor, y: Tensor, low: int, high: int) -> list[Tensor]:
+    """Return P_i(x) P_j(y) for low <= i + j <= high, ordered as `exponents`, each (M,)."""
+    of_x, of_y = legendre(x, high), legendre(y, high)
+    return [of_x[i] * of_y[j] for i, j in exponents(low, high)]
+
+
+def side_by_side(columns: list[Tensor]) -> Tensor:
+    """Return columns (M,) as a matrix (M, K), each of them in one piece of memory."""
+    return torch.stack(columns).movedim(0, -1)
+
+
+def exponents(low: int, high: int) -> list[tuple[int, int]]:
+    """Return all (i, j) with low <= i + j <= high."""
+    return [(total - j, j) for total in range(low, high + 1) for j in range(total + 1)]
+
+
+# Half width of the kernel in standard deviations: 0.3 % of a Gaussian lies beyond 3.
+_KERNEL_SIGMAS = 3.0
+# Samples per standard deviation of a wide Gaussian. Set by hand; the tests of `blur` bound what it
+# changes in a smooth image.
+_PIXELS_PER_SIGMA = 3.0
+
+
+def blur(images: Tensor, sigma: float) -> Tensor:
+    """Blur complex or real images (F, H, W) by a Gaussian of `sigma` pixels, edges repeated.
+
+    A wide Gaussian is applied to images averaged over squares of a third of `sigma`.
+    """
+    size = images.shape[-2:]
+    square = max(1, min(int(sigma / _PIXELS_PER_SIGMA), *size))
+    if square == 1:
+        return _gaussian(images, sigma)
+    if images.is_complex():
+        return torch.complex(blur(images.real, sigma), blur(images.imag, sigma))
+    coarse = avg_pool2d(images[:, None], square, ceil_mode=True, count_include_pad=False)
+    coarse = _gaussian(coarse[:, 0], sigma / square)[:, None]
+    fine = interpolate(coarse, scale_factor=square, mode="bilinear", align_corners=False)
+    return fine[:, 0, : size[0], : size[1]]
+
+
+def _gaussian(images: Tensor, sigma: float) -> Tensor:
+    half = max(1, round(_KERNEL_SIGMAS * sigma))
+    half = max(0, min(half, images.shape[-1] - 1, images.shape[-2] - 1))
+    weights = [math.exp(-0.5 * (place / sigma) ** 2) for place in range(-half, half + 1)]
+    weights = [weight / sum(weights) for weight in weights]
+    if images.is_complex():
+        parts = torch.view_as_real(images)
+        return torch.view_as_complex(_filtered(parts, weights).contiguous())
+    return _filtered(images, weights)
+
+
+def _filtered(images: Tensor, weights: list[float]) -> Tensor:
+    """Filter images (F, H, W, ...) along rows and columns by symmetric weights (2 half + 1).
+
+    Sums of shifted images: on a processor up to three times as fast as a convolution with one
+    channel.
+    """
+    half = len(weights) // 2
+    for axis in (1, 2):
+        count = images.shape[axis]
+        repeats = [half if each == axis else 1 for each in range(images.dim())]
+        ends = images.narrow(axis, 0, 1), images.narrow(axis, count - 1, 1)
+        wide = torch.cat([ends[0].repeat(repeats), images, ends[1].repeat(repeats)], axis)
+        images = weights[half] * wide.narrow(axis, half, count)
+        for place in range(half):
+            pair = wide.narrow(axis, place, count) + wide.narrow(axis, 2 * half - place, count)
+            images.add_(
+                pair, alpha=weights[place]
+            )  # Of a sum made above: its gradient stays right.
+    return images

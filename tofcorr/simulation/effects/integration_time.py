@@ -6,8 +6,13 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, FrameEffect
-from tofcorr.simulation.effects.inputs import INTEGRATION_TIME, EffectInputs, known
+from tofcorr.simulation.effects.base import (
+    INTEGRATION_TIME,
+    Coefficient,
+    EffectInputs,
+    FrameEffect,
+    known,
+)
 from tofcorr.simulation.hooks import FrameFacts
 
 # Integration times whose logarithms differ by less (no unit) are one setting. Set by hand: settings

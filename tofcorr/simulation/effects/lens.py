@@ -4,8 +4,12 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, plane_in_camera
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import (
+    CatalogueEffect,
+    Coefficient,
+    EffectInputs,
+    plane_in_camera,
+)
 from tofcorr.simulation.hooks import FrameState
 
 

@@ -7,10 +7,17 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, add_delay
-from tofcorr.simulation.effects.image_filters import blur
-from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs, inputs_from_state
-from tofcorr.simulation.effects.numerics import phase_difference
+from tofcorr.simulation.effects.base import (
+    AMPLITUDE,
+    FREQUENCY,
+    CatalogueEffect,
+    Coefficient,
+    EffectInputs,
+    add_delay,
+    blur,
+    inputs_from_state,
+    phase_difference,
+)
 from tofcorr.simulation.hooks import FrameState
 
 _EDGES = ("edge_square", "edge", "edge_at_one_metre", "astride", "astride_at_one_metre")
@@ -19,6 +26,9 @@ _EDGE_PX = 0.8
 # Slope of the logarithmic amplitude at which a pixel counts half as an edge, 1 / pixel. Set by
 # hand, well above the slope that vignetting and tilt cause.
 _EDGE_SLOPE = 0.2
+# Brightness varies where its squared second differences exceed this many times the variance of its
+# noise. Chosen: four standard deviations.
+_VARIES = 16.0
 
 
 class MixedPixelsShape(Options):
@@ -80,11 +90,34 @@ def _at_edges(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
     """Return the errors at edges, shape (M,), metres."""
     edges = inputs.from_images(_edges_of).to(inputs.radial_distance.dtype)
     if inputs.amplitude_noise is not None:
-        edges = edges * inputs.brightness_varies(_EDGE_PX)[:, None]
+        edges = edges * _brightness_varies(inputs, inputs.amplitude_noise)[:, None]
     contrast, present, shared = edges.unbind(-1)
     square, edge, edge_near, astride, astride_near = coefficients[-len(_EDGES) :].unbind(0)
     near = (edge_near * present + astride_near * shared) / inputs.radial_distance
     return square * contrast + edge * present + astride * shared + near
+
+
+def _brightness_varies(inputs: EffectInputs, noise: Tensor) -> Tensor:
+    r"""Return where brightness varies by more than noise that neighbours share, (M,), bool.
+
+    A camera that filters its images leaves pixels i and j a share r of their noise. The noise of
+    their phasors is circular, so that the amplitude of one varies with the phase of the other:
+    :math:`E\, \delta A_j \delta\phi_i = r \sigma_A^2 \sin(\phi_j - \phi_i) / A_i`. What depends on
+    slopes of the measured amplitude would thus explain noise of the distance. Second differences
+    decide, as they do not see the slopes of light and shade.
+    """
+    return inputs.from_images(_bent_square) > _VARIES * noise**2
+
+
+def _bent_square(amplitude: Tensor, _distance: Tensor) -> Tensor:
+    """Return the mean square of second differences along rows and columns, blurred, (B, H, W)."""
+    images = amplitude.double()
+    square = torch.zeros_like(images)
+    for axis in (1, 2):
+        if images.shape[axis] > 2:
+            second = images.diff(n=2, dim=axis).square() / 2
+            square.narrow(axis, 1, second.shape[axis]).add_(second)
+    return blur(square, _EDGE_PX)
 
 
 def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:

@@ -4,15 +4,16 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.rays import phase_from_radial_distance
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import (
+from tofcorr.simulation.effects.base import (
     FREQUENCY,
     VELOCITY,
+    CatalogueEffect,
+    Coefficient,
     EffectInputs,
     inputs_from_state,
     known,
+    phase_difference,
 )
-from tofcorr.simulation.effects.numerics import phase_difference
 from tofcorr.simulation.hooks import FrameState
 
 

@@ -7,14 +7,17 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.rays import SPEED_OF_LIGHT
-from tofcorr.simulation.effects.base import Coefficient, SignalEffect
-from tofcorr.simulation.effects.inputs import (
+from tofcorr.simulation.effects.base import (
     FIXED_TARGET,
     FREQUENCY,
+    Coefficient,
     EffectInputs,
+    SignalEffect,
+    exponents,
     inputs_from_state,
+    products,
+    side_by_side,
 )
-from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
 from tofcorr.simulation.effects.surface import LEAST_COSINE
 from tofcorr.simulation.effects.target_shape import AreaShape
 from tofcorr.simulation.hooks import FrameState

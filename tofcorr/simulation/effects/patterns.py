@@ -13,8 +13,7 @@ from torch import Tensor
 
 from tofcorr.errors import ConfigError
 from tofcorr.options import FiniteNumber, Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, add_delay
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, EffectInputs, add_delay
 from tofcorr.simulation.hooks import FrameState
 
 # Smallest mean number of measurements per block. Set by hand: averages noise to a third.

@@ -5,9 +5,14 @@ from typing import ClassVar
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
+from tofcorr.simulation.effects.base import (
+    Coefficient,
+    EffectInputs,
+    LinearDelay,
+    exponents,
+    products,
+    side_by_side,
+)
 
 
 class PixelShape(Options):

@@ -7,10 +7,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry import se3
+from tofcorr.geometry.se3 import small_motion
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
-from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs
-from tofcorr.simulation.effects.numerics import small_motion
+from tofcorr.simulation.effects.base import ROBOT, Coefficient, EffectInputs, GeometryEffect
 from tofcorr.simulation.hooks import FrameFacts
 
 # A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:

@@ -1,5 +1,6 @@
 """Taps that no longer grow with the light, and the light that reached them."""
 
+import math
 from collections.abc import Iterator
 from typing import ClassVar, Self
 
@@ -8,10 +9,15 @@ from torch import Tensor
 
 from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.image_filters import spilled
-from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
-from tofcorr.simulation.effects.numerics import inner_range, phase_difference
+from tofcorr.simulation.effects.base import (
+    AMPLITUDE,
+    FREQUENCY,
+    CatalogueEffect,
+    Coefficient,
+    EffectInputs,
+    inner_range,
+    phase_difference,
+)
 from tofcorr.simulation.hooks import FrameState
 
 # Share of the dim pixels whose amplitude per light is above that of white (no unit). Set by hand:
@@ -56,6 +62,10 @@ _SOFT_CHORD = 0.1
 # A phasor below this share of the brightest tap has no phase. Chosen: far above the rounding of
 # float64, far below any noise.
 _LEAST_LEFT = 1e-9
+# Pixels over which the charge falls by e, and how far it is followed. Set by hand: blooming of
+# small pixels reaches a few of them.
+_LENGTH_PX = 2.0
+_REACH_PX = 4
 # Shares of charge that spill: along columns and along rows.
 _SPILLS = 2
 
@@ -206,3 +216,26 @@ def _four_taps(background: Tensor, signal: Tensor) -> Tensor:
 def _phasor(taps: Tensor) -> Tensor:
     """Return the phasor that the differences of opposite taps (4, ...) make, complex (...)."""
     return torch.complex(taps[0] - taps[2], taps[3] - taps[1])
+
+
+def spilled(over: Tensor, axis: int) -> Tensor:
+    """Return the charge that each pixel receives from the others on its line, like `over`.
+
+    A pixel gives all that it has too much to its neighbours, equally to both sides and falling by
+    e over two pixels. What would run beyond the edge of the image is lost.
+
+    Args:
+        over: Charge above the full level, of any shape, not negative.
+        axis: The axis along which it runs.
+    """
+    count = over.shape[axis]
+    weights = [math.exp(-place / _LENGTH_PX) for place in range(1, _REACH_PX + 1)]
+    received = torch.zeros_like(over)
+    for place, weight in enumerate(weights, start=1):
+        if place >= count:
+            break
+        first, last = over.narrow(axis, 0, count - place), over.narrow(axis, place, count - place)
+        share = weight / (2 * sum(weights))
+        received.narrow(axis, place, count - place).add_(first, alpha=share)
+        received.narrow(axis, 0, count - place).add_(last, alpha=share)
+    return received

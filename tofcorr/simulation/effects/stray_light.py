@@ -6,12 +6,18 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, SignalEffect
-from tofcorr.simulation.effects.image_filters import blur, ghost
-from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
+from tofcorr.simulation.effects.base import (
+    AMPLITUDE,
+    FREQUENCY,
+    Coefficient,
+    EffectInputs,
+    SignalEffect,
+    blur,
+)
 from tofcorr.simulation.hooks import FrameState
 
 
@@ -80,3 +86,33 @@ def _scattered(
     out_of_focus = cache(partial(blur, signal, shape.ghost_sigma_of_width * camera.width))
     ways += [lambda size=size: ghost(out_of_focus(), camera, size) for size in shape.ghost_sizes]
     return torch.stack([ways[number]() for number in chosen or range(len(ways))], dim=-1)
+
+
+def ghost(images: Tensor, camera: CameraIntrinsics, size: float) -> Tensor:
+    """Return complex images (F, H, W) turned half round about the optical axis and made smaller.
+
+    Outside the ghost, and where it shows what the image does not hold, it is dark.
+
+    Args:
+        images: Phasors.
+        camera: Where the optical axis meets the image.
+        size: Of the ghost, over that of the image.
+    """
+    height, width = images.shape[-2:]
+    matrix = camera.matrix_tensor()
+    row = torch.arange(height, dtype=torch.float64)
+    column = torch.arange(width, dtype=torch.float64)
+    y = matrix[1, 2] - (row - matrix[1, 2]) / size
+    x = matrix[0, 2] - (column - matrix[0, 2]) / size
+    # Places from -1 to 1 between the centres of the outermost pixels.
+    y, x = 2 * y / max(height - 1, 1) - 1, 2 * x / max(width - 1, 1) - 1
+    places = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    parts = torch.view_as_real(images).movedim(-1, 1)
+    turned = grid_sample(
+        parts,
+        places.to(parts.dtype).expand(len(parts), *places.shape),
+        mode="bilinear",
+        padding_mode="zeros",
+        align_corners=True,
+    )
+    return torch.view_as_complex(turned.movedim(1, -1).contiguous())

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.base import Coefficient, EffectInputs, LinearDelay
 
 LEAST_COSINE = 0.05
 """Smallest cosine used (87 degrees; no unit). Set by hand: 1 / cosine stays finite, and no camera

@@ -8,8 +8,13 @@ from torch import Tensor
 
 from tofcorr.geometry.rays import tangents
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
-from tofcorr.simulation.effects.inputs import FIXED_TARGET, MEASURED_PLANES, EffectInputs
+from tofcorr.simulation.effects.base import (
+    FIXED_TARGET,
+    MEASURED_PLANES,
+    Coefficient,
+    EffectInputs,
+    GeometryEffect,
+)
 from tofcorr.simulation.hooks import FrameFacts
 
 # Planes whose entries (n, d) differ by less (no unit, metres) are one plane. Set by hand: far above

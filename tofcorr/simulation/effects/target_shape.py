@@ -5,9 +5,16 @@ from typing import ClassVar, Self
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, LinearEffect
-from tofcorr.simulation.effects.inputs import FIXED_TARGET, EffectInputs, inputs_from_state
-from tofcorr.simulation.effects.numerics import exponents, products, side_by_side
+from tofcorr.simulation.effects.base import (
+    FIXED_TARGET,
+    Coefficient,
+    EffectInputs,
+    LinearEffect,
+    exponents,
+    inputs_from_state,
+    products,
+    side_by_side,
+)
 from tofcorr.simulation.hooks import FrameState
 
 

@@ -8,8 +8,14 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, FrameEffect
-from tofcorr.simulation.effects.inputs import ROOM_TEMPERATURE, TIMESTAMP, EffectInputs, known
+from tofcorr.simulation.effects.base import (
+    ROOM_TEMPERATURE,
+    TIMESTAMP,
+    Coefficient,
+    EffectInputs,
+    FrameEffect,
+    known,
+)
 from tofcorr.simulation.hooks import FrameFacts
 
 # A pause of more mean intervals between frames than this counts as one that the camera was off in,

@@ -5,10 +5,15 @@ from typing import ClassVar, Self
 
 from torch import Tensor
 
+from tofcorr.geometry.se3 import small_motion
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
-from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs, known
-from tofcorr.simulation.effects.numerics import small_motion
+from tofcorr.simulation.effects.base import (
+    VELOCITY,
+    Coefficient,
+    EffectInputs,
+    GeometryEffect,
+    known,
+)
 from tofcorr.simulation.hooks import FrameFacts
 
 

@@ -8,9 +8,15 @@ from torch import Tensor
 
 from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, SignalEffect
-from tofcorr.simulation.effects.inputs import FREQUENCY, EffectInputs, inputs_from_state
-from tofcorr.simulation.effects.numerics import inner_range, side_by_side
+from tofcorr.simulation.effects.base import (
+    FREQUENCY,
+    Coefficient,
+    EffectInputs,
+    SignalEffect,
+    inner_range,
+    inputs_from_state,
+    side_by_side,
+)
 from tofcorr.simulation.hooks import FrameState
 
 # Periods of the error within the unambiguous range: multiples of the first. The harmonic of order
