@@ -37,8 +37,7 @@ PURPOSES = {
     "files": "whole or not at all; damage is noticed",
     "errors": "what a user can cause, and mend",
     "digits": "numbers with the digits that are known",
-    "progress": "bars at a terminal, log lines on request",
-    "spread": "standard deviation of a median deviation",
+    "progress": "bars, log lines, TensorBoard files",
     "version": "one number",
 }
 """One line for every room."""
@@ -55,16 +54,7 @@ GROUPS = {
     "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
     "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
-    "ground": (
-        "conditions",
-        "digits",
-        "files",
-        "options",
-        "progress",
-        "spread",
-        "errors",
-        "version",
-    ),
+    "ground": ("conditions", "digits", "files", "options", "progress", "errors", "version"),
 }
 _GROUP_OF = {room: group for group, rooms in GROUPS.items() for room in rooms}
 

@@ -135,7 +135,7 @@ def _predicted_rms(recording: "Recording", wall: str) -> float:
     """Fit the other walls; estimate this wall's plane alone; return its distances' RMS, mm."""
     from tofcorr.fit.walls import walls_alone
     from tofcorr.pixels.dataset import Dataset
-    from tofcorr.pixels.metrics import frame_errors
+    from tofcorr.pixels.passes import frame_errors
 
     data = Dataset((recording,))
     seen = np.flatnonzero(data.targets != wall)

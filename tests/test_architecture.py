@@ -14,7 +14,7 @@ from tofcorr.importing.registry import IMPORTERS
 ROOT = Path(__file__).resolve().parents[1]
 CONFINED = {
     "cv2": {"tofcorr/importing", "tofcorr/correction/export/opencv.py"},
-    "torch.utils.tensorboard": {"tofcorr/training/monitor.py"},
+    "torch.utils.tensorboard": {"tofcorr/progress.py", "tofcorr/training/monitor.py"},
     "yaml": {"tofcorr/options.py", "tofcorr/data", "tofcorr/importing"},
 }
 

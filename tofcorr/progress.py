@@ -1,4 +1,4 @@
-"""How far long work has come: bars for people at a terminal, log lines for those who ask.
+"""How far long work has come: bars at a terminal, log lines for those who ask, TensorBoard's files.
 
 A bar is drawn on standard error if, and only if, that is a terminal and no log lines were asked
 for. In a log file nothing of it appears. tqdm is imported only where a bar is drawn.
@@ -6,10 +6,15 @@ for. In a log file nothing of it appears. tqdm is imported only where a bar is d
 
 import logging
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 Item = TypeVar("Item")
 Advance = Callable[[int], object]
@@ -103,3 +108,29 @@ def stages(what: str, total: int) -> Iterator[Callable[[str], None]]:
     finally:
         if shown is not None:
             shown.close()
+
+
+@contextmanager
+def event_writer(folder: Path | str) -> Iterator["SummaryWriter"]:
+    """Yield a writer of TensorBoard's files, whose thread prints no traceback when it fails.
+
+    Args:
+        folder: Where the event files go; made if it is missing.
+
+    Raises:
+        OSError: They could not be written, for example because the disk is full.
+    """
+    from torch.utils.tensorboard import SummaryWriter
+
+    ended: list[BaseException | None] = []
+    before = threading.excepthook
+    threading.excepthook = keep = lambda arguments: ended.append(arguments.exc_value)
+    try:
+        with SummaryWriter(str(folder)) as writer:
+            yield writer
+    finally:
+        if threading.excepthook is keep:
+            threading.excepthook = before
+    for error in ended:
+        if error is not None:
+            raise error

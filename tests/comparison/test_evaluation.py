@@ -18,7 +18,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.geometry.rays import plane_in_frame, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset, covered_domain
-from tofcorr.pixels.metrics import frame_errors
+from tofcorr.pixels.passes import frame_errors
 from tofcorr.training.calibration import TrainingOptions
 
 

@@ -15,7 +15,7 @@ from tofcorr.comparison.select import select
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.metrics import FittedModel
+from tofcorr.pixels.passes import FittedModel
 from tofcorr.pixels.sample import usable_pixels
 
 TRAIN = np.arange(0, 24)

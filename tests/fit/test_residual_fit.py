@@ -12,7 +12,7 @@ from tofcorr.correction.state import load_calibration, save_calibration
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset, covered_domain
-from tofcorr.pixels.metrics import frame_errors
+from tofcorr.pixels.passes import frame_errors
 from tofcorr.simulation.signal import PixelDelayOptions, pixel_delay
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import calibration_state

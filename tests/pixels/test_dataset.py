@@ -16,6 +16,7 @@ from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.passes import image_moments
 
 
 @pytest.mark.parametrize(
@@ -51,7 +52,7 @@ def test_moments_of_images_as_recorded_are_those_of_images_in_float64(
     dataset = Dataset((Recording.open(path),))
     model = ErrorModel(ErrorModelOptions.from_mapping(EA, "EA"), DOMAIN)
     design = Design(model, DOMAIN, ray_directions(CAMERA))
-    found = dataset.moments(design)
+    found = image_moments(dataset, design)
     (batch,) = dataset.batches()
     assert batch.radial_distance.dtype == torch.float64
     expected = MomentAccumulator(design)(batch)

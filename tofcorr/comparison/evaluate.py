@@ -25,8 +25,8 @@ from tofcorr.files import staged_folder
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.plausibility.examine import vet
+from tofcorr.progress import event_writer
 from tofcorr.training.figures import save_figure
-from tofcorr.training.monitor import event_writer
 from tofcorr.training.report import number_or_none
 from tofcorr.version import __version__
 

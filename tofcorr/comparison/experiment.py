@@ -35,7 +35,7 @@ from tofcorr.pixels.dataset import (
     hand_eye_is_free,
     recorded_hand_eye,
 )
-from tofcorr.pixels.metrics import FittedModel, FrameErrors, held_out_errors
+from tofcorr.pixels.passes import FittedModel, FrameErrors, held_out_errors, image_moments
 from tofcorr.pixels.sample import MaskOptions, usable_pixels
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import through
@@ -273,7 +273,7 @@ class ModelFitter:
     def _moments(self, dataset: Dataset, model: ErrorModelOptions) -> ImageMoments:
         """Return a model's moments of all frames."""
         _, design = build_model(dataset, model, self.domain)
-        return dataset.moments(design, device=self._options.device)
+        return image_moments(dataset, design, device=self._options.device)
 
     def _judged_against(
         self, found: FoundWalls | None, name: str, held_out: np.ndarray, model: CalibrationModel

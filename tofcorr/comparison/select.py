@@ -19,7 +19,7 @@ from tofcorr.files import staged_folder
 from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
-from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.pixels.passes import FrameErrors
 from tofcorr.plausibility.examine import vet
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import number_or_none

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tofcorr.estimation.robust import student_quantile, student_tail
-from tofcorr.fit.problem import LEVEL
+from tofcorr.estimation.robust import LEVEL, student_quantile, student_tail
 from tofcorr.training.report import number_or_none
 
 

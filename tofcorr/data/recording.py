@@ -332,10 +332,14 @@ class FrameBatch:
     conditions: Tensor | None = None
 
 
+CHUNK_PIXELS = 131_072
+"""Pixels that are read at once: a few megabytes. Set by timing on VGA recordings."""
+
+
 def iterate_frames(
     recording: Recording,
     indices: Sequence[int] | np.ndarray | None = None,
-    chunk_pixels: int = 2_000_000,
+    chunk_pixels: int = CHUNK_PIXELS,
     device: torch.device | str = "cpu",
     image_dtype: torch.dtype = torch.float64,
 ) -> Iterator[FrameBatch]:

@@ -25,9 +25,8 @@ from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.linear import Curvature, GroupSums, inverse, reduced
-from tofcorr.estimation.robust import f_tail, student_quantile
+from tofcorr.estimation.robust import LEVEL, f_tail, student_quantile
 from tofcorr.fit.linear_image import BOWS, linearised, wall_moves
-from tofcorr.fit.problem import LEVEL
 from tofcorr.fit.reference import ImageSums, Reference, own_noise, repeated
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset

@@ -125,8 +125,6 @@ def _probes(domain: Domain) -> tuple[Float[Tensor, "probes"], Float[Tensor, "pro
     return distance, low + (high - low) * random[1]
 
 
-CHUNK_PIXELS = 131_072
-"""Pixels that a caller reads at once: a few megabytes. Set by timing on VGA recordings."""
 # Pixels whose products are formed at once: on a CPU they stay in its cache, on a GPU they fill it.
 # Set by timing.
 _BLOCK_PIXELS, _BLOCK_PIXELS_CUDA = 20_480, 4_194_304

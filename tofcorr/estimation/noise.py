@@ -28,8 +28,8 @@ from pydantic import Field
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.options import NonNegativeNumber, Number, Options, PositiveNumber, Share
-from tofcorr.spread import sigma_from_mad
 
 ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
 Source = Literal["repeats", "neighbours"]

@@ -5,21 +5,24 @@ each fit of a plane is a linear one. Its unit normal towards the camera is -g / 
 distance from it 1 / |g|.
 """
 
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tofcorr.spread import sigma_from_mad
-
+LEVEL = 0.05
+"""What every interval leaves out, and the level of every test of a fit; the usual one."""
 RobustLoss = Literal["none", "huber", "cauchy"]
+SpreadT = TypeVar("SpreadT", float, np.floating, np.ndarray, Tensor)
 
 # Tuning constants, in standard deviations: 95 % efficiency on normal noise (Holland and Welsch
 # 1977).
 _HUBER = 1.345
 _CAUCHY = 2.385
+# 1 / Phi^-1(3/4): half of a normal distribution lies within 0.6745 standard deviations.
+_SIGMA_PER_MAD = 1.482602218505602
 
 
 def student_quantile(probability: float, degrees_of_freedom: float | int) -> float:
@@ -61,6 +64,24 @@ def f_tail(ratio: float, above: float | int, below: float | int) -> float:
     from scipy.special import fdtrc
 
     return float(fdtrc(above, below, ratio))
+
+
+def sigma_from_mad(median_absolute_deviation: SpreadT) -> SpreadT:
+    """Return the standard deviation of a normal distribution of this median absolute deviation.
+
+    Gross outliers hardly change a median, so the result is that of the bulk of the values.
+
+    Args:
+        median_absolute_deviation: A number, an array or a tensor, in any unit.
+
+    Returns:
+        1.4826 times it, in the same unit.
+
+    Example:
+        >>> round(sigma_from_mad(2.0), 4)
+        2.9652
+    """
+    return _SIGMA_PER_MAD * median_absolute_deviation
 
 
 def robust_weights(standardised: Float[Tensor, "*S"], loss: RobustLoss) -> Float[Tensor, "*S"]:

@@ -59,6 +59,7 @@ from tofcorr.fit.residual import fit_residual
 from tofcorr.fit.walls import recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights
 from tofcorr.pixels.dataset import Dataset, thread_number
+from tofcorr.pixels.passes import image_moments
 from tofcorr.pixels.sample import (
     cosine_of_incidence,
     distance_to_plane,
@@ -163,7 +164,7 @@ def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
     _, design = build_model(seen, options.model, problem.domain)
     walls = recorded_walls(seen, frames).walls if problem.estimates_walls else None
     weights = first_weights(seen, frames, options.weights.noise, options.weights.robust)
-    moments = seen.moments(design, frames, weights, options.device)
+    moments = image_moments(seen, design, frames, weights, options.device)
     before = None
     for _ in range(0 if options.weights.robust == "none" else options.weights.passes):
         # Distances to a plane that is a mere guess would make every pixel an outlier.
@@ -178,7 +179,7 @@ def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
         before, model = now, calibrated(ErrorModel(core.options, problem.domain), best)
         assert weights is not None
         weights = weights.updated(seen, frames, model)
-        moments = seen.moments(design, frames, weights, options.device)
+        moments = image_moments(seen, design, frames, weights, options.device)
     return moments if walls is None else walls.seen_by(moments), weights
 
 

@@ -24,10 +24,10 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.model import Pixels
 from tofcorr.estimation.linear import AddedColumns, Curvature, NormalEquations, pose_products
-from tofcorr.estimation.robust import student_quantile
+from tofcorr.estimation.robust import LEVEL, student_quantile
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.linear_image import LinearPixels, linearised
-from tofcorr.fit.problem import LEVEL, Fit, Shift
+from tofcorr.fit.problem import Fit, Shift
 from tofcorr.geometry.rays import moved_rays, phase_from_radial_distance, plane_in_frame, tangents
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import draw_pixels, thinned

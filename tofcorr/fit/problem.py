@@ -38,9 +38,6 @@ from tofcorr.pixels.dataset import (
     resolved_planes,
 )
 
-LEVEL = 0.05
-"""What every interval leaves out, and the level of every test of a fit; the usual one."""
-
 
 class WeightOptions(Options):
     """The weight of each pixel.

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -48,12 +48,14 @@ from tofcorr.fit.linear_image import (
     linearised,
     wall_moves,
 )
-from tofcorr.fit.problem import Fit
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.options import Count, NonNegativeNumber, Number, Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import off_the_wall, some_pixels
 from tofcorr.pixels.sample import pixels_of_image
+
+if TYPE_CHECKING:
+    from tofcorr.fit.problem import Fit
 
 # What is believed before any residual was seen, and weighs as much as one of them: form errors of
 # 1 mm, poses off by 0.3 mm and 0.3 mrad, as of an industrial robot, and walls flat to 0.05 mm.
@@ -283,7 +285,7 @@ _RANDOM = torch.tensor([0, 0, 1] + [2] * BOWS + [3] * (SHAPES - BOWS))
 
 
 def estimate_reference(
-    dataset: Dataset, frames: np.ndarray, fit: Fit, noise: tuple[float, float, float] | None
+    dataset: Dataset, frames: np.ndarray, fit: "Fit", noise: tuple[float, float, float] | None
 ) -> Reference | None:
     """Return how far the camera may be from what a fitted model says, frame by frame.
 

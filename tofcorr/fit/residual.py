@@ -13,9 +13,9 @@ from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.estimation.linear import Curvature
 from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.regularisation import total_weight
-from tofcorr.estimation.robust import student_tail
+from tofcorr.estimation.robust import LEVEL, student_tail
 from tofcorr.estimation.solvers import minimise
-from tofcorr.fit.problem import LEVEL, Core, Problem, ResidualOptions
+from tofcorr.fit.problem import Core, Problem, ResidualOptions
 from tofcorr.pixels.sample import FramePixels, draw_pixels
 
 

@@ -11,9 +11,9 @@ import torch
 from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING, tiles_of
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.spread import sigma_from_mad
 
 LAGS, AXES = (1, 2), (1, 0)
 """Distances of the neighbours whose correlation is estimated, pixels: two tell how fast it falls,

@@ -1,4 +1,4 @@
-"""Recordings of one camera as one data set: numbering, planes, splits, ranges, and its passes."""
+"""Recordings of one camera as one data set: numbering, planes, splits, ranges, and threads."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,6 +20,7 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import (
+    CHUNK_PIXELS,
     FrameBatch,
     Recording,
     frame_conditions,
@@ -29,15 +30,9 @@ from tofcorr.data.recording import (
 )
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.accumulator import CHUNK_PIXELS, Design, MomentAccumulator
-from tofcorr.estimation.moments import ImageMoments, concatenate
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import Options
-from tofcorr.pixels.distributed import everyones, own_share
-
-Weighting = Callable[[FrameBatch], Tensor]
-"""Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
 
 
 @dataclass(frozen=True)
@@ -164,42 +159,6 @@ class Dataset:
                 if self.exclude is not None:
                     numbered = replace(numbered, valid=batch.valid & ~self.exclude(numbered))
                 yield numbered
-
-    def moments(
-        self,
-        design: Design,
-        frames: Sequence[int] | np.ndarray | None = None,
-        weighting: Weighting | None = None,
-        device: str = "cpu",
-    ) -> ImageMoments:
-        """Return the moments of the frames, in their order, from one pass.
-
-        Processes started by `torchrun` share the pass; each returns the moments of all frames.
-        """
-        wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
-        # The static images are looked at in small pieces, which threads would wait for.
-        with thread_number(1):
-            accumulator = MomentAccumulator(design, device)
-        own = own_share(wanted)
-        # Images stay as recorded where nothing but the sums reads them: half the bytes.
-        as_recorded = weighting is None and self.exclude is None
-        as_recorded &= self.first.depth_kind == "radial"
-        dtype = torch.float32 if as_recorded else torch.float64
-        images = self.batches(own, device, image_dtype=dtype)
-
-        def moments_of(batch: FrameBatch) -> ImageMoments:
-            return accumulator(batch, weighting(batch) if weighting else None)
-
-        parts = in_threads(moments_of, images, None if device == "cpu" else 1)
-        # Batches come recording by recording. A process may have no frame where there are more
-        # processes than frames.
-        read = [start + local for _, start, local in self.by_recording(own)]
-        mine = [(np.concatenate(read), concatenate([*parts]))] if read else []
-        everything = [part for share in everyones(mine) for part in share]
-        numbers = np.concatenate([indices for indices, _ in everything])
-        rank = np.argsort(np.argsort(wanted, kind="stable"), kind="stable")
-        order = np.argsort(numbers, kind="stable")[rank].tolist()
-        return concatenate([moments for _, moments in everything]).images(order)
 
     def by_recording(
         self, frames: Sequence[int] | np.ndarray | None

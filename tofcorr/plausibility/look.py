@@ -12,6 +12,7 @@ import torch
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import Recording
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import (
     TINY,
@@ -29,7 +30,6 @@ from tofcorr.plausibility.linear import (
     image_shape,
     pose_drift,
 )
-from tofcorr.spread import sigma_from_mad
 
 PlaneUse = Literal["known", "unknown", "ignored"]
 """`known`: the planes recorded are used; `unknown`: a start for the fit; `ignored`: not used."""

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.recording import FrameBatch
+from tofcorr.data.recording import CHUNK_PIXELS, FrameBatch
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
-from tofcorr.estimation.accumulator import CHUNK_PIXELS, Design, MomentAccumulator
+from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, concatenate
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance

@@ -25,7 +25,7 @@ from tofcorr.pixels.dataset import (
     split_frames,
     thread_number,
 )
-from tofcorr.pixels.metrics import FrameErrors, frame_errors
+from tofcorr.pixels.passes import FrameErrors, frame_errors
 from tofcorr.pixels.sample import MaskOptions
 
 

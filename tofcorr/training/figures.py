@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from tofcorr.geometry.rays import tangents
-from tofcorr.pixels.metrics import frame_errors
+from tofcorr.pixels.passes import frame_errors
 from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
 from tofcorr.training.calibration import Calibration
 

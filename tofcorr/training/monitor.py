@@ -2,10 +2,8 @@
 
 import math
 import sys
-import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +15,7 @@ from tofcorr.estimation.regularisation import total_weight
 from tofcorr.estimation.solvers import Solution
 from tofcorr.geometry import se3
 from tofcorr.pixels.sample import sample_pixels
+from tofcorr.progress import event_writer
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.figures import ends_of, error_images, error_picture, frames_to_show, profile
 from tofcorr.training.judgement import report_text
@@ -105,32 +104,6 @@ class RunMonitor:
                 yield tag, value, iteration.iterations, when
         for tag, value in state(calibration.fit.solution.parameters).items():
             yield tag, value, self.iterations[-1].iterations + 1, self._times[-1]
-
-
-@contextmanager
-def event_writer(folder: Path | str) -> Iterator["SummaryWriter"]:
-    """Yield a writer of TensorBoard's files, whose thread prints no traceback when it fails.
-
-    Args:
-        folder: Where the event files go; made if it is missing.
-
-    Raises:
-        OSError: They could not be written, for example because the disk is full.
-    """
-    from torch.utils.tensorboard import SummaryWriter
-
-    ended: list[BaseException | None] = []
-    before = threading.excepthook
-    threading.excepthook = keep = lambda arguments: ended.append(arguments.exc_value)
-    try:
-        with SummaryWriter(str(folder)) as writer:
-            yield writer
-    finally:
-        if threading.excepthook is keep:
-            threading.excepthook = before
-    for error in ended:
-        if error is not None:
-            raise error
 
 
 def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:

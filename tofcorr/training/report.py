@@ -16,7 +16,7 @@ from tofcorr.estimation.robust import outlying_images, student_quantile
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.pixels.passes import FrameErrors
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import Calibration, TrainingOptions

@@ -28,7 +28,7 @@ from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import REFERENCE_FILE, Reference, estimate_reference, save_reference
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
-from tofcorr.pixels.distributed import alone, is_first, process_group
+from tofcorr.pixels.passes import alone, is_first, process_group
 from tofcorr.pixels.sample import PixelSample, sample_pixels, usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages

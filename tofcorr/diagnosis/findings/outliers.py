@@ -22,9 +22,9 @@ from tofcorr.diagnosis.findings.where import TILES
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.geometry.rays import multiples_in_words, range_of_wrapped
 from tofcorr.plausibility.finding import LARGEST_GAP, Inspection, in_words
-from tofcorr.spread import sigma_from_mad
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,10 +41,10 @@ from tofcorr.digits import decimals, known, known_interval
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.pairs import LEAST_P
 from tofcorr.options import dump_yaml
+from tofcorr.progress import event_writer
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 from tofcorr.simulation.effects.registry import CATALOGUE
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.training.monitor import event_writer
 from tofcorr.version import __version__
 
 if TYPE_CHECKING:

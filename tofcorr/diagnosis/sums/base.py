@@ -53,13 +53,13 @@ from tofcorr.error_terms.base import Domain, Term
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.regularisation import penalties_of
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
 from tofcorr.simulation.effects.base import EffectInputs
-from tofcorr.spread import sigma_from_mad
 
 
 def unknown_amplitude_columns(

@@ -31,9 +31,9 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.base import BaseFit, unknown_amplitude_columns
 from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.pixels.dataset import in_threads
 from tofcorr.simulation.effects.base import EffectInputs
-from tofcorr.spread import sigma_from_mad
 
 BASE = "base"
 """The name of the base model among the columns."""

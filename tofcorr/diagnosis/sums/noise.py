@@ -43,7 +43,7 @@ from tofcorr.estimation.noise import (
     mean_correlation,
     tiles_of,
 )
-from tofcorr.spread import sigma_from_mad
+from tofcorr.estimation.robust import sigma_from_mad
 
 FLOOR_ERROR = 0.05
 """Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares

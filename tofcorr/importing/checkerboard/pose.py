@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.boards import FlatBoard
 from tofcorr.importing.run import RefusedViewError
-from tofcorr.spread import sigma_from_mad
 
 _SMALLEST_OUTLIER_PIXELS = 0.4
 """A corner is an outlier (glare, or a confusion with its neighbour) if its reprojection error

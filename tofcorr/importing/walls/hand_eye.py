@@ -25,7 +25,7 @@ from torch import Tensor
 from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import HAND_EYE_SYMBOLS, ImageMoments, Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls, joint_image_equations
-from tofcorr.estimation.robust import robust_weights
+from tofcorr.estimation.robust import robust_weights, sigma_from_mad
 from tofcorr.estimation.uncertainty import (
     PRIOR_SIGMA,
     named_components,
@@ -34,7 +34,6 @@ from tofcorr.estimation.uncertainty import (
 )
 from tofcorr.geometry import se3
 from tofcorr.importing.walls.image_planes import SeenPlanes
-from tofcorr.spread import sigma_from_mad
 
 _TYPICAL = 0.01
 """What an uncalibrated camera's error typically measures, metres, beside a constant and a slope:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.geometry.rays import lens_misses
 from tofcorr.plausibility.alignment import TINY, distinct
 from tofcorr.plausibility.finding import (
@@ -16,7 +17,6 @@ from tofcorr.plausibility.finding import (
     note,
 )
 from tofcorr.plausibility.look import Look
-from tofcorr.spread import sigma_from_mad
 
 # Fewest values by which a distribution is judged. Chosen.
 _FEWEST_VALUES = 50

@@ -30,6 +30,8 @@ from tofcorr.geometry.se3 import by_frame
 from tofcorr.options import FiniteNumber, Options
 from tofcorr.simulation.hooks import Effect, FrameFacts, FrameState
 
+# Long: every effect needs all of it, and its parts call one another.
+
 # Largest number of pixels in one batch of images. Set by hand: bounds the memory to some 100 MB.
 _CHUNK_PIXELS = 500_000
 _OfImages = Callable[..., Tensor]

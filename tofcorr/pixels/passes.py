@@ -1,20 +1,136 @@
-"""Errors of corrected points: their distances to the target's plane, frame by frame."""
+"""Passes over the pixels of a data set: the moments of its images, and the errors of models.
+
+Several processes, on one machine or many, share a pass: each of n takes every n-th frame. They
+exchange sums over frames, whose size does not depend on that of the images. They are started by
+`torchrun`; in a single process the functions here return their input.
+"""
 
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 
 from tofcorr.correction.model import CalibrationModel
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import Pixels
+from tofcorr.estimation.accumulator import Design, MomentAccumulator
+from tofcorr.estimation.moments import ImageMoments, concatenate
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.distributed import everyones, own_share
+from tofcorr.pixels.dataset import Dataset, in_threads, thread_number
 from tofcorr.pixels.sample import pixels_of_image
+
+ValueT = TypeVar("ValueT")
+_alone = ContextVar("alone", default=False)
+
+
+@contextmanager
+def process_group(device: str) -> Iterator[str]:
+    """Join the processes that `torchrun` started, for the length of the block.
+
+    Args:
+        device: `cpu` (gloo) or `cuda` (nccl).
+
+    Yields:
+        The device of this process: one GPU each, by its number on the machine.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield device
+        return
+    on_gpu = device.startswith("cuda")
+    if on_gpu:
+        device = f"cuda:{os.environ['LOCAL_RANK']}"
+        torch.cuda.set_device(device)
+    distributed.init_process_group("nccl" if on_gpu else "gloo")
+    try:
+        yield device
+    finally:
+        distributed.destroy_process_group()
+
+
+def is_first() -> bool:
+    """Whether this process is the one that writes and prints."""
+    return not distributed.is_initialized() or distributed.get_rank() == 0
+
+
+@contextmanager
+def alone() -> Iterator[None]:
+    """Let this process read all frames itself for the length of the block."""
+    reset = _alone.set(True)
+    try:
+        yield
+    finally:
+        _alone.reset(reset)
+
+
+def _sharing() -> bool:
+    return distributed.is_initialized() and not _alone.get()
+
+
+def own_share(frames: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Return the frames that this process reads."""
+    frames = np.asarray(frames)
+    if not _sharing():
+        return frames
+    return frames[distributed.get_rank() :: distributed.get_world_size()]
+
+
+def everyones(value: ValueT) -> list[ValueT]:
+    """Return the values that all processes pass, in the order of their ranks."""
+    if not _sharing():
+        return [value]
+    values: list[ValueT | None] = [None] * distributed.get_world_size()
+    distributed.all_gather_object(values, value)
+    return values  # type: ignore[return-value]
+
+
+Weighting = Callable[[FrameBatch], Tensor]
+"""Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
+
+
+def image_moments(
+    dataset: Dataset,
+    design: Design,
+    frames: Sequence[int] | np.ndarray | None = None,
+    weighting: Weighting | None = None,
+    device: str = "cpu",
+) -> ImageMoments:
+    """Return the moments of the frames, in their order, from one pass.
+
+    Processes started by `torchrun` share the pass; each returns the moments of all frames.
+    """
+    wanted = np.arange(dataset.num_frames) if frames is None else np.asarray(frames)
+    # The static images are looked at in small pieces, which threads would wait for.
+    with thread_number(1):
+        accumulator = MomentAccumulator(design, device)
+    own = own_share(wanted)
+    # Images stay as recorded where nothing but the sums reads them: half the bytes.
+    as_recorded = weighting is None and dataset.exclude is None
+    as_recorded &= dataset.first.depth_kind == "radial"
+    dtype = torch.float32 if as_recorded else torch.float64
+    images = dataset.batches(own, device, image_dtype=dtype)
+
+    def moments_of(batch: FrameBatch) -> ImageMoments:
+        return accumulator(batch, weighting(batch) if weighting else None)
+
+    parts = in_threads(moments_of, images, None if device == "cpu" else 1)
+    # Batches come recording by recording. A process may have no frame where there are more
+    # processes than frames.
+    read = [start + local for _, start, local in dataset.by_recording(own)]
+    mine = [(np.concatenate(read), concatenate([*parts]))] if read else []
+    everything = [part for share in everyones(mine) for part in share]
+    numbers = np.concatenate([indices for indices, _ in everything])
+    rank = np.argsort(np.argsort(wanted, kind="stable"), kind="stable")
+    order = np.argsort(numbers, kind="stable")[rank].tolist()
+    return concatenate([moments for _, moments in everything]).images(order)
+
 
 KINDS = ("to_plane", "along_ray", "in_z")
 """Kinds of error: the distance of the corrected points to the target's plane, which is what is
