@@ -6,6 +6,7 @@ configuration: a shipped name, a file, a mapping or options that exist already.
 
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
@@ -77,10 +78,8 @@ class Options(BaseModel):
         Raises:
             TofcorrError: Of kind `kind`: a key is unknown or missing, or a value is not allowed.
         """
-        try:
+        with refused_in_words(cls, where, kind):
             return cls.model_validate(values)
-        except ValidationError as error:
-            raise kind(in_words(error, cls, where)) from None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, ready for YAML or JSON."""
@@ -106,16 +105,23 @@ def one_line(text: str, longest: int = _LONGEST) -> str:
     return flat if len(flat) <= longest else flat[: longest - 3] + "..."
 
 
-def in_words(error: ValidationError, cls: type[BaseModel], where: str) -> str:
-    """Return the faults of `error` in words.
+@contextmanager
+def refused_in_words(
+    cls: type[BaseModel], where: str, kind: type[TofcorrError] = ConfigError
+) -> Iterator[None]:
+    """Refuse, in words, values that do not fit a class.
 
     Args:
-        error: Raised by the validation of `cls`.
-        cls: The options class; its keys serve as hints.
+        cls: The options class whose validation the block asks for; its keys serve as hints.
         where: What to call the source of the values, usually the file.
+        kind: The error to raise.
     """
-    # More than five would hide the first, which often causes the others.
-    return f"{where}: " + "; ".join(_one(detail, cls) for detail in error.errors()[:5])
+    try:
+        yield
+    except ValidationError as error:
+        # More than five would hide the first, which often causes the others.
+        faults = "; ".join(_one(detail, cls) for detail in error.errors()[:5])
+        raise kind(f"{where}: {faults}") from None
 
 
 def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:

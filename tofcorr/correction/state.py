@@ -18,7 +18,14 @@ from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError, TofcorrError
 from tofcorr.files import UNREADABLE, refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
-from tofcorr.options import LARGEST_NUMBER, FiniteNumber, Options, PositiveNumber, one_line
+from tofcorr.options import (
+    LARGEST_NUMBER,
+    FiniteNumber,
+    Options,
+    PositiveNumber,
+    one_line,
+    refused_in_words,
+)
 from tofcorr.version import __version__
 
 STATE_FILE = "state.pt"
@@ -252,7 +259,8 @@ def load_calibration(path: Path | str) -> CalibrationState:
     values = read_values(path, _FORMAT)
     if values is None:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
-    return CalibrationState.from_mapping(values, str(path), CalibrationDataError)
+    with refused_in_words(CalibrationState, str(path), CalibrationDataError):
+        return CalibrationState.model_validate(values)
 
 
 def save_values(

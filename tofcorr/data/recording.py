@@ -8,18 +8,18 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray, frame_chunks, open_array, read_frames
-from tofcorr.data.table import COLUMN_OF, TABLE_FILE, UNIT_LENGTH_TOLERANCE, FrameTable, read_table
+from tofcorr.data.table import COLUMN_OF, TABLE_FILE, FrameTable, read_table
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
 from tofcorr.geometry.rays import plane_in_frame, radial_distance_from_z_depth, ray_directions
+from tofcorr.geometry.se3 import RigidTransform
 from tofcorr.options import (
-    Number,
     Options,
     PositiveNumber,
     dump_yaml,
@@ -30,23 +30,6 @@ from tofcorr.options import (
 HEADER_FILE = "recording.yaml"
 PlaneOrigin = Literal["recorded", "estimated"]
 """`recorded`: measured by other means; `estimated`: found in the depth itself, never truth."""
-
-
-Row4 = tuple[Number, Number, Number, Number]
-
-
-def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
-    se3.refuse_unless_rigid(np.array(rows), UNIT_LENGTH_TOLERANCE)
-    return rows
-
-
-RigidTransform = Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)]
-"""A rigid transform as four rows."""
-_KnownOrIdentity = Annotated[
-    RigidTransform,
-    BeforeValidator(lambda rows: np.eye(4).tolist() if rows is None else rows),
-    Field(validate_default=True),
-]
 
 
 class Header(Options):
@@ -60,7 +43,7 @@ class Header(Options):
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None
     saturation_amplitude: PositiveNumber | None = None
-    tool_from_camera: _KnownOrIdentity = None  # type: ignore[assignment]
+    tool_from_camera: RigidTransform | None = None
     planes: PlaneOrigin = "recorded"
     frames: FrameNames = FrameNames()
 
@@ -165,13 +148,14 @@ class Recording:
         head = read_header(path / HEADER_FILE)
         frames = read_table(path / TABLE_FILE)
         size = (head.camera.height, head.camera.width)
+        mount = np.eye(4) if head.tool_from_camera is None else head.tool_from_camera
         recording = cls(
             path=path,
             camera=head.camera.intrinsics(),
             depth_kind=head.depth_kind,
             modulation_frequency=head.modulation_frequency_hz,
             saturation_amplitude=head.saturation_amplitude,
-            tool_from_camera=se3.nearest_rigid(np.array(head.tool_from_camera, dtype=np.float64)),
+            tool_from_camera=se3.nearest_rigid(np.array(mount, dtype=np.float64)),
             frames=frames,
             **{name: _opened(image, path, *size) for name, image in IMAGE_ARRAYS.items()},
             planes=head.planes,

@@ -14,6 +14,7 @@ from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions, Value, condition
 from tofcorr.data.arrays import LARGEST_DISTANCE
 from tofcorr.errors import CalibrationDataError, is_control
 from tofcorr.geometry import se3
+from tofcorr.geometry.se3 import UNIT_LENGTH_TOLERANCE
 from tofcorr.options import LARGEST_NUMBER, SMALLEST_POSITIVE
 
 TABLE_FILE = "frames.csv"
@@ -26,10 +27,6 @@ REQUIRED_COLUMNS = ("frame", *NUMBERS, "target")
 """Columns that every recording has, in the order in which they are written."""
 COLUMN_OF = {"pose_id": "pose_id", **{each.name: each.column for each in OPTIONAL_CONDITIONS}}
 """Columns that a recording may lack, by the attribute of `FrameTable` that holds them."""
-
-UNIT_LENGTH_TOLERANCE = 1e-3
-"""Largest difference from 1 of the length of a quaternion, a normal or a column of a rotation (no
-unit): rounding to three digits. Part of the recording format, version 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,7 +22,6 @@ from tofcorr.data.recording import (
 )
 from tofcorr.data.table import (
     TABLE_FILE,
-    UNIT_LENGTH_TOLERANCE,
     FrameRow,
     FrameTable,
     table_text,
@@ -76,13 +75,13 @@ class RecordingWriter:
         planes: PlaneOrigin = "recorded",
         frame_names: FrameNames | None = None,
     ) -> None:
-        matrix = None if tool_from_camera is None else np.asarray(tool_from_camera).tolist()
+        mount = np.eye(4) if tool_from_camera is None else np.asarray(tool_from_camera)
         values = {
             "camera": camera.section(),
             "depth_kind": depth_kind,
             "modulation_frequency_hz": modulation_frequency,
             "saturation_amplitude": saturation_amplitude,
-            "tool_from_camera": matrix,
+            "tool_from_camera": mount.tolist(),
             "planes": planes,
             "frames": frame_names or FrameNames(),
         }
@@ -187,7 +186,7 @@ class RecordingWriter:
         """Refuse a pose that has no quaternion; the reader checks everything else."""
         try:
             pose = np.asarray(row.world_from_tool, dtype=np.float64)
-            refuse_unless_rigid(pose, UNIT_LENGTH_TOLERANCE)
+            refuse_unless_rigid(pose)
         except ValueError as error:
             raise CalibrationDataError(f"{self._here()}, world_from_tool: {error}.") from None
 

@@ -23,7 +23,6 @@ from tofcorr.data.recording import (
     Recording,
     planes_in_tool,
 )
-from tofcorr.data.table import UNIT_LENGTH_TOLERANCE
 from tofcorr.diagnosis.elsewhere import simulated_elsewhere
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.rerun.simulator import twin_distance
@@ -160,7 +159,7 @@ def frames_of(returned: Any, recording: Recording) -> Recording:  # noqa: ANN401
             IMAGE_ARRAYS[name].check(checked[name], range(recording.num_frames), source)
             continue
         try:
-            se3.refuse_unless_rigid(checked[name], UNIT_LENGTH_TOLERANCE)
+            se3.refuse_unless_rigid(checked[name])
         except ValueError as error:
             raise CalibrationDataError(f"The simulator's tool_from_camera: {error}.") from None
         checked[name] = se3.nearest_rigid(checked[name])

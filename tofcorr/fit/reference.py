@@ -49,7 +49,7 @@ from tofcorr.fit.linear_image import (
     wall_moves,
 )
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.options import Count, NonNegativeNumber, Number, Options
+from tofcorr.options import Count, NonNegativeNumber, Number, Options, refused_in_words
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import off_the_wall, some_pixels
 from tofcorr.pixels.sample import pixels_of_image
@@ -460,7 +460,8 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
         wrong = {f"it cannot be read ({error})": True}
     for reason in (reason for reason, holds in wrong.items() if holds):
         raise CalibrationDataError(f"{path}: {reason}; {_ADVICE}")
-    found = Reference.from_mapping(values, str(path), CalibrationDataError)
+    with refused_in_words(Reference, str(path), CalibrationDataError):
+        found = Reference.model_validate(values)
     size = num_unknowns(state)
     widths = {"mean": size, "covariance": size, "covariance_within": size}
     for name, width in (widths | {"random_variance": 3 + SHAPES, "views": 7}).items():

@@ -7,11 +7,19 @@ they are.
 """
 
 import math
+from typing import Annotated
 
 import numpy as np
 import torch
 from kornia.geometry.liegroup import Se3
+from pydantic import AfterValidator
 from torch import Tensor
+
+from tofcorr.options import Number
+
+UNIT_LENGTH_TOLERANCE = 1e-3
+"""Largest difference from 1 of the length of a quaternion, a normal or a column of a rotation (no
+unit): rounding to three digits. Part of the recording format, version 1."""
 
 # Angle in radians below which the exponential takes the series, and the number of its terms: the
 # first term left out is 2e-18 of the first one.
@@ -122,7 +130,7 @@ def assemble(rotation: Tensor, translation: Tensor) -> Tensor:
     return torch.cat([top, bottom], dim=-2)
 
 
-def refuse_unless_rigid(matrix: np.ndarray, tolerance: float) -> None:
+def refuse_unless_rigid(matrix: np.ndarray, tolerance: float = UNIT_LENGTH_TOLERANCE) -> None:
     """Refuse a matrix that is not a finite rigid transform of shape (4, 4).
 
     Args:
@@ -146,6 +154,18 @@ def refuse_unless_rigid(matrix: np.ndarray, tolerance: float) -> None:
         )
     if np.linalg.det(rotation) < 0:
         raise ValueError("the upper left 3x3 block is a reflection, not a rotation")
+
+
+Row4 = tuple[Number, Number, Number, Number]
+
+
+def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
+    refuse_unless_rigid(np.array(rows))
+    return rows
+
+
+RigidTransform = Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)]
+"""A rigid transform in a file, as four rows."""
 
 
 def nearest_rigid(matrix: np.ndarray) -> np.ndarray:

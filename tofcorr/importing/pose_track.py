@@ -8,7 +8,6 @@ from typing import Self
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from tofcorr.data.table import UNIT_LENGTH_TOLERANCE
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 
@@ -75,7 +74,7 @@ class PoseTrack:
             raise CalibrationDataError(f"{source}: expected poses, found none.")
         for place, pose in enumerate(poses):
             try:
-                se3.refuse_unless_rigid(pose, UNIT_LENGTH_TOLERANCE)
+                se3.refuse_unless_rigid(pose)
             except ValueError as error:
                 raise CalibrationDataError(f"{source}: pose {place}: {error}.") from None
         poses = np.stack([se3.nearest_rigid(pose) for pose in poses])

@@ -7,18 +7,20 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator
 
 from tofcorr.conditions import condition
-from tofcorr.data.recording import DepthKind, Number, PositiveNumber, RigidTransform
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.condition_terms import NAME_OF
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation.noise import NoiseModel
 from tofcorr.files import staged_file
-from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
+from tofcorr.geometry.se3 import RigidTransform
 from tofcorr.observables.dropouts import DropoutModel
 from tofcorr.observables.read import Observed
 from tofcorr.options import (
     NonNegativeNumber,
+    Number,
     Options,
+    PositiveNumber,
     Range,
     dump_yaml,
     resolve_options,

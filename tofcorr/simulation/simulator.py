@@ -23,7 +23,7 @@ from tofcorr.geometry.rays import (
     z_depth_from_radial_distance,
 )
 from tofcorr.options import resolve_options
-from tofcorr.progress import through
+from tofcorr.progress import bar
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
 from tofcorr.simulation.hooks import STAGES, Effect, FrameFacts, FrameState
@@ -191,16 +191,17 @@ def simulate(
     seed, mount = generator.initial_seed(), options.hand_eye
     plan = draw_plan(options, generator, num_frames=num_frames)
     guess = hand_eye_guess(mount, generator)
-    states = take_frames(options, plan, generator if noise else None)
-    with RecordingWriter(
+    writer = RecordingWriter(
         out,
         camera=options.camera.intrinsics(),
         depth_kind=options.depth_kind,
         modulation_frequency=options.sensor.modulation_frequency_hz,
         tool_from_camera=guess.numpy(),
-    ) as writer:
-        for state in through(states, "simulating", total=len(plan)):
+    )
+    with writer, bar(len(plan), "simulating") as advance:
+        for state in take_frames(options, plan, generator if noise else None):
             append_frame(writer, state, options)
+            advance(1)
         truth = {"tool_from_camera": mount.tool_from_camera().tolist(), "seed": seed}
         writer.add_truth("truth", truth)
         writer.add_truth("options", options.to_mapping())

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.recording import Recording, RigidTransform
+from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE
 from tofcorr.diagnosis.findings.where import Interval, interval_of
@@ -26,6 +26,7 @@ from tofcorr.diagnosis.sums.study import Study, fitted_coefficients
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions, unambiguous_range
+from tofcorr.geometry.se3 import RigidTransform
 from tofcorr.observables.compare import Observables, compare_observables
 from tofcorr.sensor.parts import section_of
 from tofcorr.sensor.sensor_file import (
