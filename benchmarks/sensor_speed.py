@@ -18,8 +18,8 @@ from torch import Tensor
 from benchmarks.scene import camera_of
 from benchmarks.sealed.scores import table
 from benchmarks.timing import timed
-from tofcorr.sensor.effects import ImageEffects
 from tofcorr.sensor.model import SensorModel
+from tofcorr.sensor.scene import ImageEffects
 from tofcorr.sensor.sensor_file import SensorFile
 from tofcorr.simulation.effects import CATALOGUE
 

@@ -11,10 +11,9 @@ import time
 from pathlib import Path
 
 from tofcorr.data.recording import Recording
-from tofcorr.observables.dropouts import dropouts_of
-from tofcorr.observables.noise import noise_of
+from tofcorr.observables.measure import dropouts_of, noise_of
 from tofcorr.observables.read import observe
-from tofcorr.sensor.parts import section_of
+from tofcorr.sensor.model import section_of
 from tofcorr.sensor.sensor_file import (
     ErrorSection,
     SensorFile,

@@ -13,8 +13,13 @@ from scipy.ndimage import gaussian_filter1d
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
 from tofcorr.estimation.noise import NoiseModel, filter_width, neighbour_correlation
-from tofcorr.observables.dropouts import DropoutModel, dropouts_of
-from tofcorr.observables.noise import NoiseMeasurement, level_of_repeats, noise_of
+from tofcorr.observables.measure import (
+    DropoutModel,
+    NoiseMeasurement,
+    dropouts_of,
+    level_of_repeats,
+    noise_of,
+)
 from tofcorr.observables.read import observe, pose_groups
 
 AMPLITUDES = np.array([300.0, 1000.0, 2000.0])

@@ -22,6 +22,7 @@ from sensor.sensors import (
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.errors import FrameError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.model import SensorWarning
@@ -70,7 +71,7 @@ def test_the_corrector_undoes_the_error_terms(kind: str) -> None:
     model = sensor(error=section, depth_kind=kind)
     state = CalibrationState(
         name="test",
-        error_model=model.base.model_options,
+        error_model=ErrorModelOptions(terms=model.sensor.error.terms),
         domain=model.base.domain,
         coefficients=model.base.model.coefficient_vector(),
         tool_from_camera=torch.eye(4, dtype=torch.float64),

@@ -10,8 +10,14 @@ from typing import Any
 import numpy as np
 
 from tofcorr.data.recording import Recording
-from tofcorr.observables.dropouts import DropoutMeasurement, border_of, dropouts_of
-from tofcorr.observables.noise import NoiseMeasurement, noise_of, noise_source
+from tofcorr.observables.measure import (
+    DropoutMeasurement,
+    NoiseMeasurement,
+    border_of,
+    dropouts_of,
+    noise_of,
+    noise_source,
+)
 from tofcorr.observables.pairs import (
     LEAST_POSES,
     Matched,

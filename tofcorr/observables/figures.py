@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tofcorr.observables.compare import Observables
-from tofcorr.observables.dropouts import DropoutMeasurement
-from tofcorr.observables.noise import LEAST_VARIANCE, NoiseMeasurement
+from tofcorr.observables.measure import LEAST_VARIANCE, DropoutMeasurement, NoiseMeasurement
 from tofcorr.observables.read import quotient
 
 BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"

@@ -14,7 +14,7 @@ from tofcorr.estimation.noise import NoiseModel
 from tofcorr.files import staged_file
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.geometry.se3 import RigidTransform
-from tofcorr.observables.dropouts import DropoutModel
+from tofcorr.observables.measure import DropoutModel
 from tofcorr.observables.read import Observed
 from tofcorr.options import (
     NonNegativeNumber,

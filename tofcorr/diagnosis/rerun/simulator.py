@@ -28,7 +28,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions, unambiguous_range
 from tofcorr.geometry.se3 import RigidTransform
 from tofcorr.observables.compare import Observables, compare_observables
-from tofcorr.sensor.parts import section_of
+from tofcorr.sensor.model import section_of
 from tofcorr.sensor.sensor_file import (
     ErrorSection,
     SensorFile,
