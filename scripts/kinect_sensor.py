@@ -74,7 +74,7 @@ def main(recording_path: Path, out: Path) -> None:
             "made by scripts/kinect_sensor.py.",
             *NOT_KNOWN,
         ),
-        camera=CameraOptions.of(state.camera),
+        camera=CameraOptions(**state.camera.section()),
         depth_kind=state.depth_kind,
         modulation_frequency_hz=recording.modulation_frequency,
         error=section_of(state.model().error, ErrorSection(reads="measured_distance", terms=terms)),

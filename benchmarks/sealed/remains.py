@@ -19,6 +19,7 @@ from benchmarks.renewed.geometry import Array
 from benchmarks.renewed.recording import read
 from benchmarks.sealed.answers import Outcome, entries_of, load
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.gap import (
     Gap,
     OpenSet,
@@ -28,7 +29,6 @@ from tofcorr.diagnosis.findings.gap import (
 )
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(simulate_anew=False, page=False)

@@ -6,10 +6,9 @@ import diagnosed_recordings
 import pytest
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.sums.study import Study
 

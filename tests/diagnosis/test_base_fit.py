@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.base import BaseFit, BaseModel, fit_base
 from tofcorr.diagnosis.sums.noise import robust_weights
 from tofcorr.diagnosis.sums.observations import hand_eye_columns, observe, predicted_distance

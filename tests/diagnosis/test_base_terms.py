@@ -13,10 +13,9 @@ import pytest
 from diagnosis.resamples import unnamed
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.registry import TERMS

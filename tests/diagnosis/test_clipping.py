@@ -7,9 +7,9 @@ import diagnosed_recordings
 import pytest
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.simulation.effects.saturation import light_of
 

@@ -20,10 +20,9 @@ from importing.walls.rendered_room import (
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter, write_recording
-from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.diagnose import Prepared, diagnose, prepare
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import Prepared, prepare
 from tofcorr.diagnosis.sums.observations import (
     observe,
     predicted_distance,

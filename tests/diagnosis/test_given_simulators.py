@@ -15,7 +15,7 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
-from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.given import (
     GivenSimulator,
     frames_of,
@@ -24,7 +24,6 @@ from tofcorr.diagnosis.given import (
     rendered_error,
 )
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.options import SimulatorOptions

@@ -9,10 +9,10 @@ import pytest
 
 from benchmarks.wrong_recordings.parts import Parts
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings import outliers
 from tofcorr.diagnosis.findings.outliers import LARGEST_GAP, refuse_impossible_gap
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine

@@ -11,10 +11,9 @@ import pytest
 from diagnosed_recordings import recorded
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.report.words import lone_poses
 
 # An error that the polynomials of the base model follow over some range, and miss beyond it.

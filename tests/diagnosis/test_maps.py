@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tofcorr.diagnosis.sums.maps import FittedMap
 from tofcorr.diagnosis.sums.study import (
+    FittedMap,
     Study,
     with_poses_reestimated,
     with_residual,

@@ -11,6 +11,7 @@ import torch
 from diagnosis.resamples import resamples_of
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.gap import (
     OpenSet,
     judge_remainder,
@@ -21,7 +22,6 @@ from tofcorr.diagnosis.findings.naming import (
     name_effects,
 )
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.base import SimulatorError
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import ConfigError

@@ -14,10 +14,10 @@ from diagnosed_recordings import STILL, altered, recorded
 from scipy.ndimage import gaussian_filter, uniform_filter
 from torch import Tensor
 
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.structure import noise_floor, shared_by_poses, unlike_waves
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.noise import PixelNoise
 from tofcorr.diagnosis.sums.study import Study
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import Prepared, prepare
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.outliers import Outliers, mask_warning
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import Prepared, prepare
 from tofcorr.diagnosis.sums.base import unknown_amplitude_columns
 from tofcorr.diagnosis.sums.observations import observe
 

@@ -9,9 +9,9 @@ from diagnosed_recordings import STILL, altered, recorded
 from scipy.ndimage import uniform_filter
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.structure import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums import shared_noise
 from tofcorr.diagnosis.sums.observations import observe, same_exposure
 from tofcorr.diagnosis.sums.shared_noise import Lags

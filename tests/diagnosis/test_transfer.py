@@ -12,8 +12,9 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.given import open_simulator
 from tofcorr.diagnosis.rerun.checks import measure_transfer, noisy_frames
-from tofcorr.diagnosis.rerun.simulator import Evidence, fitted_to
+from tofcorr.diagnosis.rerun.simulator import Evidence, fitted_to, mount_at
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.geometry import se3
 from tofcorr.observables.compare import compare_observables
 
 
@@ -76,3 +77,9 @@ def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
     assert without_amplitude.noise is not None
     assert without_amplitude.amplitude is None
     assert without_amplitude.noise["ratio"] == pytest.approx(compared.noise["ratio"], abs=0.15)
+
+
+def test_hand_eye_options_hold_any_transform(generator: torch.Generator) -> None:
+    transform = se3.exp(torch.randn(6, generator=generator, dtype=torch.float64))
+    found = mount_at(transform).tool_from_camera()
+    torch.testing.assert_close(found, transform, rtol=0, atol=1e-12)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.gap import (
     allowed_scatter,
     judge_remainder,
@@ -17,7 +18,6 @@ from tofcorr.diagnosis.findings.gap import (
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.structure import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.linear_system import pose_columns
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study

@@ -18,9 +18,9 @@ from benchmarks.sealed.remains import true_gaps_mm
 from benchmarks.withheld.__main__ import RIGHT, SET, WARNING, WRONG, audit_table, judged
 from benchmarks.withheld.tiers import AUDIT, OFF_BY, OFF_SHARE, write_case
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 
 TRUTH = ("multipath",)
 

@@ -6,11 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.simulation.scene import (
-    CheckerboardTarget,
-    seen_reflectivity,
-    world_from_plane,
-)
+from tofcorr.geometry.se3 import world_from_plane
+from tofcorr.simulation.scene import CheckerboardTarget, seen_reflectivity
 
 
 def _grid(height: int, width: int, step: float, turn: float = 0.0) -> Tensor:

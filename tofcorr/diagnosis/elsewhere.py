@@ -21,14 +21,19 @@ from tofcorr.diagnosis.sums.base import (
     fit_base,
     supported_base,
 )
-from tofcorr.diagnosis.sums.maps import FittedMap
 from tofcorr.diagnosis.sums.observations import (
     TINY,
     Observations,
     effect_inputs,
     predicted_distance,
 )
-from tofcorr.diagnosis.sums.study import Study, build_study, relinearised, with_poses_reestimated
+from tofcorr.diagnosis.sums.study import (
+    FittedMap,
+    Study,
+    build_study,
+    relinearised,
+    with_poses_reestimated,
+)
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.effects.base import EffectInputs

@@ -130,6 +130,28 @@ def assemble(rotation: Tensor, translation: Tensor) -> Tensor:
     return torch.cat([top, bottom], dim=-2)
 
 
+def world_from_plane(normal: Tensor, offset: Tensor) -> Tensor:
+    """Return the frames of planes: x and y are in the plane, z is the normal.
+
+    The origin is the point of the plane nearest to the origin of the world. x is the world's x axis
+    projected onto the plane (the world's y axis if x is nearly parallel to the normal). So the
+    plane of a recording alone determines where the squares are.
+
+    Args:
+        normal: Unit normals n, shape (..., 3).
+        offset: d in n . x + d = 0, shape (...), metres.
+
+    Returns:
+        Rigid transforms, shape (..., 4, 4).
+    """
+    first, second, _ = torch.eye(3).to(normal)
+    along = torch.where(normal[..., :1].abs() < 0.9, first, second)
+    across = along - normal * (along * normal).sum(-1, keepdim=True)
+    x = torch.nn.functional.normalize(across, dim=-1)
+    rotation = torch.stack([x, torch.linalg.cross(normal, x), normal], dim=-1)
+    return assemble(rotation, -offset[..., None] * normal)
+
+
 def refuse_unless_rigid(matrix: np.ndarray, tolerance: float = UNIT_LENGTH_TOLERANCE) -> None:
     """Refuse a matrix that is not a finite rigid transform of shape (4, 4).
 

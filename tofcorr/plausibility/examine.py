@@ -1,11 +1,8 @@
 """The checks run on a recording; `vet` is what every command calls first."""
 
-import math
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-
-import numpy as np
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset, PlaneChoice, Recordings, opened, resolved_planes
@@ -118,31 +115,9 @@ def examine(data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> 
     return Inspection(
         recordings=tuple(str(one.path) for one in data.recordings),
         findings=tuple(sorted(once, key=lambda one: SEVERITIES.index(one.severity))),
-        numbers=_numbers(look, aligned=aligned),
+        numbers=look.numbers(aligned=aligned),
         outlying={} if impossible else outlying_frames(look),
         garbage_share=share,
         garbage_bends=bent or dominated,
         look=look,
     )
-
-
-def _numbers(look: Look, *, aligned: bool) -> dict[str, float]:
-    """Return what was measured; the focal length if its standard error is below 3 %."""
-    stored = look.stored[np.isfinite(look.stored)]
-    found: dict[str, float] = {
-        "frames": float(look.data.num_frames),
-        "median distance, m": float(np.median(stored)) if len(stored) else math.nan,
-        "extent of the poses, m": float(np.linalg.norm(np.ptp(look.poses[:, :3, 3], axis=0))),
-        "pixels on the target, %": 100 * float(look.masked.mean()),
-        "noise of a pixel, mm": 1e3 * look.noise,
-    }
-    if aligned:
-        found["flatness of a frame's points, mm"] = 1e3 * look.flatness
-        if (given := look.as_given) is not None:
-            found["distance to the planes after alignment, mm"] = 1e3 * given.misfit
-            found["angle to the planes after alignment, deg"] = math.degrees(given.typical_angle)
-            found["distances too long by, mm"] = 1e3 * given.constant
-        if look.shape is not None and 100 * (focal := look.shape["focal"]).size_error < 3:
-            found["focal length should change by, %"] = 100 * float(focal.value[0])
-            found["standard error of that change, %"] = 100 * focal.size_error
-    return {name: value for name, value in found.items() if math.isfinite(value)}

@@ -3,6 +3,7 @@
 Everything is computed once and when it is asked for.
 """
 
+import math
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
@@ -371,3 +372,25 @@ class Look:
         off = np.full(len(self.scene.poses), np.nan)
         off[self.scene.known] = self.linear.frame_planes_off(self._left)
         return off
+
+    def numbers(self, *, aligned: bool) -> dict[str, float]:
+        """Return what was measured; the focal length if its standard error is below 3 %."""
+        stored = self.stored[np.isfinite(self.stored)]
+        found: dict[str, float] = {
+            "frames": float(self.data.num_frames),
+            "median distance, m": float(np.median(stored)) if len(stored) else math.nan,
+            "extent of the poses, m": float(np.linalg.norm(np.ptp(self.poses[:, :3, 3], axis=0))),
+            "pixels on the target, %": 100 * float(self.masked.mean()),
+            "noise of a pixel, mm": 1e3 * self.noise,
+        }
+        if aligned:
+            found["flatness of a frame's points, mm"] = 1e3 * self.flatness
+            if (given := self.as_given) is not None:
+                angle = math.degrees(given.typical_angle)
+                found["distance to the planes after alignment, mm"] = 1e3 * given.misfit
+                found["angle to the planes after alignment, deg"] = angle
+                found["distances too long by, mm"] = 1e3 * given.constant
+            if self.shape is not None and 100 * (focal := self.shape["focal"]).size_error < 3:
+                found["focal length should change by, %"] = 100 * float(focal.value[0])
+                found["standard error of that change, %"] = 100 * focal.size_error
+        return {name: value for name, value in found.items() if math.isfinite(value)}

@@ -9,7 +9,6 @@ from torch import Tensor
 from tofcorr.data.recording import CameraSection, DepthKind
 from tofcorr.data.table import COLUMN_OF
 from tofcorr.geometry import se3
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import (
     Count,
     NonNegativeNumber,
@@ -27,11 +26,6 @@ class CameraOptions(CameraSection):
     """The camera intrinsics; keys as in `recording.yaml`."""
 
     model_config = ConfigDict(extra="forbid")
-
-    @classmethod
-    def of(cls, camera: CameraIntrinsics) -> "CameraOptions":
-        """Return the options of a camera."""
-        return cls(**camera.section())
 
 
 class SensorOptions(Options):
@@ -87,15 +81,6 @@ class CameraMountOptions(Options):
         turned = se3.exp(torch.cat([torch.zeros(3, dtype=torch.float64), rotation]))
         translation = torch.tensor(self.translation_mm, dtype=torch.float64) * 1e-3
         return se3.assemble(turned[:3, :3], translation)
-
-    @classmethod
-    def from_matrix(cls, tool_from_camera: Tensor) -> Self:
-        """Return the options whose truth is this transform (4, 4)."""
-        rotation = se3.log(tool_from_camera.detach())[3:]
-        return cls(
-            translation_mm=tuple((tool_from_camera[:3, 3].detach() * 1e3).tolist()),
-            rotation_deg=tuple(torch.rad2deg(rotation).tolist()),
-        )
 
 
 def _recordable(name: str) -> str:

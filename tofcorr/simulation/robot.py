@@ -11,6 +11,7 @@ from torch import Tensor
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
+from tofcorr.geometry.se3 import world_from_plane
 from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
 from tofcorr.simulation.hooks import FrameFacts, FrameState
 from tofcorr.simulation.options import (
@@ -19,7 +20,6 @@ from tofcorr.simulation.options import (
     RobotOptions,
     SimulatorOptions,
 )
-from tofcorr.simulation.scene import world_from_plane
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

@@ -8,7 +8,6 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
-from tofcorr.geometry import se3
 from tofcorr.options import Number, Options, PositiveNumber, Share, Vector3
 
 
@@ -80,41 +79,6 @@ def target_named(targets: Mapping[str, Target], name: str) -> Target:
             "take the reflectivity from the recording."
         )
     return targets[name]
-
-
-def world_from_plane(normal: Tensor, offset: Tensor) -> Tensor:
-    """Return the frame of a plane: x and y are in the plane, z is the normal.
-
-    The origin is the point of the plane nearest to the origin of the world. x is the world's x axis
-    projected onto the plane (the world's y axis if x is nearly parallel to the normal). So the
-    plane of a recording alone determines where the squares are.
-
-    Args:
-        normal: Unit normal n, shape (3,).
-        offset: d in n . x + d = 0, shape ().
-
-    Returns:
-        Rigid transform, shape (4, 4).
-    """
-    along = torch.eye(3, dtype=normal.dtype)[0 if normal[0].abs() < 0.9 else 1]
-    x = torch.nn.functional.normalize(along - normal * (along @ normal), dim=0)
-    y = torch.linalg.cross(normal, x)
-    top = torch.stack([x, y, normal, -offset * normal], dim=1)
-    return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-
-
-def planes_from_world(normals: Tensor, offsets: Tensor) -> Tensor:
-    """Return the inverses of `world_from_plane` for many planes.
-
-    Args:
-        normals: Unit normals, shape (F, 3).
-        offsets: d in n . x + d = 0, shape (F,), metres.
-
-    Returns:
-        Rigid transforms, shape (F, 4, 4).
-    """
-    planes = zip(normals, offsets, strict=True)
-    return torch.stack([se3.inverse(world_from_plane(normal, offset)) for normal, offset in planes])
 
 
 def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Tensor:

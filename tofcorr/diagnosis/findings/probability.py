@@ -38,9 +38,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.maps import FittedMap
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import (
+    FittedMap,
     Study,
     absorbed_share,
     left_over,

@@ -49,7 +49,6 @@ from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study, fitted_coefficients, hidden_effects
 from tofcorr.error_terms.base import Term
 from tofcorr.estimation.robust import student_quantile
-from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
 
 # The cause that a constant counts as: a wall cannot tell whose it is.
@@ -153,7 +152,7 @@ def twist_of(study: Study) -> Tensor:
     known = study.fit.known
     if known is None or not study.fit.model.num_hand_eye:
         return torch.zeros(0, dtype=torch.float64)
-    return se3.log(se3.inverse(known.tool_from_camera) @ study.fit.tool_from_camera)
+    return known.twist_to(study.fit.tool_from_camera)
 
 
 def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | None:

@@ -15,7 +15,6 @@ from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study, absorbed_share
 from tofcorr.digits import known, known_interval
-from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
 
 if TYPE_CHECKING:
@@ -250,7 +249,7 @@ def _cause_line(found: Evidence, one: Share) -> str:
         return f"{line}; {effect_line(found.named, one.cause)}."
     if one.cause != HAND_EYE or known is None:
         return f"{line}; a parameter of the simulator's error model."
-    moved = se3.log(se3.inverse(known.tool_from_camera) @ found.tool_from_camera)
+    moved = known.twist_to(found.tool_from_camera)
     return (
         f"{line}; the camera sits {mm(float(moved[:3].norm()))} mm and "
         f"{math.degrees(float(moved[3:].norm())):.2f} degrees from where the simulator has it."
@@ -294,8 +293,8 @@ def list_remarks(
     remarks = [lone_poses(study, gap.floor), _largest_component(gap, named)]
     if not named.tested:
         remarks.append(
-            f"With {study.sums.num_units} poses effects are ranked and none is named; that needs "
-            f"{options.tests.least_images}."
+            f"With {study.observations.num_units} poses effects are ranked and none is named; that "
+            f"needs {options.tests.least_images}."
         )
     if named.names:
         remarks.append(_closed(gap))

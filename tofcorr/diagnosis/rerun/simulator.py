@@ -20,9 +20,8 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE
 from tofcorr.diagnosis.findings.where import Interval, interval_of
-from tofcorr.diagnosis.sums.maps import FittedMap
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
-from tofcorr.diagnosis.sums.study import Study, fitted_coefficients
+from tofcorr.diagnosis.sums.study import FittedMap, Study, fitted_coefficients
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions, unambiguous_range
@@ -165,7 +164,7 @@ class Evidence:
         changes: dict[str, Any] = {
             "sensor": options.sensor.model_copy(update={"delays": delays}),
             "effects": (*options.effects, *(effect.to_mapping() for effect in own)),
-            "hand_eye": CameraMountOptions.from_matrix(self.tool_from_camera),
+            "hand_eye": mount_at(self.tool_from_camera),
         }
         return options.model_copy(update=changes)
 
@@ -305,7 +304,7 @@ def _plain(study: Study) -> SimulatorOptions:
         # Of a grey wall, which reflects a half.
         electrons_at_1m = electrons * distance**2 / (0.5 * light.demodulation_contrast)
     return SimulatorOptions(
-        camera=CameraOptions.of(recording.camera),
+        camera=CameraOptions(**recording.camera.section()),
         depth_kind=recording.depth_kind,
         shots=tuple(
             ShotOptions(target=name, poses=n)
@@ -321,6 +320,14 @@ def _plain(study: Study) -> SimulatorOptions:
                 electrons_per_count=electrons_per_count, read_noise_electrons=0.0, converter_bits=32
             ),
         ),
+    )
+
+
+def mount_at(tool_from_camera: Tensor) -> CameraMountOptions:
+    """Return the options of a simulator whose true hand-eye transform is this one, (4, 4)."""
+    return CameraMountOptions(
+        translation_mm=tuple((1e3 * tool_from_camera[:3, 3]).tolist()),
+        rotation_deg=tuple(torch.rad2deg(se3.log(tool_from_camera)[3:]).tolist()),
     )
 
 
@@ -456,7 +463,7 @@ def sensor_of(found: Evidence, observables: Observables | None) -> SensorFile:
         version=1,
         title="A time-of-flight camera, as a diagnosis found it.",
         measured_from=tuple(sentences),
-        camera=CameraOptions.of(recording.camera),
+        camera=CameraOptions(**recording.camera.section()),
         depth_kind=recording.depth_kind,
         modulation_frequency_hz=recording.modulation_frequency,
         tool_from_camera=cast(RigidTransform, tuple(map(tuple, found.tool_from_camera.tolist()))),

@@ -318,6 +318,10 @@ class SimulatorError:
         of_pixels = ("error", "sigma", "uncertain")
         return replace(self, **{name: getattr(self, name)[pixels] for name in of_pixels})
 
+    def twist_to(self, tool_from_camera: Tensor) -> Tensor:
+        """Return the change from the simulator's hand-eye transform to another, shape (6,)."""
+        return se3.log(se3.inverse(self.tool_from_camera) @ tool_from_camera)
+
     def residual(self, observations: Observations) -> Tensor:
         """Return measured less simulated distance, the simulator as given, shape (M,), metres."""
         predicted = predicted_distance(observations, self.tool_from_camera)

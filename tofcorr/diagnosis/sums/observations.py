@@ -28,12 +28,12 @@ from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.walls import name_walls
+from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance, tangents
 from tofcorr.geometry.se3 import by_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.hooks import FrameFacts
-from tofcorr.simulation.scene import planes_from_world
 from tofcorr.simulation.simulator import facts_of
 
 
@@ -313,7 +313,7 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
     """Return what effects may depend on: predicted geometry, measured amplitude."""
     facts, frame = observations.facts, observations.frame
     distance, slope, points = seen_points(observations, tool_from_camera)
-    target_from_world = planes_from_world(facts.normal_world, facts.offset)
+    target_from_world = se3.inverse(se3.world_from_plane(facts.normal_world, facts.offset))
     target_xy = by_frame(points, target_from_world[:, :2, :3].mT, frame)
     chunks = frame_chunks(observations)
     images = [distance_images(observations, tool_from_camera, c).float() for c in chunks]

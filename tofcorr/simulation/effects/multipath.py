@@ -6,6 +6,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from tofcorr.geometry import se3
 from tofcorr.geometry.rays import SPEED_OF_LIGHT
 from tofcorr.simulation.effects.base import (
     FIXED_TARGET,
@@ -21,7 +22,6 @@ from tofcorr.simulation.effects.base import (
 from tofcorr.simulation.effects.surface import LEAST_COSINE
 from tofcorr.simulation.effects.target_shape import AreaShape
 from tofcorr.simulation.hooks import FrameState
-from tofcorr.simulation.scene import planes_from_world
 
 SIDES = (("left", 0, -1.0), ("right", 0, 1.0), ("below", 1, -1.0), ("above", 1, 1.0))
 """Where surfaces stand: name, axis of the target, and sign."""
@@ -82,7 +82,7 @@ def light_by_surfaces(
 def camera_over_target(inputs: EffectInputs) -> Tensor:
     """Return the camera of each pixel in the target's coordinates, height positive, (M, 3)."""
     facts = inputs.facts
-    target_from_world = planes_from_world(facts.normal_world, facts.offset)
+    target_from_world = se3.inverse(se3.world_from_plane(facts.normal_world, facts.offset))
     place = (target_from_world @ facts.world_from_tool @ inputs.tool_from_camera)[:, :3, 3]
     return inputs.of_frame(torch.cat([place[:, :2], place[:, 2:].abs()], dim=1))
 
