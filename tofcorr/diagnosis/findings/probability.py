@@ -20,11 +20,13 @@ Four things keep its sum from being trusted as it stands, and each is a term of 
 - The columns of an effect are not quite its form: no two lenses, rooms or robots are alike. What
   they explain of the true effect falls short by 1 + e^2 z^2, with its form error e and a standard
   normal z (a model discrepancy; Kennedy and O'Hagan 2001). So a model with gain g_k of effect k may
-  explain up to e^2 z^2 g_k more of what there is: at most as much as the best model does.
+  explain up to e^2 z^2 s_k g_k more of what there is: at most as much as the best model n does.
+  The form of k explains only what resembles it: s_k is the share that k takes away of what an
+  effect l adds, the least of those l that n has and m has not.
 - Few effects are there. Each has the prior odds o.
 
 .. math:: p(m) = \Big\langle \operatorname{softmax}_m \Big[ |m| \log o
-    + \min\big(D_m + \tfrac1T \textstyle\sum_k e_k^2 z_k^2 g_{mk},\; \max_n D_n\big) \Big]
+    + \min\big(D_m + \tfrac1T \textstyle\sum_k e_k^2 z_k^2 s_{mk} g_{mk},\; D_n\big) \Big]
     \Big\rangle_{w, z}, \qquad D_m = \tfrac1T \textstyle\sum_u w_u \ell_{mu} .
 
 The prior standard deviation of an effect is a size a in metres, as a root mean square over all
@@ -306,20 +308,6 @@ class Models:
         """Return the log predictive density of the model of one effect over the base model's."""
         return float(self.total[self.models.index((name,))]) if (name,) in self.models else 0.0
 
-    def _gains(self) -> list[dict[str, float]]:
-        """Return what each effect of a known form error adds to each model."""
-        total = dict(zip(self.models, self.total.tolist(), strict=True))
-        gains = []
-        for model in self.models:
-            own = {}
-            for name in model:
-                error = CATALOGUE[name].form_error if name in CATALOGUE else 0.0
-                without = total.get(tuple(other for other in model if other != name))
-                if error > 0 and without is not None:
-                    own[name] = error**2 * max(total[model] - without, 0.0)
-            gains.append(own)
-        return gains
-
     def posterior(self, weights: Tensor, generator: torch.Generator) -> Tensor:
         """Return the probability of each model for some weights of the poses, shape (N, D).
 
@@ -328,15 +316,30 @@ class Models:
             generator: Of the form errors, drawn for each row by itself.
         """
         density = self.densities @ weights.T
-        names = sorted({name for model in self.models for name in model})
-        drawn = torch.randn(len(names), len(weights), generator=generator).double().square()
+        best, names = density.max(0), sorted({name for model in self.models for name in model})
+        square = torch.randn(len(names), len(weights), generator=generator).double().square()
         missed = torch.zeros_like(density)
-        for row, gains in zip(missed, self._gains(), strict=True):
-            for name, gain in gains.items():
-                row.add_(gain * drawn[names.index(name)])
-        explained = torch.minimum(density + missed, density.max(0).values)
+        for number in best.indices.unique().tolist():
+            own = best.indices == number
+            missed[:, own] = self._missed(self.models[number], names) @ square[:, own]
         prices = self.price * torch.tensor([len(model) for model in self.models])
-        return torch.softmax(explained - prices[:, None], 0)
+        return torch.softmax(torch.minimum(density + missed, best.values) - prices[:, None], 0)
+
+    def _missed(self, best: Model, names: Sequence[str]) -> Tensor:
+        """Return what the form of each effect may miss of the best model at z = 1, (N, K)."""
+        total = dict(zip(map(frozenset, self.models), self.total.tolist(), strict=True))
+        missed = torch.zeros(len(total), len(names), dtype=torch.float64)
+        for row, model in zip(missed, total, strict=True):
+            further = [one for one in set(best) - model if model | {one} in total]
+            added = {one: total[model | {one}] - total[model] for one in further}
+            for name in model & CATALOGUE.keys():
+                rest, alike = model - {name}, 1.0
+                for one, beside in added.items():
+                    alone = total.get(rest | {one}, 0.0) - total.get(rest, math.inf)
+                    alike = min(alike, max(1 - beside / alone, 0.0)) if alone > 0 else alike
+                gain = max(total[model] - total.get(rest, total[model]), 0.0)
+                row[names.index(name)] = CATALOGUE[name].form_error ** 2 * alike * gain
+        return missed
 
 
 class Search:

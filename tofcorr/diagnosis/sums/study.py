@@ -209,11 +209,12 @@ class Study:
     def material_mm(self) -> float:
         """Minimum size of the first effect that is named, millimetres.
 
-        A simulator's error that was fitted at other poses is carried to these with a form error.
-        What the tolerance for finer forms of base terms allows is then no effect either.
+        A simulator's error that was fitted at other poses is carried to these with a form error,
+        and planes that were found in the depth took pixels at their edges for their own. What the
+        tolerance for finer forms of base terms allows is then no effect either.
         """
         tests, known = self.options.tests, self.fit.known
-        if known is not None and known.carried:
+        if not self.inputs.planes_are_measured or (known is not None and known.carried):
             return max(tests.material_mm, tests.form_tolerance_mm)
         return tests.material_mm
 

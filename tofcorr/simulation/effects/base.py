@@ -349,7 +349,7 @@ class CatalogueEffect(Effect, ABC):
     refines: ClassVar[tuple[str, ...]] = ()
     of_frame: ClassVar[bool] = False
     prior: ClassVar[float] = 0.02
-    form_error: ClassVar[float] = 0.65
+    form_error: ClassVar[float] = 0.8
     reads_light: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
