@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import shape_checks  # noqa: F401 - it puts itself in the place of a decorator.
 import torch
 from hypothesis import settings
 from running import Program, Said

@@ -5,7 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from jaxtyping import TypeCheckError
+from beartype import beartype
+from jaxtyping import Float, TypeCheckError
+from shape_checks import checked
+from torch import Tensor
 
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.uncertainty import posterior_covariance
@@ -43,6 +46,16 @@ def test_a_wrong_shape_is_refused_in_a_test_run() -> None:
         Parameters(torch.eye(3), torch.zeros(2))
     with pytest.raises(TypeCheckError, match="rays"):
         grazing(60.0, torch.zeros(4, 5, 2))
+
+
+def test_an_answer_is_refused_whose_arguments_were_seen_with_a_right_one() -> None:
+    @checked(typechecker=beartype)
+    def first(values: Float[Tensor, "n"], count: float) -> Float[Tensor, "n"]:  # noqa: F821
+        return values[: int(count)]
+
+    assert first(torch.zeros(3), 3.0).shape == (3,)
+    with pytest.raises(TypeCheckError, match="return value"):
+        first(torch.zeros(3), 2.0)
 
 
 def test_shapes_are_annotated_only_where_they_are_checked() -> None:
