@@ -22,6 +22,7 @@ import tofcorr
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.posed import PosedImport
 from tofcorr.pixels.dataset import Dataset
 
 EA = {"name": "EA", "model": synthetic_scene.EA}
@@ -36,13 +37,28 @@ class Imported(NamedTuple):
     report: dict[str, Any]
 
 
+def import_room(out: Path, images: int, clutter: float) -> Imported:
+    generator = np.random.default_rng(2)
+    hand_eye = hand_eye_anywhere(generator)
+    room = Room(Camera(48, 40, 46.0), tool_from_camera=hand_eye, clutter=clutter)
+    views = room.views(poses_in_room(images, generator), generator)
+    given = intrinsics(room.camera), views.world_from_tool, views.depth, views.amplitude
+    return Imported(room, views, *imported_room(out, *given))
+
+
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory: pytest.TempPathFactory) -> Imported:
-    generator = np.random.default_rng(1)
-    room = Room(Camera(48, 40, 46.0), tool_from_camera=hand_eye_anywhere(generator), clutter=0.2)
-    views = room.views(poses_in_room(40, generator), generator)
-    given = intrinsics(room.camera), views.world_from_tool, views.depth, views.amplitude
-    return Imported(room, views, *imported_room(tmp_path_factory.mktemp("room") / "walls", *given))
+    # Much clutter would be taken for a mistake, and all mistakes tried.
+    return import_room(tmp_path_factory.mktemp("room") / "walls", 40, 0.02)
+
+
+def test_planes_off_all_walls_that_no_mistake_explains_are_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    undone = [("the columns mirrored", 300.0)]
+    monkeypatch.setattr(PosedImport, "_mistakes_undone", lambda *_: iter(undone))
+    (warning,) = import_room(tmp_path / "walls", 16, 0.2).report["warnings"]
+    assert "images show a wall, and planes are off by" in warning
 
 
 def test_each_image_and_wall_is_a_frame_with_a_mask_of_its_own(imported: Imported) -> None:
