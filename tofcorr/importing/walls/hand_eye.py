@@ -304,9 +304,11 @@ def _candidate_rotations(planes: SeenPlanes) -> Tensor:
         """Return the weight of pairs that agree to within about an angle, shape (K,)."""
         # The Gaussian of an angle, through its cosine: falls to 1 / e at the width.
         steep = 1 / (1 - math.cos(width))
+        # What is less counts for nothing; exponentials near underflow take five times as long.
+        least = math.log(torch.finfo(torch.float32).tiny) / 2
         normals = (turned(part).float() for part in rotations.split(100))
-        agree = ((steep * (one @ one.mT - 1)).exp_().flatten(1) @ pair for one in normals)
-        return torch.cat(list(agree)).double()
+        near = ((steep * (one @ one.mT - 1)).clamp_(min=least) for one in normals)
+        return torch.cat([one.exp_().flatten(1) @ pair for one in near]).double()
 
     number, coarse = _GRID
     fine = coarse / 3
