@@ -1,5 +1,7 @@
 """What TensorBoard shows is what happened."""
 
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,8 +132,10 @@ def test_a_sample_holds_usable_pixels_and_thinning_keeps_both_ends(trained: Trai
 def test_without_figures_only_they_are_missing(
     trained: Trained, shown: EventAccumulator, tmp_path: Path
 ) -> None:
-    result = trained.result
-    result.monitor.write(tmp_path, result.calibration, result.report, figures=False)
+    result, monitor = trained.result, copy(trained.result.monitor)
+    # Rounding takes the loss of a fit that took all points to the camera below zero: a traceback.
+    monitor.iterations = [replace(one, history=(-1e-18,)) for one in monitor.iterations]
+    monitor.write(tmp_path, result.calibration, result.report, figures=False)
     less, whole = _read(tmp_path).Tags(), shown.Tags()
     missing = {kind: set(whole[kind]) - set(less[kind]) for kind in ("scalars", "tensors")}
     assert all(tag.startswith("error_mm_against/") for tag in missing["scalars"])

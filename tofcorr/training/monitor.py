@@ -97,9 +97,9 @@ class RunMonitor:
             }
 
         for iteration, when in zip(self.iterations, self._times, strict=True):
-            left = math.log10(max(iteration.step_left, sys.float_info.min))
-            own = {"convergence/loss_m2": iteration.loss, "convergence/log10_step_left_se": left}
-            own["convergence/rms_mm"] = 1e3 * math.sqrt(iteration.loss / total_weight(moments))
+            loss, left = iteration.loss, math.log10(max(iteration.step_left, sys.float_info.min))
+            own = {"convergence/loss_m2": loss, "convergence/log10_step_left_se": left}
+            own["convergence/rms_mm"] = 1e3 * max(loss / total_weight(moments), 0.0) ** 0.5
             for tag, value in (own | state(iteration.parameters)).items():
                 yield tag, value, iteration.iterations, when
         for tag, value in state(calibration.fit.solution.parameters).items():
