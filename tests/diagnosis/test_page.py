@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -121,27 +122,40 @@ def without_effects(result: DiagnosisResult) -> DiagnosisResult:
     return replace(result, effects=(), cause_sets=(), gap_steps=(), shares=(left,))
 
 
+def as_found(result: DiagnosisResult) -> DiagnosisResult:
+    return result
+
+
+Kind = Callable[[DiagnosisResult], DiagnosisResult]
+
+
 @pytest.fixture(scope="module")
-def page(time_diagnosis: DiagnosisResult) -> str:
-    return render(time_diagnosis)
+def rendered(time_diagnosis: DiagnosisResult) -> Callable[[Kind], str]:
+    """The page of each kind of findings, rendered once."""
+    return cache(lambda kind: render(kind(time_diagnosis)))
+
+
+@pytest.fixture(scope="module")
+def page(rendered: Callable[[Kind], str]) -> str:
+    return rendered(as_found)
 
 
 @needs_browser
 @pytest.mark.parametrize("kind", [with_simulator, without_effects])
 def test_nothing_of_the_page_is_cut_and_every_picture_has_a_text_beside_it(
-    kind: Callable[[DiagnosisResult], DiagnosisResult],
+    kind: Kind,
+    rendered: Callable[[Kind], str],
     time_diagnosis: DiagnosisResult,
     tmp_path: Path,
 ) -> None:
-    result = kind(time_diagnosis)
-    frames, console = looked_at(render(result), tmp_path)
+    frames, console = looked_at(rendered(kind), tmp_path)
     assert console == ""
     for width, seen in zip(WIDTHS, frames, strict=True):
         assert seen["width"] == width
         assert seen["scroll"] <= width
         assert seen["cut"] == []
         assert seen["silent"] == []
-        assert seen["pictures"] == len(result.all_figures())
+        assert seen["pictures"] == len(kind(time_diagnosis).all_figures())
 
 
 @needs_browser
@@ -156,11 +170,13 @@ def test_the_browser_would_see_what_is_cut_silent_or_wrong(page: str, tmp_path: 
     assert "not defined" in console
 
 
-def test_every_picture_of_every_kind_of_report_has_words(time_diagnosis: DiagnosisResult) -> None:
-    for result in (with_simulator(time_diagnosis), without_effects(time_diagnosis), time_diagnosis):
+def test_every_picture_of_every_kind_of_report_has_words(
+    rendered: Callable[[Kind], str], time_diagnosis: DiagnosisResult
+) -> None:
+    for kind in (with_simulator, without_effects, as_found):
+        result, shown = kind(time_diagnosis), html.unescape(rendered(kind))
         figures = result.all_figures()
         assert ("where_as_given" in figures) == (result.stages[0].gap is not None)
-        shown = html.unescape(render(result))
         for name in figures:
             figure = shown[shown.index(f'<figure id="{name}">') :].split("</figure>")[0]
             alt, finding, reading = (

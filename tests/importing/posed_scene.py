@@ -265,10 +265,3 @@ def met(
             seen &= shown(k, place + far[..., None] * world)
         nearest[seen], cosine[seen], plane[seen] = far[seen], -towards[seen], k
     return nearest, cosine, plane
-
-
-def apart(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """Return how far two transforms are apart: millimetres and degrees."""
-    between = np.linalg.inv(first) @ second
-    turn = Rotation.from_matrix(between[:3, :3]).magnitude()
-    return float(1e3 * np.linalg.norm(between[:3, 3])), float(np.degrees(turn))

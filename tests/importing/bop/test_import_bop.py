@@ -7,9 +7,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from cameras import apart
 from importing import scene_files
 from importing.frames.imported import assert_equal_recordings, import_png, run_import
-from importing.posed_scene import Drive, Recorded, apart, unit_rays
+from importing.posed_scene import Drive, Recorded, unit_rays
 
 
 @pytest.fixture(scope="module")

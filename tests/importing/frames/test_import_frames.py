@@ -5,19 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cameras import apart
 from importing import scene_files
 from importing.frames.imported import Imported, assert_equal_recordings, import_png, import_written
-from importing.posed_scene import Recorded, apart
+from importing.posed_scene import Recorded
 
 # How near the start of the fit is: the camera's error of 10 mm is not calibrated yet.
 NEAR_MM, NEAR_DEG = 15.0, 0.5
 
 
 def assert_start_is_near(imported: Imported, recorded: Recorded) -> None:
-    start = imported.done.tool_from_camera
-    mm, degrees = apart(start, recorded.tool_from_camera)
-    assert mm < NEAR_MM
-    assert degrees < NEAR_DEG
+    off = apart(imported.done.tool_from_camera, recorded.tool_from_camera)
+    assert (off < (NEAR_MM, NEAR_DEG)).all()
 
 
 @pytest.fixture(scope="module")

@@ -5,23 +5,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from importing.posed_scene import Drive, Recorded, apart
+from cameras import apart
+from importing.posed_scene import Drive, Recorded
 from importing.rosbag import written_bags as bags
 from importing.rosbag.test_import_rosbag import WITH_INFRARED, import_bag
+from running import Program
 from scipy.spatial.transform import Rotation
-
-from tofcorr.cli.main import group
 
 NEAR_MM, NEAR_DEG = 1.0, 0.1
 """What is asked of the whole way: a hand-eye transform within 1 mm and 0.1 degrees."""
 
 LAG_NEAR_S = 0.010
-
-
-def run(*arguments: object) -> None:
-    result = CliRunner().invoke(group, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, result.output
 
 
 def exported_hand_eye(urdf: Path) -> np.ndarray:
@@ -45,7 +39,7 @@ def recorded(request: pytest.FixtureRequest) -> Recorded:
 @pytest.mark.parametrize("kind", ["mcap", "ros1"])
 @pytest.mark.parametrize("how", ["moving", "standing still", "late"])
 def test_the_hand_eye_is_found_wherever_the_camera_is_and_whatever_its_clock(
-    kind: str, how: str, recorded: Recorded, tmp_path: Path
+    kind: str, how: str, recorded: Recorded, tmp_path: Path, program: Program
 ) -> None:
     """Import, train and export; nothing is known but the bag."""
     late, still = 0.08 if how == "late" else 0.0, how == "standing still"
@@ -55,9 +49,8 @@ def test_the_hand_eye_is_found_wherever_the_camera_is_and_whatever_its_clock(
     options = ("--eye-to-hand",) if still else ()
     imported = import_bag(path, recording, *WITH_INFRARED, *options)
     assert imported.exit_code == 0, imported.text
-    run("train", "--config", "ea", "--recording", recording, "--out", out, "--set", "advice=0")
-    run("export", "--run", out, "--format", "urdf", "--out", urdf)
-    mm, degrees = apart(exported_hand_eye(urdf), drive.tool_from_camera)
-    assert mm < NEAR_MM
-    assert degrees < NEAR_DEG
+    train = ("train", "--config", "ea", "--set", "advice=0")
+    assert program(*train, "--recording", recording, "--out", out).code == 0
+    assert program("export", "--run", out, "--format", "urdf", "--out", urdf).code == 0
+    assert (apart(exported_hand_eye(urdf), drive.tool_from_camera) < (NEAR_MM, NEAR_DEG)).all()
     assert abs(imported.report["lag"]["seconds"] - late) < LAG_NEAR_S

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from importing.posed_scene import apart
+from cameras import apart
 from importing.walls.rendered_room import (
     CUPBOARD,
     FLOOR,
@@ -59,9 +59,7 @@ def test_three_walls_and_a_floor_are_found_and_every_view_is_of_its_wall(
     found = found_in(room, views)
     shown = planes_shown(room, found)
     assert sorted(shown) == [0, 1, 2, 3]
-    mm, degrees = apart(found.tool_from_camera, room.tool_from_camera)
-    assert mm < NEAR_MM
-    assert degrees < NEAR_DEG
+    assert (apart(found.tool_from_camera, room.tool_from_camera) < (NEAR_MM, NEAR_DEG)).all()
     for image, wall in zip(found.image, found.wall, strict=True):
         assert (views.plane[image] == shown[wall]).mean() > 0.03
     assert found.undetermined == []
