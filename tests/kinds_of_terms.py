@@ -46,14 +46,15 @@ def model_of(kind: str, domain: Domain = DOMAIN, **options: Any) -> ErrorModel:
     return model
 
 
-def randomise(model: torch.nn.Module, generator: torch.Generator) -> None:
-    """Give every parameter, and the map of the pixels, random values."""
+def randomise(
+    model: torch.nn.Module, generator: torch.Generator, size: float = 1.0, of_network: float = 1.0
+) -> None:
+    """Give every parameter, and the map of the pixels, random values of these sizes."""
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator).double())
-        for name, buffer in model.named_buffers():
-            if name.endswith("offset"):
-                buffer.copy_(torch.randn(buffer.shape, generator=generator).double())
+        for name, value in [*model.named_parameters(), *model.named_buffers()]:
+            if isinstance(value, torch.nn.Parameter) or name.endswith("offset"):
+                scale = of_network if "residual" in name else size
+                value.copy_(scale * torch.randn(value.shape, generator=generator))
 
 
 def inputs(generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:

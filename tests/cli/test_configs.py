@@ -71,6 +71,7 @@ WRONG = {
     "import polaroid": "No such command 'polaroid'",
     "correct --modle x": "No such option",
     "correct --model a --recording b --out c": "b: there is no such folder",
+    "diagnose --recording b --out c": "b: there is no such folder",
     "export --run a --format lut --out b": "state.pt: there is no such",
     "import checkerboard . --out o --board 5x7 --square-mm 30 --intrinsics kinect": (
         "neither a file nor a configuration shipped for 'import'. Did you mean 'kinect2'?"

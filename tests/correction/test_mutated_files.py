@@ -9,9 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import broken_recordings
 import numpy as np
 import pytest
 import torch
+from broken_recordings import GONE
 from correction.export.states import ACCURACY, EYE_TO_HAND, TRANSFORMS, calibration, write
 
 import tofcorr
@@ -25,20 +27,8 @@ Change = Callable[[dict[str, Any]], Any]
 
 
 def put(key: str, value: object) -> Change:
-    """Replace one entry; dots lead into entries."""
-
-    def change(values: dict[str, Any]) -> None:
-        *parents, last = key.split(".")
-        holder: Any = values
-        for parent in parents:
-            holder = holder[parent]
-        holder[last] = value(holder[last]) if callable(value) else value
-
-    return change
-
-
-def drop(key: str) -> Change:
-    return lambda values: values.pop(key)
+    """Return what replaces one entry."""
+    return lambda values: broken_recordings.put(values, key, value)
 
 
 NAN, MAP = float("nan"), torch.zeros(5, 7).double()
@@ -58,7 +48,7 @@ STATES: dict[str, tuple[Change, str]] = {
     "three rows": (put("tool_from_camera", lambda t: t[:3]), r"expected shape \(4, 4\)"),
     "a tensor for a version": (put("version", torch.ones(2)), "has version"),
     "a word for a version": (put("version", "x" * 3000), r"has version x+\.\.\., this package"),
-    "no domain": (drop("domain"), "'domain' is missing"),
+    "no domain": (put("domain", GONE), "'domain' is missing"),
     "another size": (put("domain.height", 6), "'camera' and 'domain' disagree"),
     "too large a size": (put("domain.height", 10**7), "'domain.height': .*less than or equal"),
     "a range turned round": (put("domain.amplitude", (9.0, 1.0)), "'domain.amplitude': .*lower"),
@@ -107,7 +97,7 @@ def test_a_state_that_was_changed_is_refused_by_key(tmp_path: Path, name: str) -
 
 
 MODULES: dict[str, tuple[Change, str]] = {
-    "no state": (drop("state"), "'state' is missing"),
+    "no state": (put("state", GONE), "'state' is missing"),
     "a number for a tensor": (put("state", {"error_model.constant": 1.0}), "'state.error_model"),
     "no labels": (put("state", lambda s: {"error_model.constant": s["_extra_state"]}), "damaged"),
     "a tensor for a format": (put("format", torch.ones(2)), "is not a calibration"),

@@ -161,13 +161,6 @@ def test_the_command_writes_the_report_and_finds_what_the_function_finds(
     assert json.loads((tmp_path / "report" / "diagnosis.json").read_text()) == alone.to_mapping()
 
 
-def test_a_refused_recording_leaves_no_report(tmp_path: Path) -> None:
-    out = tmp_path / "report"
-    done = CliRunner().invoke(command, ["--recording", str(tmp_path / "no"), "--out", str(out)])
-    assert done.exit_code != 0
-    assert not out.exists()
-
-
 @pytest.mark.slow
 def test_diagnosing_does_not_touch_the_global_generator(time_missing: Recording) -> None:
     torch.manual_seed(5)

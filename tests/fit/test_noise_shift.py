@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from diagnosed_recordings import recorded
+from diagnosed_recordings import STILL, recorded
 
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.moments import MomentObjective, Parameters
@@ -18,11 +18,6 @@ from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import hand_eye_accuracy
 
 SIGMA = 0.02  # metres
-CHANGES = {
-    "shots": [{"target": "white", "poses": 12}],
-    "conditions": {"integration_time_us": [500.0]},
-    "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
-}
 
 
 def _fitted(recording: Recording, **changes: object) -> Fit:
@@ -35,7 +30,7 @@ def _fitted(recording: Recording, **changes: object) -> Fit:
 @pytest.fixture(scope="module")
 def fits(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fit, list[Fit]]:
     """Fits to a recording without noise, and to the same with other noise each time."""
-    clean = recorded(tmp_path_factory.mktemp("shift") / "clean", 61, [], CHANGES, noise=False)
+    clean = recorded(tmp_path_factory.mktemp("shift") / "clean", 61, [], STILL, noise=False)
     random = np.random.default_rng(61)
     return _fitted(clean), [_fitted(_noisy(clean, SIGMA, random)) for _ in range(6)]
 
@@ -81,7 +76,7 @@ def test_model_and_hand_eye_transform_are_those_of_the_estimate(
 
 
 def test_an_estimate_may_stay_at_the_least_loss(tmp_path: Path) -> None:
-    one = recorded(tmp_path / "one", 61, [], CHANGES)
+    one = recorded(tmp_path / "one", 61, [], STILL)
     left, moved = _fitted(one, remove_noise_shift=False), _fitted(one)
     assert left.solution.parameters is left.optimum
     torch.testing.assert_close(_shift(left).twist, _shift(moved).twist)
@@ -90,7 +85,7 @@ def test_an_estimate_may_stay_at_the_least_loss(tmp_path: Path) -> None:
 
 def test_estimated_walls_move_along(tmp_path: Path) -> None:
     """On the walls of the least loss the points would be off by as much as the hand-eye moved."""
-    clean = recorded(tmp_path / "clean", 61, [], CHANGES, noise=False)
+    clean = recorded(tmp_path / "clean", 61, [], STILL, noise=False)
     noisy = _noisy(clean, SIGMA / 4, np.random.default_rng(62))
     one = _fitted(noisy, planes="unknown")
     assert one.walls is not None

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import kinds_of_terms
 import torch
 from kinds_of_terms import DOMAIN
 from small_recordings import CAMERA
@@ -34,13 +35,7 @@ def module_of(*kinds: str, **arguments: Any) -> DepthCorrection:
 
 def randomise(module: DepthCorrection, size: float = 0.02) -> None:
     """Give every parameter, and the map of the pixels, random values."""
-    generator = torch.Generator().manual_seed(3)
-    with torch.no_grad():
-        for name, value in [*module.named_parameters(), *module.named_buffers()]:
-            if isinstance(value, torch.nn.Parameter) or name.endswith("fixed_pattern.offset"):
-                scale = 0.5 if "residual" in name else size
-                drawn = torch.randn(value.shape, generator=generator, dtype=torch.float64)
-                value.copy_(scale * drawn)
+    kinds_of_terms.randomise(module, torch.Generator().manual_seed(3), size, 0.5)
 
 
 def frames(
