@@ -30,13 +30,13 @@ from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift
 from tofcorr.drift.offset import OffsetSums, Wall
 from tofcorr.errors import TofcorrError
-from tofcorr.fit.reference import Reference, unknown_reference
+from tofcorr.fit.reference import estimate_reference, unknown_reference
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 from tofcorr.training.calibration import TrainingOptions
-from tofcorr.training.run import calibration_state, run_reference, train
+from tofcorr.training.run import calibration_state, train
 
 Values = dict[str, Any]
 WALLS: tuple[Wall, ...] = ("per_image", "one", "recorded")
@@ -85,7 +85,8 @@ def one_draw(number: int, seed: int, folder: Path) -> list[Values]:
     options = resolve_options(TrainingOptions, model).model_copy(update={"advice": 0})
     result = train(folder / "train", options)
     state = calibration_state(result.data, options, result.fit)
-    reference: Reference | None = run_reference(result.calibration, state)
+    frames = result.calibration.frames
+    reference = estimate_reference(result.data, frames, result.fit, state.noise)
     later = check_options(camera, max(FRAMES), generator)
     same = recorded(later, folder / "unchanged", frames, 0.0)
     moved = recorded(later, folder / "drifted", max(FRAMES), DRIFT_MM)

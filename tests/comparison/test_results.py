@@ -71,14 +71,9 @@ def test_select_returns_what_the_command_prints_and_writes(
     assert selection.ties == []
 
 
-def test_results_are_drawn(
-    evaluation: tofcorr.EvaluationResult, selection: tofcorr.SelectionResult
-) -> None:
+def test_results_are_drawn(evaluation: tofcorr.EvaluationResult) -> None:
     (comparison,) = evaluation.plot_comparison().axes
     assert [text.get_text() for text in comparison.get_xticklabels()] == ["wall"]
-    panels = selection.plot_ranking().axes
-    assert len(panels) == 2
-    assert [text.get_text() for text in panels[0].get_yticklabels()] == ["constant", "EA"]
 
 
 def test_every_set_is_a_row_and_recordings_of_one_selection_are_taken_together(

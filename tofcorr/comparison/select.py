@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from tofcorr.comparison.experiment import Experiment, held_out_experiment
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
@@ -175,23 +174,6 @@ class SelectionResult:
             "warnings": found.warnings,
             "headline": self.headline,
         }
-
-    def plot_ranking(self) -> Figure:
-        """Draw by how much each model is behind the best, with 95 % intervals, by grouping."""
-        rankings, names = self.rankings, list(self.decisive.errors)
-        size = 2 + 3 * len(rankings), 2 + len(names) / 3
-        figure = Figure(figsize=size, layout="constrained")
-        panels = figure.subplots(1, len(rankings), sharey=True, squeeze=False)[0]
-        for axes, (by, ranking) in zip(panels, rankings.items(), strict=True):
-            for place, (name, one) in enumerate(ranking.behind.items()):
-                style = {"fmt": "o", "color": "C2" if name == ranking.winner else "0.4"}
-                axes.errorbar(one.mean, place, xerr=np.nan_to_num(one.half_width), **style)
-            axes.axvline(0, color="0.7", zorder=0)
-            axes.set_yticks(np.arange(len(names)), names)
-            axes.set_title(f"{by}s held out: {ranking.winner} wins", fontsize=10)
-            axes.set_xlabel("error minus that of the best [mm]")
-        panels[0].invert_yaxis()
-        return figure
 
 
 def select(

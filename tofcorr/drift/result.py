@@ -1,13 +1,10 @@
-"""What a drift check found, in words, as plain values and as a figure."""
+"""What a drift check found, in words and as plain values."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from tofcorr.digits import known, known_interval
 from tofcorr.drift.offset import ImageDrift, Wall
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Verdict = Literal["holds", "drifted", "undecided"]
 
@@ -105,24 +102,3 @@ class DriftResult:
                 for frame, _, flatness, pixels in self.images
             ],
         }
-
-    def plot_images(self) -> "Figure":
-        """Draw offset and flatness of each image, with the overall interval and the threshold."""
-        from matplotlib.figure import Figure
-
-        figure, threshold = Figure(figsize=(7, 5), layout="constrained"), 1e3 * self.threshold
-        top, bottom = figure.subplots(2, 1, sharex=True)
-        frames, offset, flatness, _ = zip(*self.images, strict=True)
-        low, high = (1e3 * end for end in self.interval)
-        top.axhspan(low, high, color="C0", alpha=1 / 5, label="all images, 95 % interval")
-        top.plot(frames, [1e3 * one for one in offset], "o", color="C0", label="one image")
-        bottom.plot(frames, [1e3 * one for one in flatness], "o", color="C1")
-        for axes, ends in ((top, (-threshold, threshold)), (bottom, (threshold,))):
-            for end in ends:
-                axes.axhline(end, color="C3", linestyle="--", linewidth=1)
-            axes.grid(alpha=1 / 4)
-        top.set_ylabel("reads too far by [mm]")
-        top.legend(fontsize=8)
-        bottom.set(ylabel="departure from a plane [mm]", ylim=(0, None))
-        bottom.set_xlabel("frame (dashed: threshold)")
-        return figure

@@ -1,18 +1,17 @@
 """The fit of a module to recordings, as `tofcorr train` does it, and what it found."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
+
+from pydantic import TypeAdapter
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.estimation.solvers import Watcher
-from tofcorr.pixels.dataset import Dataset, resolved_planes, split_frames
-from tofcorr.pixels.sample import usable_pixels
-from tofcorr.plausibility.examine import vet
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.calibration import TrainingOptions, calibrate
-from tofcorr.training.judgement import against_garbage, frames_left_out, report_text
+from tofcorr.training.judgement import report_text
 from tofcorr.training.report import training_report
-from tofcorr.training.run import calibration_state
+from tofcorr.training.run import calibration_state, inspected
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,34 +85,23 @@ def fit_to(
     Raises:
         CalibrationDataError: The data cannot support the model, or cannot be what they say.
     """
-    planes = resolved_planes(options.planes, dataset.recordings)
-    inspection = vet(dataset, planes, force=force)
-    options = against_garbage(options, inspection)
-    frames, _ = split_frames(dataset, options.split)
-    left_out = frames_left_out(inspection, [frames])
-    robust = options.weights.robust != "none"
-    dataset = usable_pixels(dataset, options, robust=robust, frames=frames)
+    dataset, options, inspection, left_out = inspected(dataset, options, force=force)
     found = calibrate(dataset, options, watcher, left_out=left_out)
     told = training_report(found, options.model_copy(update={"advice": 0}), inspection)
-    half, hand_eye = "test" if len(found.test) else "train", told["hand_eye"]
-    errors = {stage: _error(halves[half]) for stage, halves in told["error_mm"].items()}
-    report = FitReport(
-        model=options.name,
+    half = "test" if len(found.test) else "train"
+    errors = {
+        stage: {name: math.nan if one is None else one for name, one in halves[half].items()}
+        for stage, halves in told["error_mm"].items()
+    }
+    values = {
+        **told,
+        **told["hand_eye"],
         **errors,
-        held_out=half == "test",
-        tool_from_camera=tuple(map(tuple, hand_eye["tool_from_camera"])),
-        translation_se_mm=tuple(hand_eye["translation_se_mm"]),
-        rotation_se_deg=tuple(hand_eye["rotation_se_deg"]),
-        stopped=str(told["stopped"]),
-        iterations=told["iterations"],
-        train_frames=tuple(told["frames"]["train"]),
-        test_frames=tuple(told["frames"]["test"]),
-        warnings=tuple(filter(None, [inspection.headline, *told["warnings"]])),
-        text=report_text(told),
-    )
+        "held_out": half == "test",
+        "train_frames": told["frames"]["train"],
+        "test_frames": told["frames"]["test"],
+        "warnings": [*filter(None, [inspection.headline]), *told["warnings"]],
+        "text": report_text(told),
+    }
+    report = TypeAdapter(FitReport).validate_python(values)
     return calibration_state(found.data, options, found.fit), report
-
-
-def _error(measured: Mapping[str, float | None]) -> ErrorMM:
-    numbers = {name: math.nan if one is None else one for name, one in measured.items()}
-    return ErrorMM(**numbers)

@@ -25,12 +25,13 @@ from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Solution
 from tofcorr.files import refuse_existing, staged_file, staged_folder
 from tofcorr.fit.problem import Fit
-from tofcorr.fit.reference import REFERENCE_FILE, Reference, estimate_reference, save_reference
+from tofcorr.fit.reference import REFERENCE_FILE, estimate_reference, save_reference
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
 from tofcorr.pixels.passes import alone, is_first, process_group
 from tofcorr.pixels.sample import PixelSample, sample_pixels, usable_pixels
 from tofcorr.plausibility.examine import vet
+from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import stages
 from tofcorr.training.calibration import Calibration, TrainingOptions, calibrate
 from tofcorr.training.figures import (
@@ -48,11 +49,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LOG = logging.getLogger(__name__)
-
-
-def run_reference(calibration: Calibration, state: CalibrationState) -> Reference | None:
-    """Return what a later check must know of the frames, fitted and held out; None: unknown."""
-    return estimate_reference(calibration.data, calibration.frames, calibration.fit, state.noise)
 
 
 def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> CalibrationState:
@@ -143,7 +139,8 @@ class TrainingResult:
         fit, options = self.fit, self.options
         state = calibration_state(self.data, options, fit)
         save_calibration(folder / STATE_FILE, state)
-        reference = run_reference(self.calibration, state)
+        seen, frames = self.data, self.calibration.frames
+        reference = estimate_reference(seen, frames, fit, state.noise)
         if reference is not None:
             save_reference(folder / REFERENCE_FILE, reference, state)
         if self.force or self.report["verdict"] != DO_NOT_USE:
@@ -225,6 +222,32 @@ def interruptible() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
+def inspected(
+    data: Dataset, options: TrainingOptions, *, force: bool
+) -> tuple[Dataset, TrainingOptions, Inspection, tuple[int, ...]]:
+    """Look at recordings, and choose the pixels, weights and frames of a training.
+
+    Args:
+        data: The recordings.
+        options: Of the training.
+        force: Go on whatever the recordings look like.
+
+    Returns:
+        The recordings without the pixels that are left out; the options, with robust weights where
+        garbage spoils a fit; what was odd; and global numbers of frames that no fit uses.
+
+    Raises:
+        CalibrationDataError: The recordings cannot be what they say.
+    """
+    inspection = vet(data, resolved_planes(options.planes, data.recordings), force=force)
+    options = against_garbage(options, inspection)
+    frames, _ = split_frames(data, options.split)
+    left_out = frames_left_out(inspection, [frames])
+    robust = options.weights.robust != "none"
+    data = usable_pixels(data, options, robust=robust, frames=frames)
+    return data, options, inspection, left_out
+
+
 def train(
     recordings: Recordings,
     config: Config = "ea",
@@ -259,8 +282,8 @@ def train(
     if out is not None:
         refuse_existing(Path(out))
     seconds: dict[str, float] = {}
-    # The bar counts read, inspect, read, fit and report; then write and figures.
-    with stages("training", 5 if out is None else 7) as begin:
+    # The bar counts read, inspect, fit and report; then write and figures.
+    with stages("training", 4 if out is None else 6) as begin:
 
         @contextmanager
         def stage(name: str) -> Iterator[None]:
@@ -276,13 +299,7 @@ def train(
             data = Dataset(opened(recordings))
             start = None if resume is None else resumed_parameters(resume, options)
         with stage("inspect"):
-            inspection = vet(data, resolved_planes(options.planes, data.recordings), force=force)
-            options = against_garbage(options, inspection)
-            train_frames, _ = split_frames(data, options.split)
-            left_out = frames_left_out(inspection, [train_frames])
-        with stage("read"):
-            robust = options.weights.robust != "none"
-            data = usable_pixels(data, options, robust=robust, frames=train_frames)
+            data, options, inspection, left_out = inspected(data, options, force=force)
         with process_group(options.device) as device, interruptible() as interrupted:
             # Every process fits, so that none waits; only the first one watches and writes.
             place = Path(out) if out is not None and is_first() else None

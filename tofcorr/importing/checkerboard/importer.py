@@ -9,7 +9,7 @@ Kinect v2 in `tests/importing/checkerboard/test_kinect2.py` they refuse at most 
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,7 +29,6 @@ from tofcorr.importing.checkerboard.pose import (
     calibrate,
     calibration_warning,
     estimate_pose,
-    poses_of,
 )
 from tofcorr.importing.images import (
     DepthCoding,
@@ -64,9 +63,13 @@ _TENTH = 0.1
 From half of it on all views together get a warning: 5 cm at 1 m is the largest error that an
 uncalibrated camera is known for."""
 
-_CHANGES = 0.02, 0.01
-"""Relative changes of focal length and square length that are tried: typical errors of factory
-intrinsics and of a printed board."""
+# With a longer focal length the board seems farther away, its corners at almost the same pixels;
+# with longer squares at exactly the same.
+_DEGENERACY = (
+    "A board cannot tell focal length, square length and slope of the distance error apart: a "
+    "focal length or squares 1 % longer lower the slope by 10 mm/m. Measure the printed board, and "
+    "take the focal length from a source of its own, before trusting offset and slope."
+)
 
 _SAME_VIEW = "are the two images of the same view?"
 
@@ -216,8 +219,6 @@ class BoardImport:
         ratio = typical_ratio(views)
         refuse = partial(refuse_mixed_up, ratio=ratio)
         views = sieve.apply(refuse, views, lambda view: view.name, "comparing boards")
-        posed = [(self._corners[view.name], view.pose, view.error) for view in views]
-        degeneracy = study_degeneracy(posed, self._board, self._camera, options.depth_kind)
         warnings += agreement_warnings(views, ratio, options.depth_kind)
         return PreparedImport(
             views=[self._reported(view) for view in views],
@@ -230,8 +231,7 @@ class BoardImport:
                 saturation_amplitude=options.saturation_counts,
             ),
             camera=about_camera,
-            findings={"degeneracy": degeneracy},
-            warnings=[*warnings, degeneracy_warning(degeneracy)],
+            warnings=[*warnings, _DEGENERACY],
         )
 
     def _detect(self, view: str, refused: Refused) -> None:
@@ -405,72 +405,3 @@ def agreement_warnings(
             f"z into radial depth (0 expected): is depth really '{depth_kind}'?"
         )
     return warnings
-
-
-def study_degeneracy(
-    views: Sequence[tuple[np.ndarray, BoardPose, float]],
-    board: FlatBoard,
-    camera: CameraIntrinsics,
-    depth_kind: DepthKind,
-) -> dict[str, Any]:
-    """Estimate the poses again with other focal lengths and square lengths.
-
-    With a longer focal length the board is farther away, and its corners have almost the same
-    pixels; with longer squares exactly the same. Both look like a distance error proportional to
-    the distance.
-
-    Args:
-        views: Of each view the corners, the board's pose, and the median depth error, metres.
-        board: The board as given.
-        camera: The camera intrinsics used.
-        depth_kind: Kind of the views' depth errors.
-
-    Returns:
-        What `import.json` says of it: `as_given`, and `alternatives` that the corners cannot
-        exclude (shorter and longer focal length, larger squares).
-    """
-
-    def read_with(focal: float, square: float) -> dict[str, Any]:
-        (fx, skew, cx), (_, fy, cy), last = camera.matrix
-        other = replace(camera, matrix=((fx * focal, skew, cx), (0.0, fy * focal, cy), last))
-        larger = replace(board, square_length=board.square_length * square)
-        poses = [poses_of(corners, larger, other, pose.used)[0] for corners, pose, _ in views]
-        distances = np.array([distance(pose, larger) for pose in poses])
-        errors = np.array([error + distance(pose, board) for _, pose, error in views]) - distances
-        # Over less than 0.1 m a slope says nothing.
-        slope = None if np.ptp(distances) < _TENTH else np.polyfit(distances, 1000 * errors, 1)[0]
-        return {
-            "focal_factor": focal,
-            "square_factor": square,
-            "reprojection_rms_px": float(np.sqrt(np.mean([p.reprojection_rms**2 for p in poses]))),
-            "slope_mm_per_m": None if slope is None else float(slope),
-            "mean_error_mm": 1000 * float(errors.mean()),
-        }
-
-    def distance(pose: BoardPose, board: FlatBoard) -> float:
-        centre = pose.centre(board)
-        return float(centre[2] if depth_kind == "z" else np.linalg.norm(centre))
-
-    focal, square = _CHANGES
-    changes = ((1 - focal, 1.0), (1 + focal, 1.0), (1.0, 1 + square))
-    alternatives = [read_with(*change) for change in changes]
-    return {"as_given": read_with(1.0, 1.0), "alternatives": alternatives}
-
-
-def degeneracy_warning(found: dict[str, Any]) -> str:
-    """Return the result of `study_degeneracy` as a sentence with numbers."""
-
-    def said(one: dict[str, Any]) -> str:
-        slope = one["slope_mm_per_m"]
-        error = f"{one['reprojection_rms_px']:.3f} px and {one['mean_error_mm']:+.1f} mm"
-        return error if slope is None else f"{error}, slope {slope:+.1f} mm/m"
-
-    shorter, longer, larger = map(said, found["alternatives"])
-    focal, square = _CHANGES
-    return (
-        "A board cannot tell focal length, square length and slope of the distance error apart: "
-        f"reprojection error and mean depth error are {said(found['as_given'])}; with the focal "
-        f"length {focal:.0%} shorter {shorter}, longer {longer}; with squares {square:.0%} larger "
-        f"{larger}. Measure the printed board, and take the focal length from a source of its own, "
-        "before trusting offset and slope."
-    )
