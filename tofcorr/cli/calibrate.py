@@ -24,14 +24,8 @@ _TRAINING = "training.calibration:TrainingOptions"
 _EVALUATION = "comparison.options:EvaluationOptions"
 _SELECTION = "comparison.options:SelectionOptions"
 
-_PLANES = (
-    "Whether the recorded planes were measured (known) or are a start for the fit (unknown); auto: "
-    "as recording.yaml says."
-)
-_WALL = (
-    "What is known of the wall: nothing; that all frames show the same one and the robot's poses "
-    "are right; or its recorded plane."
-)
+_PLANES = "known: the planes were measured; unknown: a start; auto: as recording.yaml says."
+_WALL = "What is known: nothing; all frames show one wall, and poses are right; or its plane."
 _DRIFTED = "Offset or departure from a plane above which the camera counts as drifted."
 
 

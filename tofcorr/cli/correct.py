@@ -53,10 +53,8 @@ def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Pa
         if recording.raw is not None:
             left_out = "raw.npy was left out: it would disagree with the corrected depth."
             click.echo(left_out, err=True)
-        click.echo(
-            f"{out}: {recording.num_frames} frames corrected; {share:.1%} of the pixels with a "
-            "return lie in the calibrated range."
-        )
+        inside = f"{share:.1%} of the pixels with a return lie in the calibrated range"
+        click.echo(f"{out}: {recording.num_frames} frames corrected; {inside}.")
     if ply is not None:
         with _refused_by(model):
             write_point_clouds(corrector, recording, ply)
@@ -79,24 +77,19 @@ def _refuse_another_camera(
 ) -> None:
     """Refuse a recording that the corrector was not made for."""
     if metadata.depth_kind not in (recording.depth_kind, None):
-        raise CalibrationDataError(
-            f"{recording.path}: depth is of kind '{recording.depth_kind}', but {model} corrects "
-            f"'{metadata.depth_kind}'. Train on a recording of this camera and driver."
-        )
+        kinds = f"'{recording.depth_kind}', but {model} corrects '{metadata.depth_kind}'"
+        raise CalibrationDataError(f"{recording.path}: depth is of kind {kinds}: another camera?")
     camera, made_for = recording.camera, metadata.camera
     size = (made_for.width or camera.width, made_for.height or camera.height)
     if size != (camera.width, camera.height):
-        raise CalibrationDataError(
-            f"{recording.path}: frames are {camera.width}x{camera.height} pixels, but {model} "
-            f"was made for {size[0]}x{size[1]}."
+        said = (
+            f"{camera.width}x{camera.height} pixels, but {model} was made for {size[0]}x{size[1]}"
         )
+        raise CalibrationDataError(f"{recording.path}: frames are {said}.")
     lens = (made_for.K, made_for.distortion)
     if lens not in ((camera.matrix, camera.distortion), (None, None)):
-        click.echo(
-            f"Warning: {recording.path} has another lens calibration than {model} was made with; "
-            "the correction holds only if the camera and its lens are the same.",
-            err=True,
-        )
+        other = f"{recording.path} has another lens calibration than {model} was made with"
+        click.echo(f"Warning: {other}; does the same camera have the same lens?", err=True)
     if metadata.needs_amplitude:
         recording.require("amplitude", f"the corrector {model}")
 
@@ -126,9 +119,7 @@ def export_command(run: Path, name: str, out: Path, device: str) -> None:
 
     if device != "cpu" and not (FORMATS[name].for_device and torch.cuda.is_available()):
         compiled = " and ".join(one.name for one in FORMATS.values() if one.for_device)
-        raise ConfigError(
-            f"--device {device}: only {compiled} is for one device, and this machine must have it."
-        )
+        raise ConfigError(f"--device {device}: only for {compiled}, on a machine that has it.")
     _refuse_useless(run)
     state = load_calibration(run / STATE_FILE)
     export(name, DepthCorrector.from_state(state).to(device), out, state)
@@ -144,6 +135,5 @@ def _refuse_useless(run: Path) -> None:
         return
     report = json.loads(file.read_text(encoding="utf-8"))
     if report["verdict"] == DO_NOT_USE:
-        raise CalibrationDataError(
-            f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']} Train with --force, if so."
-        )
+        said = f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']}"
+        raise CalibrationDataError(f"{said} Train with --force, if so.")

@@ -18,10 +18,7 @@ _SENSOR = (
     "The camera: a shipped name such as kinect_v2, the report of a diagnosis, or its sensor.yaml."
 )
 _LIGHT = "What amplitude.npy of the ideal recording holds: the camera's units, or a share 0 to 1."
-_SIM = (
-    "Simulator under diagnosis: YAML file or shipped name of the built-in one, or a recording that "
-    "any other one rendered; without it a simulator is fitted to the recording."
-)
+_SIM = "YAML or shipped name of the built-in simulator, or a rendered recording; else: fitted."
 
 
 @click.command()
@@ -69,10 +66,8 @@ def degrade_command(sensor: str, recording_path: Path, out: Path, **given: Any) 
         done = degrade(sensor, recording_path, out, **given)
     for sentence in dict.fromkeys(str(warning.message) for warning in caught):
         click.echo(f"Warning: {sentence}", err=True)
-    click.echo(
-        f"{out}: {done.recording.num_frames} frames; {done.valid_share:.1%} of the pixels with a "
-        "true distance are valid."
-    )
+    valid = f"{done.valid_share:.1%} of the pixels with a true distance are valid"
+    click.echo(f"{out}: {done.recording.num_frames} frames; {valid}.")
 
 
 @click.command()

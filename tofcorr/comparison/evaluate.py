@@ -207,8 +207,7 @@ class EvaluationResult:
         return self._table(
             f"Table 2. Mean absolute error per pixel, mm, {folds}-fold cross-validation",
             [[one.name, *map(_interval, row)] for one, row in zip(self.sets, found, strict=True)],
-            f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t). Images of one pose stay "
-            "together.",
+            f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t).",
         )
 
     def _repeats_table(self, metric: str, kind: str) -> Table:
@@ -222,8 +221,7 @@ class EvaluationResult:
             f"Held-out RMS {kind}, mm, {repeats.number} random splits by pose, "
             f"{100 * repeats.test_fraction:.0f} % held out",
             rows,
-            "Mean ± standard deviation over the splits; the interval allows for their overlap "
-            "(Nadeau and Bengio 2003).",
+            "Mean ± standard deviation; the interval allows for the overlap of the splits.",
         )
 
     def _tests_table(self, protocol: str, metric: str) -> Table:
@@ -243,8 +241,7 @@ class EvaluationResult:
             f"Paired t-tests of held-out {name} on the {source}",
             ["set: first / second", "first − second, mm", "p", "verdict"],
             rows,
-            f"± 95 %, Student's t with {dof} degrees of freedom, two-sided, each test by itself; "
-            "all pairs are in evaluation.json.",
+            f"± 95 %, Student's t with {dof} degrees of freedom; all pairs: evaluation.json.",
         )
 
 

@@ -285,8 +285,6 @@ class ModelFitter:
             return with_every_wall(self.measured, found, model)
         unseen = set(found.of_frame[held_out].tolist()) - set(found.numbers.tolist())
         for wall in sorted(unseen):
-            self.warnings.append(
-                f"{name}: no training image shows the wall '{found.names[wall]}'; its "
-                "held-out images are judged against the recorded plane."
-            )
+            said = f"{name}: no training image shows the wall '{found.names[wall]}'"
+            self.warnings.append(f"{said}; its images are judged against the recorded plane.")
         return found.put_into(self._dataset)

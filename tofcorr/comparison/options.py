@@ -66,9 +66,7 @@ class ComparedModel(TrainingOptions):
             return values
         for key in DECIDED_BY_THE_COMPARISON:
             if key in values:
-                raise ValueError(
-                    f"'{key}' cannot differ from model to model; the comparison decides it for all"
-                )
+                raise ValueError(f"'{key}' cannot differ from model to model; set it beside them")
         if "config" not in values:
             return values
         if not isinstance(values["config"], str):
@@ -280,10 +278,8 @@ class SelectionOptions(ComparisonOptions):
             else:
                 found[by] = groups
         if not found:
-            raise CalibrationDataError(
-                f"{dataset.first.path}: no images can be held out to compare the models: "
-                + " ".join(skipped.values())
-            )
+            why = f"no images can be held out to compare the models: {' '.join(skipped.values())}"
+            raise CalibrationDataError(f"{dataset.first.path}: {why}")
         return found, skipped
 
     def _groups(self, dataset: Dataset, by: Grouping) -> dict[str, np.ndarray]:

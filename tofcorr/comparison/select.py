@@ -79,10 +79,8 @@ class SelectionResult:
         for by in others:
             ranking = self.rankings[by]
             if winner != ranking.winner and winner not in ranking.ties:
-                text += (
-                    f" With {by}s held out {ranking.winner} is better: {winner} is "
-                    f"{ranking.behind[winner].mean:.2f} mm behind the best there."
-                )
+                behind = f"{winner} is {ranking.behind[winner].mean:.2f} mm behind the best there"
+                text += f" With {by}s held out {ranking.winner} is better: {behind}."
         return text
 
     def __repr__(self) -> str:
@@ -129,9 +127,8 @@ class SelectionResult:
             *comparability_notes(self.options),
             *(f"Not held out by {by}: {why}" for by, why in self.experiment.skipped.items()),
             *(f"Warning: {warning}" for warning in self.experiment.warnings),
-            "Errors are distances to the plane, each pose held out once, mean over the poses ± one "
-            "standard error. Behind the best: paired difference, pose by pose, with its 95 % "
-            "interval.",
+            "Errors are distances to the plane, mean over the held-out poses ± one standard error. "
+            "Behind the best: paired difference, pose by pose, with its 95 % interval.",
         ]
         return "\n\n".join(parts)
 

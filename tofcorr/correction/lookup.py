@@ -49,9 +49,8 @@ class LookupTable:
             ValueError: The frame is of another size.
         """
         if depth.shape[-2:] != self.offset.shape or amplitude.shape != depth.shape:
-            raise ValueError(
-                f"expected the camera's {self.offset.shape}; got {depth.shape}, {amplitude.shape}."
-            )
+            got = f"{depth.shape}, {amplitude.shape}"
+            raise ValueError(f"expected the camera's {self.offset.shape}; got {got}.")
         validity = self.metadata["validity"]
         depth = np.where((depth > 0) & np.isfinite(depth), depth, np.float32(np.nan))
         radial = depth * self.radial_of_z

@@ -208,19 +208,16 @@ class CameraGeometry(nn.Module):
         for name, frame in given.items():
             refuse_other_than_tensor(name, frame)
             if not frame.dtype.is_floating_point:
-                raise FrameError(
-                    f"{name}: expected a floating-point type, got {frame.dtype}; convert to metres."
-                )
+                raise FrameError(f"{name}: expected floating-point metres, got {frame.dtype}.")
         size = list(self.radial_of_depth.shape)
         if depth.dim() < 2 or list(depth.shape[-2:]) != size:
+            got = f"got {list(depth.shape)}. Was the frame cropped, binned or transposed?"
             raise FrameError(
-                f"depth: expected shape (..., {size[0]}, {size[1]}), the size of the camera; got "
-                f"{list(depth.shape)}. Was the frame cropped, binned or transposed?"
+                f"depth: expected shape (..., {size[0]}, {size[1]}) of the camera; {got}"
             )
         if amplitude is not None and amplitude.shape != depth.shape:
-            raise FrameError(
-                f"amplitude: expected depth's shape {[*depth.shape]}, got {[*amplitude.shape]}."
-            )
+            shapes = f"expected depth's shape {[*depth.shape]}, got {[*amplitude.shape]}"
+            raise FrameError(f"amplitude: {shapes}.")
 
 
 class CalibratedRanges(nn.Module):

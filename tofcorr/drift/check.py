@@ -27,8 +27,7 @@ from tofcorr.progress import through
 
 # Why the equations of a check may have no solution, and what to do.
 _NO_SOLUTION = (
-    "poses, planes or depth are far off, or the frames hardly differ; see `tofcorr inspect`, or "
-    "use the plane of each image."
+    "poses, planes or depth are off, or frames hardly differ; use the plane of each image."
 )
 
 
@@ -76,12 +75,11 @@ def check(
     low, high = result.interval
     # A certain drift is refused if it is most likely beyond what any camera has.
     if abs(result.offset) > LARGEST_GAP and not low <= 0 <= high and not force:
-        raise CalibrationDataError(
-            f"{dataset.first.path}: the distances would be {1e3 * result.offset:+.0f} mm off, and "
-            f"no camera drifts by more than {1e3 * LARGEST_GAP:.0f} mm: check unit and kind of the "
-            "depth, the mask and the wall (`tofcorr inspect` shows more; --force, in Python "
-            "force=True, measures all the same)."
+        said = (
+            f"the distances would be {1e3 * result.offset:+.0f} mm off, and no camera drifts so far"
         )
+        advice = "check unit and kind of the depth, the mask and the wall, or add --force"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}: {advice} (Python: force=True).")
     result = replace(result, headline=headline or result.headline)
     if out is not None:
         text = json.dumps(result.to_mapping(), indent=1, allow_nan=False) + "\n"
@@ -119,10 +117,8 @@ def check_drift(
         known = known.model_copy(update={"noise": None})
     sums = OffsetSums(state, dataset, wall, known)
     if not list(through(sums.read(), "checking", total=dataset.num_frames)):
-        raise CalibrationDataError(
-            f"{dataset.first.path}: no image has {FEWEST_PIXELS} usable pixels on a wall within "
-            "the calibrated ranges of distance and amplitude; record a wall there."
-        )
+        said = f"no image has {FEWEST_PIXELS} usable pixels on a wall within the calibrated ranges"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}; record a wall there.")
     found = sums.estimate()
     low, high = found.value - found.half_width, found.value + found.half_width
     flatness = math.sqrt(np.mean([one.flatness**2 for one in found.images]))
@@ -147,19 +143,13 @@ def check_drift(
 def _headline(found: Offset) -> str | None:
     """Return what to say first of images that are not of one camera and one wall, or not of it."""
     if found.disagrees:
-        return (
-            f"Doubtful frames: they disagree with each other {found.disagreement:.1f} times as "
-            "much as those of the calibration: two cameras, walls that are not flat or elsewhere "
-            "than recorded, or wrong poses."
-        )
+        much = f"{found.disagreement:.1f} times as much as those of the calibration"
+        return f"Doubtful frames: they disagree {much}: two cameras, wrong poses, or bent walls?"
     # Warming up makes as much as other errors of a camera.
     if abs(found.value) <= max(CAMERA, found.half_width):
         return None
-    return (
-        f"Doubtful frames: they are {1e3 * abs(found.value):.0f} mm too "
-        f"{'far' if found.value > 0 else 'near'}, and cameras drift by millimetres: another "
-        "setting, a filter, another kind of depth, or another camera."
-    )
+    off = f"{1e3 * abs(found.value):.0f} mm too {'far' if found.value > 0 else 'near'}"
+    return f"Doubtful frames: they are {off}, and cameras drift by millimetres: another setting?"
 
 
 def _refuse_unfit(state: CalibrationState, dataset: Dataset, wall: Wall) -> None:
@@ -167,25 +157,16 @@ def _refuse_unfit(state: CalibrationState, dataset: Dataset, wall: Wall) -> None
     first, walls = dataset.first, np.unique(dataset.targets)
     reason = None
     if first.camera != state.camera or first.depth_kind != state.depth_kind:
+        size = f"{state.camera.width}x{state.camera.height} pixels, {state.depth_kind} depth"
         reason = (
-            "this is not the camera that was calibrated: expected "
-            f"{state.camera.width}x{state.camera.height} pixels, depth_kind {state.depth_kind} and "
-            "the same K and distortion."
+            f"this is not the camera that was calibrated: expected {size}, the same K and lens."
         )
     elif wall == "one" and not dataset.moves:
-        reason = (
-            "one wall seen from several poses needs a robot's poses in frames.csv, and there none "
-            "changes; use the plane per image, or the recorded one."
-        )
+        reason = "one wall needs a robot that moves, and no pose changes; use the wall per image."
     elif wall == "recorded" and dataset.planes_are_estimated:
-        reason = (
-            "the planes are estimated from the depth (recording.yaml: planes), so they cannot show "
-            "an offset of the camera; use the wall per image, or one wall."
-        )
+        reason = "the planes are estimated from the depth; use the wall per image, or one wall."
     elif wall == "one" and dataset.planes_are_estimated and len(walls) > 1:
-        reason = (
-            f"one wall is asked for, and the frames show {len(walls)} ({', '.join(walls)}); use "
-            "the wall per image."
-        )
+        shown = f"the frames show {len(walls)} ({', '.join(walls)})"
+        reason = f"one wall is asked for, and {shown}; use the wall per image."
     if reason is not None:
         raise CalibrationDataError(f"{first.path}: {reason}")

@@ -55,12 +55,8 @@ class DriftResult:
         low, high = known_interval(interval, most=2, sign="+")
         how = "Add frames at different distances and tilts."
         if self.wall == "per_image":
-            how = (
-                "A wall at an unknown place in each image shows an offset only by the bow that "
-                f"this gives to a plane, here to within {(interval[1] - interval[0]) / 2:.2g} mm. "
-                "Use a measured wall (wall: recorded), or one wall seen from known robot poses "
-                "(wall: one)."
-            )
+            bow = f"tells an offset to within {(interval[1] - interval[0]) / 2:.2g} mm"
+            how = f"A wall at an unknown place {bow}. Use a measured one, or one seen from poses."
         lines = [
             self.headline,
             _VERDICTS[self.verdict],
@@ -69,16 +65,13 @@ class DriftResult:
             f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",
             # Some are expected: the ranges are the central 99.8 % of the training pixels.
             self.outside > 1 / 10
-            and f"{100 * self.outside:.0f} % of the pixels lie outside the calibrated ranges and "
-            "were not used.",
+            and f"{100 * self.outside:.0f} % of the pixels, outside the ranges, were not used.",
             # Of views like the calibrated ones a twentieth counts as unlike.
             self.unlike > 1 / 2
-            and f"{100 * self.unlike:.0f} % of the images see the wall as no calibrated one did "
-            "(distance, tilt, place in the image): errors of such views were not measured, and "
+            and f"{100 * self.unlike:.0f} % of the images see the wall as no calibrated one did: "
             "the interval may be too narrow. Check at the views of the calibration.",
             not self.form_is_known
-            and "The run has no reference.json (an older version trained it): the interval takes "
-            "the form of its model as right, and is too narrow where that is wrong.",
+            and "The run has no reference.json: the interval takes the form of its model as right.",
             self.verdict == "undecided" and how,
         ]
         return "\n".join(line for line in lines if line)

@@ -125,9 +125,7 @@ class Domain:
             CalibrationDataError: No amplitudes are known.
         """
         if self.amplitude is None or self.normalised_amplitude is None:
-            raise CalibrationDataError(
-                "The intensity term needs amplitude.npy: record amplitudes, or choose other terms."
-            )
+            raise CalibrationDataError("An intensity term needs amplitude.npy; or choose others.")
         return max(self.amplitude.high * LOG_FLOOR, 1e-30)
 
     def interval(self, variable: Variable) -> Interval:
@@ -277,10 +275,8 @@ class DescribedModule(nn.Module):
         for key in dict.fromkeys([*own, *stored]):
             expected, found = own.get(key), stored.get(key)
             if found != json.loads(json.dumps(expected)):
-                raise StateError(
-                    f"{type(self).__name__}: the state is of another model: its '{key}' is {found}"
-                    f", not {expected}. Build the module as the saved one was built."
-                )
+                said = f"of another model: its '{key}' is {found}, not {expected}"
+                raise StateError(f"{type(self).__name__}: the state is {said}. Build it alike.")
 
     def register_interval(self, prefix: str, interval: Interval) -> None:
         """Keep `centre` and `half_width` of an interval, each behind a prefix, as such numbers."""
@@ -500,9 +496,8 @@ class ConditionTerm(Term):
         super().__init__(options, "condition", symbols)
         self.index: int = CONDITIONS.index(condition)
         if condition not in domain.conditions:
-            raise CalibrationDataError(
-                f"A term needs every frame's {condition.replace('_', ' ')}: add it to frames.csv."
-            )
+            name = condition.replace("_", " ")
+            raise CalibrationDataError(f"A term needs every frame's {name}: add it to frames.csv.")
         for name, number in zip(("low", "high", "mean"), domain.conditions[condition], strict=True):
             self.register_number(name, number)
 

@@ -148,10 +148,8 @@ def in_si_units(
             continue
         number = torch.as_tensor(value, device=device).to(dtype)
         if number.dim() and list(number.shape) != list(frames):
-            raise FrameError(
-                f"{column}: expected one number, or one for each frame, shape {list(frames)}; got "
-                f"shape {list(number.shape)}."
-            )
+            shapes = f"one for each frame, shape {list(frames)}; got {list(number.shape)}"
+            raise FrameError(f"{column}: expected one number, or {shapes}.")
         name = NAME_OF[column]
         known[name] = number * condition(name).si_per_unit
     return known

@@ -206,9 +206,7 @@ class Periodic(SignalTerm):
 
     def __init__(self, options: PeriodicOptions, domain: Domain) -> None:
         if domain.modulation_frequency is None:
-            raise CalibrationDataError(
-                "periodic needs modulation_frequency_hz: add it to recording.yaml, or use a spline."
-            )
+            raise CalibrationDataError("periodic needs modulation_frequency_hz in recording.yaml.")
         orders = [options.fundamental * k for k in range(1, options.harmonics + 1)]
         names = [f"{function}{order}" for order in orders for function in ("sin", "cos")]
         super().__init__(options, "distance", names)

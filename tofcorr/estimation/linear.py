@@ -473,8 +473,7 @@ def _of_effects(sums: GroupSums, noise: Tensor, precision: Tensor) -> tuple[Tens
 def solvable(
     path: Path,
     task: str,
-    reason: str = "the frames do not differ enough, or poses, planes or depth are far off; see "
-    "`tofcorr inspect`.",
+    reason: str = "frames hardly differ, or poses, planes or depth are off; see `tofcorr inspect`.",
 ) -> Iterator[None]:
     """Refuse a recording whose equations the block finds to have no solution.
 

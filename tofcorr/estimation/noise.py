@@ -189,9 +189,8 @@ def fit_noise(
     usable = torch.isfinite(differences) & torch.isfinite(amplitude) & (amplitude > 0)
     differences, amplitude = differences[usable], amplitude[usable]
     if len(differences) < _FEWEST_PER_BIN:
-        raise CalibrationDataError(
-            f"The noise needs more than {len(differences)} usable differences: {_FEWEST_PER_BIN}."
-        )
+        few = f"{len(differences)} usable differences of {_FEWEST_PER_BIN} needed"
+        raise CalibrationDataError(f"The noise cannot be estimated: {few}.")
     bins = brightness_bins(amplitude.numpy(), _FEWEST_PER_BIN)
     centre = np.array([float(amplitude[part].median()) for part in bins])
     spread = [
@@ -200,9 +199,7 @@ def fit_noise(
     ]
     variance = np.square(spread) / 2
     if not variance.min() > 0:
-        raise CalibrationDataError(
-            "The noise cannot be estimated: most pixels repeat: rounded, or copies of one frame?"
-        )
+        raise CalibrationDataError("The noise is unknown: most pixels repeat. Copies of one frame?")
     floor, shot, readout = fit_law(centre[:, None] ** [0.0, -1.0, -2.0], variance).tolist()
     return DistanceNoise(floor, shot, readout, source)
 

@@ -153,10 +153,8 @@ class Direction(NamedTuple):
         if self.correlation is None:
             return names[0]
         first_two = "" if len(names) == 2 else " of the first two"
-        return (
-            f"{', '.join(names[:-1])} and {names[-1]} together "
-            f"(corr{first_two} {self.correlation:+.2f})"
-        )
+        together = f"{', '.join(names[:-1])} and {names[-1]} together"
+        return f"{together} (corr{first_two} {self.correlation:+.2f})"
 
 
 class Observability(NamedTuple):

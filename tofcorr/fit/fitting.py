@@ -271,11 +271,9 @@ def _hold(problem: Problem, core: Core) -> Core:
     if prior is None:
         return core
     if problem.options.free_directions == "refuse":
-        raise CalibrationDataError(
-            f"The images do not determine: {'; '.join(prior.names)}. Add views tilted about two "
-            "axes and a wider range of distances, keep the recorded hand-eye transform "
-            "(hand_eye.estimate: no), or set free_directions: prior."
-        )
+        advice = "tilt views about two axes, at more distances, or set free_directions: prior"
+        names = "; ".join(prior.names)
+        raise CalibrationDataError(f"The images do not determine: {names}; {advice}.")
     objective = MomentObjective(moments, core.total_prior)
     return replace(core, solution=minimise(objective, core.start, problem.options.solver))
 
@@ -292,10 +290,8 @@ def refuse_diverged(parameters: Parameters) -> None:
     # of the digits wrong.
     if bool((off.abs() < torch.finfo(rotation.dtype).eps ** 0.5).all()):
         return
-    raise CalibrationDataError(
-        "The frames do not determine the hand-eye transform: its estimate grew without bounds. "
-        "Record more poses, near and far and tilted to all sides, or choose a model of fewer terms."
-    )
+    advice = "Record poses near and far and tilted to all sides, or choose a smaller model."
+    raise CalibrationDataError(f"The frames do not determine the hand-eye transform. {advice}")
 
 
 def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:

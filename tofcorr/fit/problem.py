@@ -126,19 +126,14 @@ def build_model(
     for term in options.terms:
         # Where the amplitude never changes, no coefficient of such a term is determined.
         if "amplitude" in term.needs and amplitude is not None and amplitude.low >= amplitude.high:
-            raise CalibrationDataError(
-                f"{dataset.first.path}: amplitude.npy holds {amplitude.low:g} in every pixel used, "
-                f"so it was not measured, and the term {term.kind} needs it. Remove the file and "
-                f"choose models without that term: {_DEPTH_ALONE}."
-            )
+            one = f"amplitude.npy holds {amplitude.low:g} in every pixel used, not measured ones"
+            said = f"{one}. Remove it, and choose models without {term.kind}: {_DEPTH_ALONE}."
+            raise CalibrationDataError(f"{dataset.first.path}: {said}")
     error = ErrorModel(options, domain)
     return error, Design(error, domain, dataset.ray_directions())
 
 
-_DEPTH_ALONE = (
-    "`tofcorr train --config e0` needs depth alone, and so do evaluate and select with "
-    "`--set 'models=[{config: e0}]'`"
-)
+_DEPTH_ALONE = "`--config e0` (evaluate, select: `--set 'models=[{config: e0}]'`) needs depth alone"
 
 
 def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
@@ -152,9 +147,8 @@ def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
             try:
                 dataset.require(name, f"the term {term.kind}")
             except CalibrationDataError as error:
-                raise CalibrationDataError(
-                    f"{error} Record it, or choose models without that term: {_DEPTH_ALONE}."
-                ) from None
+                advice = f"Record it, or choose models without that term: {_DEPTH_ALONE}."
+                raise CalibrationDataError(f"{error} {advice}") from None
 
 
 @dataclass(frozen=True)
@@ -260,9 +254,8 @@ class Shift(NamedTuple):
         """Return one sentence for the user about an error that the model lacks."""
         moved, turned = self.size
         return (
-            f"The residuals {self.words}: the model lacks a term. With one, the hand-eye transform "
-            f"would lie {1e3 * moved:.1f} mm and {1e3 * turned:.1f} mrad from this one. "
-            "Its standard errors are widened by that; `tofcorr diagnose` looks for the cause."
+            f"The residuals {self.words}: the model lacks a term, which moves the hand-eye by "
+            f"{1e3 * moved:.1f} mm and {1e3 * turned:.1f} mrad. `tofcorr diagnose` looks for it."
         )
 
     def to_mapping(self, rotation: Tensor) -> dict[str, Any]:

@@ -467,10 +467,8 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
     for name, width in (widths | {"random_variance": 3 + SHAPES, "views": 7}).items():
         numbers = getattr(found, name)
         if numbers is not None and numbers.shape[-1] != width:
-            raise CalibrationDataError(
-                f"{path}: '{name}' has shape {tuple(numbers.shape)}, expected {width} numbers in "
-                f"a row; {_ADVICE}"
-            )
+            said = f"'{name}' has shape {tuple(numbers.shape)}, expected {width} a row"
+            raise CalibrationDataError(f"{path}: {said}; {_ADVICE}")
     return found
 
 

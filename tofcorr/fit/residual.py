@@ -57,10 +57,8 @@ def fit_residual(
     if options.keep == "always" or p_value < LEVEL:
         network, best = _train(core, error, sample, domain, options)
     without, with_network = (1e3 * float(np.nanmean(row)) ** 0.5 for row in square)
-    words = (
-        f"The residual network was {'dropped' if network is None else 'kept'}: on held-out images "
-        f"{with_network:.2f} mm RMS with it, {without:.2f} mm without (p = {p_value:.3g})."
-    )
+    kept = f"The residual network was {'dropped' if network is None else 'kept'}: held-out images"
+    words = f"{kept} have {with_network:.2f} mm RMS, {without:.2f} without (p = {p_value:.3g})."
     return words, network, best
 
 

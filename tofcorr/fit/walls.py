@@ -92,10 +92,10 @@ def recorded_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Foun
     # A wall has three unknowns, and one image determines about three: fewer than three images
     # contribute little to the other unknowns.
     for place in np.flatnonzero(count < (1 if dataset.planes_are_estimated else 3))[:1]:
+        said = f"of each wall, '{names[numbers[place]]}' has {count[place]}"
+        advice = "(one target, and one plane in frames.csv). Record more, or measure that wall."
         raise CalibrationDataError(
-            f"{dataset.first.path}: planes: unknown needs at least 3 images of each wall, "
-            f"'{names[numbers[place]]}' has {count[place]}. Frames of one wall carry the same "
-            "target and the same nx, ny, nz, d in frames.csv; record more, or measure that wall."
+            f"{dataset.first.path}: planes: unknown needs at least 3 images {said} {advice}"
         )
     columns = "normal_world", "offset", "world_from_tool"
     normal, offset, pose = (dataset.column(name)[frames] for name in columns)

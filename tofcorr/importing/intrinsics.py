@@ -52,10 +52,8 @@ class GivenIntrinsics:
         own, (width, height) = self.size or size, size
         if own != size:
             advice = " Are they turned? Add --rotate 90 or --rotate 270 (import frames, rosbag)."
-            raise CalibrationDataError(
-                f"{self.source}: the intrinsics hold for {own[0]}x{own[1]} pixels, the images have "
-                f"{width}x{height}.{advice * (own == (height, width))}"
-            )
+            said = f"the intrinsics hold for {own[0]}x{own[1]} pixels, images have {width}x{height}"
+            raise CalibrationDataError(f"{self.source}: {said}.{advice * (own == (height, width))}")
         camera = CameraIntrinsics(
             width=width, height=height, matrix=self.matrix, distortion=self.distortion
         )

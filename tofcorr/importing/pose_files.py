@@ -72,9 +72,9 @@ def _guessed_format(path: Path) -> str:
         raise CalibrationDataError(f"{path}: expected poses, found none.")
     number, fields = lines[0]
     if len(fields) not in (4, 8, 12, 13, 16, 17):
+        said = f"line {number} has {len(fields)} numbers"
         raise CalibrationDataError(
-            f"{path}: line {number} has {len(fields)} numbers; expected 8 (TUM: time, translation, "
-            "quaternion x y z w), 12 or 16 (a matrix), or a header row (CSV)."
+            f"{path}: {said}; expected 8 (TUM), 12, 16 (matrices) or a header."
         )
     return "tum" if len(fields) == 8 else "matrices"
 
@@ -100,8 +100,7 @@ def rigid_transforms(
         said = (
             "the quaternion x y z w has length {:.4g}; expected 1."
             if of_quaternions
-            else "rx, ry, rz are read as an axis times radians, and the angle is {:.4g}; degrees, "
-            "or Euler angles, must be turned into quaternions qx, qy, qz, qw."
+            else "rx, ry, rz are read as an axis times radians, here {:.4g}; give quaternions."
         )
         raise CalibrationDataError(f"{where(place)}: {said.format(length[place])}")
     transforms = np.tile(np.eye(4), (len(rotation), 1, 1))

@@ -52,12 +52,9 @@ _SUSPICIOUS_MM = 20.0
 leaves."""
 
 _OF_POSES = {
-    "inverted": "their inverses: are the poses those of the base in the tool (--base-frame and "
-    "--tool-frame exchanged), or is --eye-to-hand missing or too much?",
-    "quaternions": "quaternions read as w x y z: write them as x y z w, or in a CSV whose header "
-    "names qw, qx, qy, qz.",
-    "rotations": "rotations inverted and translations as they are: are the matrices written column "
-    "by column, or the quaternions those of the inverse?",
+    "inverted": "their inverses: exchange --base-frame and --tool-frame, or change --eye-to-hand?",
+    "quaternions": "quaternions read as w x y z: write them as x y z w, or in a CSV with a header.",
+    "rotations": "rotations inverted and translations as they are: of matrices by columns?",
 }
 """What undoes usual mistakes in poses, and advice."""
 
@@ -269,12 +266,9 @@ class PosedImport:
             raise CalibrationDataError(f"{said} and by {left[best]:.0f} mm with {best}")
         if given is None:
             return []
-        return [
-            f"{len(np.unique(given.image))} of {len(chosen.images)} images show a wall, and planes "
-            f"are off by {before:.0f} mm (one on no wall counts {farthest:.0f}); up to "
-            f"{_SUSPICIOUS_MM:.0f} are expected. Do images and poses belong together, and are "
-            "there large walls in view?"
-        ]
+        seeing = f"{len(np.unique(given.image))} of {len(chosen.images)} images show a wall"
+        off = f"planes are off by {before:.0f} mm, up to {_SUSPICIOUS_MM:.0f} are expected"
+        return [f"{seeing}, and {off}. Do images and poses belong together?"]
 
     def _mistakes_undone(self, chosen: Chosen) -> Iterator[tuple[str, float]]:
         """Yield what undoes each usual mistake, with advice, and the misfit that it leaves."""
@@ -354,10 +348,8 @@ class PosedImport:
             if fits.sum() >= max(4, off.sum() / 2):
                 first, last = (self._source.names[k] for k in chosen.images[fits][[0, -1]])
                 which = f"{fits.sum()} of {seeing.sum()} images, '{first}' to '{last}'"
-                raise CalibrationDataError(
-                    f"{self._source.origin}: {which}, lie on the walls with the poses shifted by "
-                    f"{shift:+d}: was an image or a pose dropped before '{first}'?"
-                )
+                said = f"{which}, lie on the walls with the poses shifted by {shift:+d}"
+                raise CalibrationDataError(f"{self._source.origin}: {said}: was an image dropped?")
 
     def _refined(self, lag: Lag, moving: np.ndarray, found: FoundWalls) -> Lag:
         """Refine the lag on images that were taken while the tool moved, 200 of them.
@@ -473,10 +465,8 @@ def _refuse_impossible_poses(world_from_tool: np.ndarray, origin: str) -> None:
     extent = float(np.linalg.norm(np.ptp(world_from_tool[:, :3, 3], axis=0)))
     turned = float(np.abs(world_from_tool[:, :3, :3] - world_from_tool[0, :3, :3]).max())
     if extent > _FARTHEST:
-        raise CalibrationDataError(
-            f"{origin}: the tool moves over {extent:.4g} m. Are the translations in millimetres? "
-            "Expected metres (in CSV, columns tx_mm, ty_mm, tz_mm are scaled)."
-        )
+        said = f"the tool moves over {extent:.4g} m"
+        raise CalibrationDataError(f"{origin}: {said}. Are the translations in millimetres?")
     if 1000 * max(extent, turned) < 1:
         raise CalibrationDataError(f"{origin}: all poses are the same to {1000 * extent:.2g} mm.")
 
@@ -496,11 +486,8 @@ def _lag_warnings(lag: Lag) -> list[str]:
     if abs(lag.seconds) < max(3 * lag.standard_error, _LAG_OF_STOPS / 4):
         return []
     when = "late" if lag.seconds > 0 else "early"
-    return [
-        f"Images are stamped {1000 * abs(lag.seconds):.0f} ± {2000 * lag.standard_error:.0f} ms "
-        f"{when} against the poses; this lag was removed. Add --lag-s 0 to keep the stamps as they "
-        "are."
-    ]
+    size = f"{1000 * abs(lag.seconds):.0f} ± {2000 * lag.standard_error:.0f} ms {when}"
+    return [f"Images are stamped {size} against the poses; --lag-s 0 does not remove this lag."]
 
 
 def _contradiction(known: np.ndarray | None, found: np.ndarray) -> list[str]:
@@ -518,7 +505,5 @@ def _contradiction(known: np.ndarray | None, found: np.ndarray) -> list[str]:
     shift, turn = se3.apart(torch.as_tensor(known), torch.as_tensor(found))
     if 1000 * shift < 50 and math.degrees(turn) < 3:
         return []
-    return [
-        f"The walls fit best with the camera {1000 * shift:.0f} mm and {math.degrees(turn):.1f} "
-        "degrees away from where its poses place it. Are the poses those of the depth camera?"
-    ]
+    away = f"{1000 * shift:.0f} mm and {math.degrees(turn):.1f} degrees away from its poses"
+    return [f"The walls fit best with the camera {away}. Are they those of the depth camera?"]

@@ -76,9 +76,8 @@ class Sieve:
                 self.refused[name(view)] = str(refusal)
         if not results:
             first = next(iter(self.refused.values()), "there are none")
-            raise CalibrationDataError(
-                f"{self._source}: none of {len(self.refused)} views can be imported: {first}."
-            )
+            none = f"none of {len(self.refused)} views can be imported"
+            raise CalibrationDataError(f"{self._source}: {none}: {first}.")
         return results
 
 

@@ -275,9 +275,7 @@ class DepthCorrection(FrameCorrection):
         with zipfile.ZipFile(path) as archive:
             is_scripted = any("/code/" in name for name in archive.namelist())
         if is_scripted:
-            raise CalibrationDataError(
-                f"{path}: holds nothing to fit: use torch.jit.load, or load the run folder."
-            )
+            raise CalibrationDataError(f"{path}: holds nothing to fit: use torch.jit.load.")
         values = read_values(path, FORMAT)
         if values is None:
             return cls._from_calibration(load_calibration(path), None)
@@ -337,10 +335,8 @@ class DepthCorrection(FrameCorrection):
     def extra_repr(self) -> str:
         """Return the model's name, image size, depth kind and range, for printing."""
         low, high = self.domain.radial_distance
-        return (
-            f"{self.options.name}, {self.camera.height}x{self.camera.width} pixels, "
-            f"{self.depth_kind} depth, {low:.2f} to {high:.2f} m"
-        )
+        size = f"{self.camera.height}x{self.camera.width} pixels"
+        return f"{self.options.name}, {size}, {self.depth_kind} depth, {low:.2f} to {high:.2f} m"
 
     def _set_labels(self, labels: Labels) -> None:
         """Set what the module says of itself, and the buffers that follow from it."""
@@ -412,10 +408,8 @@ class DepthCorrection(FrameCorrection):
         options = load_options(TrainingOptions, config) if config.is_file() else None
         state = load_calibration(folder / STATE_FILE)
         if options is not None and not state.error_model.same_coefficients(options.model):
-            raise CalibrationDataError(
-                f"{config}: its model has other terms than {STATE_FILE} beside it; it was changed, "
-                "or its copy was cut short. Copy it again; or remove it: fits then use defaults."
-            )
+            said = f"has other terms than {STATE_FILE} beside it. Copy it again, or remove it"
+            raise CalibrationDataError(f"{config}: {said}: defaults then hold.")
         return cls._from_calibration(state, options)
 
     @classmethod
@@ -451,10 +445,8 @@ def _untrained(options: TrainingOptions, domain: Domain) -> ErrorModel:
     try:
         error = ErrorModel(options.model, domain)
     except CalibrationDataError as missing:
-        raise CalibrationDataError(
-            f"{missing} For a DepthCorrection, pass ranges=recording, or ranges=Domain(...) with "
-            "the missing entry."
-        ) from None
+        advice = "For a DepthCorrection, pass ranges=recording, or a Domain with the missing entry."
+        raise CalibrationDataError(f"{missing} {advice}") from None
     if options.residual is not None:
         error.residual = ResidualNetwork(options.residual.network, domain)
     return error
@@ -483,10 +475,8 @@ def resolve_domain(ranges: Domain | Recordings | None, camera: CameraIntrinsics)
         ConfigError: `camera` is something else, such as the recording.
     """
     if not isinstance(camera, CameraIntrinsics):
-        raise ConfigError(
-            f"camera: expected a tofcorr.CameraIntrinsics, got {type(camera).__name__}. A "
-            "recording holds its own: tofcorr.Recording.open(FOLDER).camera."
-        )
+        got = f"expected a CameraIntrinsics, got {type(camera).__name__}"
+        raise ConfigError(f"camera: {got}. A recording holds its own, as recording.camera.")
     if ranges is None or isinstance(ranges, Domain):
         return replace(ranges or _USUAL, height=camera.height, width=camera.width)
     dataset = open_dataset(ranges, camera)
@@ -502,10 +492,8 @@ def open_dataset(recordings: Recordings, camera: CameraIntrinsics) -> Dataset:
     dataset = Dataset(opened(recordings))
     found = dataset.first.camera
     if found != camera:
-        raise CalibrationDataError(
-            f"{dataset.first.path}: is of the camera {found}, the module was built for {camera}. "
-            "Build DepthCorrection(recording.camera)."
-        )
+        said = f"is of the camera {found}, the module was built for {camera}"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}. Build it with recording.camera.")
     return dataset
 
 

@@ -385,15 +385,11 @@ class Workspace:
             ConfigError: A number is out of range.
         """
         if not 0 < self.nearest < self.farthest:
-            raise ConfigError(
-                f"The distances {self.nearest:g} to {self.farthest:g} m are not an interval in "
-                "front of the camera."
-            )
+            ends = f"{self.nearest:g} to {self.farthest:g} m"
+            raise ConfigError(f"The distances {ends} are no interval in front of the camera.")
         if not 0 < self.tilt_deg < _STEEPEST_INCIDENCE_DEG:
-            raise ConfigError(
-                f"The tilt of {self.tilt_deg:g} degrees is not between 0 and "
-                f"{_STEEPEST_INCIDENCE_DEG:g}."
-            )
+            most = f"between 0 and {_STEEPEST_INCIDENCE_DEG:g}"
+            raise ConfigError(f"The tilt of {self.tilt_deg:g} degrees is not {most}.")
 
     @property
     def log_dark(self) -> float:
@@ -476,10 +472,7 @@ def plan_poses(
         np.random.default_rng(seed),
     )
     if pool is None:
-        raise ConfigError(
-            "No view between the given distances lies on the wall: allow shorter distances, less "
-            "tilt, or give the wall's size."
-        )
+        raise ConfigError("No view lies on the wall: allow shorter distances, or less tilt.")
     domain = _domain(camera, workspace)
     design = Design(ErrorModel(model, domain), domain, rays)
     # An image counts for so many independent pixels: they share the errors of pose and target. Set

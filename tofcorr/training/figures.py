@@ -116,11 +116,9 @@ def error_picture(images: Images, titles: Sequence[str]) -> tuple[np.ndarray, st
     picture = np.concatenate([first, free, second, free, third], axis=1)
     factor = -(-600 // picture.shape[1])
     rows = "\n".join(f"{n}. {title.replace(chr(10), ', ')}" for n, title in enumerate(titles, 1))
-    words = (
-        f"Errors along the ray: blue too near, red too far, grey not used. Left: before, up to "
-        f"{columns[1][1]:.1f} mm. Middle: after, the same scale. Right: after, up to "
-        f"{columns[2][1]:.2f} mm. From top to bottom:\n\n{rows}"
-    )
+    scales = f"Left: before, up to {columns[1][1]:.1f} mm; middle: after; right: after, up to"
+    scales += f" {columns[2][1]:.2f} mm. From top to bottom:\n\n{rows}"
+    words = f"Errors along the ray: blue too near, red too far, grey not used. {scales}"
     return picture.repeat(factor, axis=0).repeat(factor, axis=1), words
 
 

@@ -70,10 +70,8 @@ def left_out_words(frames: Sequence[int]) -> list[str]:
     if not frames:
         return []
     verb = "is" if len(frames) == 1 else "are"
-    return [
-        f"{in_words(tuple(frames)).capitalize()} {verb} left out of all fits and of the errors, as "
-        "in a training: poses, planes or images disagree with all others."
-    ]
+    which = f"{in_words(tuple(frames)).capitalize()} {verb} left out of all fits and errors"
+    return [f"{which}: poses, planes or images disagree with all others."]
 
 
 def left_out_mapping(frames: Iterable[int], inspection: Inspection) -> list[dict[str, Any]]:
@@ -163,16 +161,14 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
     if fit.walls is not None and fit.gain < 2 / 3:
         yield (
             DO_NOT_USE,
-            f"Where 1 m is measured, the fit leaves {fit.gain:.2f} m: from few poses, or at one "
-            "distance, errors that grow with the distance cannot be told from a nearer wall. "
-            "Record poses nearer and farther, or measure the wall's plane.",
+            f"Where 1 m is measured, the fit leaves {fit.gain:.2f} m. Record poses nearer and "
+            "farther, or measure the wall's plane.",
         )
     # No model can foresee noise: below a tenth of it a fit has collapsed.
     if not fitted >= noise / 10 and math.isfinite(noise):
         yield (
             DO_NOT_USE,
-            f"The fit leaves {fitted:.2g} mm where one pixel has {noise:.1f} mm of noise: too few "
-            "different frames, so that the model could take every point to the camera.",
+            f"The fit leaves {fitted:.2g} mm of {noise:.1f} mm noise: too few different frames.",
         )
     if held_out > _WORSE * bare:
         yield DO_NOT_USE, f"{measured}: the depth correction makes them worse."
@@ -198,6 +194,7 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
         yield "usable" if max(fit.misfit.size) > _WEAK else "good", fit.misfit.lacking()
     if not solution.converged and solution.stopped != "not_finite":
         yield "usable", solution.message
+    wide = 1e3 * PRIOR_SIGMA
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
     weak = [one for one in fit.observability.directions if one.sigma > _WEAK]
     of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
@@ -205,9 +202,8 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
     if undetermined := [one.in_words() for one in others if one.is_undetermined]:
         yield (
             "usable" if free else "good",
-            f"The images do not determine {'; '.join(undetermined)}: a prior of "
-            f"{1e3 * PRIOR_SIGMA:g} mm and {1e3 * PRIOR_SIGMA:g} mrad around the starting guess is "
-            "used instead. Record more tilts and distances.",
+            f"The images do not determine {'; '.join(undetermined)}: a prior of {wide:g} mm and "
+            f"{wide:g} mrad is used instead. Record more tilts and distances.",
         )
     if uncertain := [one for one in others if not one.is_undetermined]:
         of_hand_eye = any(name.startswith(("t_", "w_")) for one in uncertain for name in one.shares)
@@ -222,15 +218,14 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
         if max(shift, turn) > _WEAK:
             yield (
                 "usable",
-                f"The hand-eye transform is known to {1e3 * shift:.1f} mm and {1e3 * turn:.1f} "
-                "mrad only, along its worst axes: record more tilts and distances.",
+                f"The hand-eye is known to {1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only: "
+                "record more tilts and distances.",
             )
     if of_curves:
         yield (
             "good",
-            "Parts of the curves are set by the smoothing penalty, not by data, with standard "
-            f"deviations of up to {1e3 * max(of_curves):.0f} mm: the recording does not hold those "
-            "combinations of distance and amplitude.",
+            "Parts of the curves are set by the smoothing penalty, not by data: their standard "
+            f"deviations reach {1e3 * max(of_curves):.0f} mm.",
         )
 
 
@@ -247,11 +242,8 @@ def beyond_noise(held_out: float | None, noise: float) -> str | None:
     beyond = math.sqrt(max((held_out or 0.0) ** 2 - noise**2, 0.0))
     if not beyond > max(1.5, 0.6 * noise):
         return None
-    return (
-        f"Held-out frames are off by {beyond:.1f} mm beyond the noise of their pixels: poses or "
-        "planes scatter so much, or the camera has an error that this model lacks, which may move "
-        "the hand-eye transform by more than its standard errors; `tofcorr diagnose` tells which."
-    )
+    off = f"Held-out frames are off by {beyond:.1f} mm beyond the noise of their pixels"
+    return f"{off}: poses scatter, or the model lacks a term; `tofcorr diagnose` tells which."
 
 
 def report_text(report: Mapping[str, Any], most_warnings: int = 5) -> str:
@@ -273,10 +265,9 @@ def report_text(report: Mapping[str, Any], most_warnings: int = 5) -> str:
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
     if advice := report["advice"]:
-        lines.append(
-            f"The largest standard error is {advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad), "
-            f"of {report['observability']['weakest'][0]['direction']}. To lower it, add:"
-        )
+        largest = f"{advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad)"
+        direction = report["observability"]["weakest"][0]["direction"]
+        lines.append(f"The largest standard error is {largest}, of {direction}. To lower it, add:")
         lines += [
             f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
             f"deg, rolled by {pose['roll_by_deg']:+.0f}: then {pose['worst_sigma_mm_or_mrad']:.2f}"

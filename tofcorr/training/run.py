@@ -80,10 +80,7 @@ def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
     """
     state = load_calibration(Path(run) / STATE_FILE)
     if not state.error_model.same_coefficients(options.model):
-        raise ConfigError(
-            f"{run}: its model has other terms than the configuration asks for; resume with the "
-            "configuration of that run, its config.yaml."
-        )
+        raise ConfigError(f"{run}: its model has other terms; resume with its own config.yaml.")
     return Parameters(state.tool_from_camera, state.coefficients, state.hand_eye_estimated)
 
 

@@ -77,11 +77,8 @@ def hardly_tilted(support: Support) -> str | None:
     strong, _ = support.tilt_deg
     if strong >= _ENOUGH_TILT:
         return None
-    return (
-        f"The camera is hardly tilted against the wall (standard deviation {strong:.1f} degrees, "
-        f"{_ENOUGH_TILT} needed on two axes): the model's form decides translation along the "
-        "wall, rotation about its normal, and how much of a constant is c0 and how much t_z."
-    )
+    needed = f"(standard deviation {strong:.1f} degrees, {_ENOUGH_TILT} needed on two axes)"
+    return f"The camera is hardly tilted {needed}: the hand-eye rests on the model's form."
 
 
 def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list[str]:
@@ -98,26 +95,18 @@ def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list
         roll = support.roll_deg or 0.0
         # More makes up for tilt about one axis only.
         hint = "" if roll > 10 else f" and hardly rolled ({roll:.1f} degrees)"
-        found.append(
-            f"The camera is tilted about one axis only (standard deviation {strong:.1f} and "
-            f"{weak:.1f} degrees, {_ENOUGH_TILT} needed on both){hint}: translation along "
-            "that axis is unknown; tilt about the other one, or roll the camera."
-        )
+        needed = f"(standard deviation {strong:.1f} and {weak:.1f} degrees, {_ENOUGH_TILT} needed)"
+        found.append(f"The camera is tilted about one axis only {needed}{hint}: tilt or roll it.")
     low, high = support.distance_m
     # Below half of its centre the distance term can hardly be separated from the constant.
     if high - low < (high + low) / 4:
-        found.append(
-            f"The range of distances is narrow ({low:.2f} to {high:.2f} m): the distance "
-            "polynomial's coefficients hold in that range only, and its constant cannot be "
-            "separated from t_z; add nearer and farther views."
-        )
+        ends = f"({low:.2f} to {high:.2f} m): c0 cannot be separated from t_z"
+        found.append(f"The range of distances is narrow {ends}; add nearer and farther views.")
     ratio = support.reflectivity_ratio
     if with_intensity and ratio is not None and ratio < ENOUGH_REFLECTIVITY:
+        needed = f"(bright to dark {ratio:.1f} to 1, {ENOUGH_REFLECTIVITY} to 1 needed)"
         found.append(
-            f"The target has one reflectivity (bright to dark {ratio:.1f} to 1, "
-            f"{ENOUGH_REFLECTIVITY} to 1 needed): the amplitude is nearly a function of "
-            "distance and place, so the intensity term cannot be separated from the distance term; "
-            "add a checkerboard or a grey wall."
+            f"The target has one reflectivity {needed}: add a checkerboard or a grey wall."
         )
     return found
 

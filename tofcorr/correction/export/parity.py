@@ -58,11 +58,8 @@ def require_parity(correct: Correct, state: CalibrationState, tolerance: float =
     # What is missing on both sides does not differ; what is missing on one was counted.
     largest = float((corrected.double() - expected).abs().nan_to_num(0.0, 0.0).max())
     if largest > tolerance or mistaken:
-        raise ExportError(
-            f"The exported corrector differs from the float64 model by {largest:.1e} m "
-            f"({tolerance:.0e} m allowed) and in the validity of {mistaken} of "
-            f"{depth.numel()} pixels; nothing was written."
-        )
+        said = f"by {largest:.1e} m ({tolerance:.0e} m allowed), and {mistaken} pixels in validity"
+        raise ExportError(f"The export differs from the float64 model {said}; nothing was written.")
 
 
 def _around(

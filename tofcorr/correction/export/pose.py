@@ -37,11 +37,8 @@ class Mount:
 
     def __init__(self, state: CalibrationState, format_name: str) -> None:
         if not state.hand_eye_estimated:
-            raise ConfigError(
-                f"The {format_name} export needs an estimated hand-eye transform. The calibration "
-                f"{state.name} has none: its recording has no robot poses, or its configuration "
-                "says hand_eye.estimate: no. Train on a recording with the robot's poses."
-            )
+            said = f"{format_name} needs an estimated hand-eye transform, and {state.name} has none"
+            raise ConfigError(f"{said}: train on a recording with robot poses.")
         self.frames, self.accuracy = state.frames, state.hand_eye_accuracy
         self.transform = state.tool_from_camera.detach().cpu().double().numpy()
         self.translation: list[float] = self.transform[:3, 3].tolist()
@@ -69,15 +66,11 @@ class Mount:
             return [*lines, "Standard errors are unknown."]
         translation = " ".join(f"{value:.3f}" for value in self.accuracy.translation_se_mm)
         rotation = " ".join(f"{value:.4f}" for value in self.accuracy.rotation_se_deg)
-        lines.append(
-            f"Standard errors along x y z of '{parent}': {translation} mm; "
-            f"about them: {rotation} deg."
-        )
+        errors = f"{translation} mm; about them: {rotation} deg"
+        lines.append(f"Standard errors along x y z of '{parent}': {errors}.")
         if self.accuracy.undetermined:
-            lines.append(
-                "NOT DETERMINED by the recording (t along, w about the camera's axes), and not in "
-                f"the standard errors: {'; '.join(self.accuracy.undetermined)}."
-            )
+            lacking = "; ".join(self.accuracy.undetermined)
+            lines.append(f"NOT DETERMINED, nor in the standard errors: {lacking} (camera's axes).")
         return lines
 
     def comment(self) -> str:

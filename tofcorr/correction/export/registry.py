@@ -38,10 +38,8 @@ class Format:
         """
         missing = [name for name in self.packages if find_spec(name) is None]
         if missing:
-            raise ConfigError(
-                f"The {self.name} export needs {' and '.join(missing)}: "
-                f"pip install 'tofcorr[{self.extra}]'."
-            )
+            extra = f"pip install 'tofcorr[{self.extra}]'"
+            raise ConfigError(f"The {self.name} export needs {' and '.join(missing)}: {extra}.")
 
 
 _ONNX = ("onnx", "onnxscript", "onnxruntime")

@@ -238,10 +238,7 @@ def read_board(text: str) -> dict[str, Any]:
     number, word = r"(\d+)", "(?::([^:]+))?"
     match = re.fullmatch(f"(?:({'|'.join(BOARDS)}):)?{number}[xX]{number}{word}{word}", text)
     if match is None or (match[1] in (None, Board.kind) and match[4] is not None):
-        raise ConfigError(
-            f"expected inner corners such as 5x7, or charuco:5x7:4X4_50:0.75 or "
-            f"apriltag:6x6:APRILTAG_36H11:0.3, got '{text[:60]}'."
-        )
+        raise ConfigError(f"expected 5x7, charuco:5x7:4X4_50:0.75 or the like, got '{text[:60]}'.")
     keys = ("board_kind", "board_columns", "board_rows", "board_dictionary", "board_share")
     return dict(zip(keys, (match[1] or Board.kind, *match.groups()[1:]), strict=True))
 

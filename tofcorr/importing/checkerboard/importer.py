@@ -358,9 +358,8 @@ def typical_ratio(views: Sequence[BoardView]) -> float:
     """
     ratio = float(np.median([view.ratio for view in views]))
     if not 0.5 < ratio < 2:
-        raise CalibrationDataError(
-            f"the depth is {ratio:.3g} times the board's distance; correct its unit or the square."
-        )
+        said = f"depth is {ratio:.3g} times the board's distance"
+        raise CalibrationDataError(f"{said}; correct its unit or the square.")
     return ratio
 
 
@@ -371,9 +370,8 @@ def refuse_mixed_up(view: BoardView, ratio: float) -> BoardView:
         RefusedViewError: Depth and infrared image are not of the same view, or the pose is wrong.
     """
     if abs(view.ratio / ratio - 1.0) > _TENTH:
-        raise RefusedViewError(
-            f"the depth is {view.ratio:.3f} times the distance, elsewhere {ratio:.3f}; {_SAME_VIEW}"
-        )
+        said = f"the depth is {view.ratio:.3f} times the distance, elsewhere {ratio:.3f}"
+        raise RefusedViewError(f"{said}; {_SAME_VIEW}")
     return view
 
 
@@ -387,10 +385,8 @@ def agreement_warnings(
     """
     warnings = []
     if abs(ratio - 1.0) > _TENTH / 2:
-        warnings.append(
-            f"Depth reads {100 * (ratio - 1):+.1f} % against the board: check the square length, "
-            "the focal length and the unit of depth before calling it a distance error."
-        )
+        off = f"Depth reads {100 * (ratio - 1):+.1f} % against the board"
+        warnings.append(f"{off}: are square length, focal length and the unit of depth right?")
     moments = np.sum([view.kind_moments for view in views], axis=0)
     # After removing constant and D, D (1 - cosine) must vary by more than the camera's own error,
     # some millimetres, to estimate its slope.
@@ -400,8 +396,6 @@ def agreement_warnings(
         return warnings
     slope = float(np.linalg.solve(moments[:3, :3], moments[:3, 3])[2])
     if abs(slope) > 0.5:
-        warnings.append(
-            f"Away from the image centre the depth error grows with {slope:+.2f} of what turns "
-            f"z into radial depth (0 expected): is depth really '{depth_kind}'?"
-        )
+        said = f"the depth error grows with {slope:+.2f} of what turns z into radial depth"
+        warnings.append(f"Off the centre {said} (0 expected): is depth really '{depth_kind}'?")
     return warnings

@@ -119,10 +119,10 @@ def estimate_pose(
         used = inliers
         best, *others = poses_of(corners, board, camera, used)
     if not best.reprojection_rms <= max_reprojection:
-        raise RefusedViewError(
-            f"the corners miss the board by {best.reprojection_rms:.2f} px (root mean square), "
-            f"{max_reprojection:g} px are allowed; is the image blurred or the board bent?"
+        missed = (
+            f"{best.reprojection_rms:.2f} px (root mean square), {max_reprojection:g} are allowed"
         )
+        raise RefusedViewError(f"the corners miss the board by {missed}; is it bent, or blurred?")
     for other in others:
         # Poses whose normals differ by less than 3 degrees are the same pose.
         same = best.plane()[0] @ other.plane()[0] > np.cos(np.radians(3))
@@ -225,11 +225,9 @@ def calibrate(
 def calibration_warning(camera: CameraIntrinsics, about: dict[str, Any]) -> str:
     """Return a sentence on how the uncertainty of the focal length affects distances."""
     focal_length, deviation = camera.matrix[0][0], about["standard_deviations"][0]
-    return (
-        f"The focal length calibrated from {about['views']} views is {focal_length:.1f} ± "
-        f"{deviation:.1f} px (one standard deviation): the distance error's slope is uncertain by "
-        f"{1000 * deviation / focal_length:.1f} mm/m."
-    )
+    slope = 1000 * deviation / focal_length
+    found = f"The focal length of {about['views']} views is {focal_length:.1f} ± {deviation:.1f} px"
+    return f"{found}: the distance error's slope is uncertain by {slope:.1f} mm/m."
 
 
 def _solve(
@@ -258,11 +256,8 @@ def _solve(
     cosines = np.clip(normals @ mean / np.linalg.norm(mean), -1.0, 1.0)
     tilt = float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2))))
     if not (sound and sane.all()) or tilt < _SMALLEST_TILT_DEG:
-        raise CalibrationDataError(
-            f"the board's tilts vary by {tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed), and "
-            f"the focal length came out as {matrix[0, 0]:.4g} ± {deviations[0]:.2g} px; tilt the "
-            "board about both axes, or give the intrinsics."
-        )
+        said = f"the board's tilts vary by {tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed)"
+        raise CalibrationDataError(f"{said}; tilt it about both axes, or give the intrinsics.")
     errors = [
         np.linalg.norm(
             cv2.projectPoints(points, turn, move, matrix, distortion)[0][:, 0] - own, axis=1

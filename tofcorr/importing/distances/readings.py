@@ -106,15 +106,10 @@ def open_distances(
     warnings = []
     if unit_mm is None:
         word = "millimetres" if unit == 1 else "metres"
-        warnings.append(
-            f"Distances are typically {typical[0]:g} and read as {word}; state "
-            f"--depth-unit-mm {unit:g} if that is right."
-        )
+        read_as = f"Distances are typically {typical[0]:g} and read as {word}"
+        warnings.append(f"{read_as}; state --depth-unit-mm {unit:g} if that is right.")
     if zones == (1, 1):
-        warnings.append(
-            "One pixel: its ray is the optical axis by definition. The ray's place and direction "
-            "on the tool can be found; a turn about the ray cannot."
-        )
+        warnings.append("One pixel: its ray is the optical axis; a turn about it cannot be found.")
     origin = ", ".join(map(str, sources)) if len(sources) < 3 else f"{sources[0]}, ..."
     every = (unit * np.concatenate(tables) / 1000).astype(np.float32)
 

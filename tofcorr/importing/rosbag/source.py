@@ -278,9 +278,11 @@ def _images(
         partner = by_time[nearest(amplitude.stamps[by_time], depth.stamps)]
         gap = np.abs(depth.stamps - amplitude.stamps[partner])
         if (gap > _SAME_IMAGE).all():
+            said = (
+                f"no image of {amplitude.topic} is within {_SAME_IMAGE:g} s of one of {depth.topic}"
+            )
             raise CalibrationDataError(
-                f"{depth.bag.path}: no image of {amplitude.topic} is stamped within "
-                f"{_SAME_IMAGE:g} s of one of {depth.topic}; the nearest is {gap.min():.3f} s away."
+                f"{depth.bag.path}: {said}; the nearest is {gap.min():.3f} s off."
             )
         reason = f"{amplitude.topic} has no image of its time"
         refused = {names[k]: reason for k in order if gap[k] > _SAME_IMAGE}
@@ -369,10 +371,8 @@ def _read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics
     if "image_rect" in depth and any(lens):
         matrix = [*projection[:3], *projection[4:7], *projection[8:11]]
         values |= {"K": matrix, "distortion": []}
-        warnings.append(
-            f"{depth} is undistorted by its name: the projection P of {topic} is used. State "
-            "--intrinsics if that is wrong."
-        )
+        used = f"{depth} is undistorted by its name: the projection P of {topic} is used"
+        warnings.append(f"{used}. State --intrinsics if that is wrong.")
     return intrinsics_from_mapping(values, f"{bag.path}: {topic}"), warnings
 
 

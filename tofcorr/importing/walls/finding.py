@@ -69,11 +69,8 @@ class FoundWalls:
         """Return a sentence about what the images do not determine; none where they do."""
         if not self.undetermined:
             return []
-        return [
-            f"The images do not determine: {'; '.join(self.undetermined)}. There the recording "
-            "holds the recorded guess and no measurement. Turn the camera about two axes before "
-            "the walls, and roll it."
-        ]
+        lacking = f"The images do not determine: {'; '.join(self.undetermined)}"
+        return [f"{lacking}. There the guess stays. Turn the camera about two axes, and roll it."]
 
 
 def walls_of_planes(
@@ -106,10 +103,9 @@ def walls_of_planes(
     # three images determine them, and the fourth is the check.
     fewest = 4
     if seeing < fewest:
-        raise CalibrationDataError(
-            f"{origin}: {seeing} of {len(images)} images show anything flat on "
-            f"{options.least_share:.0%} and to within {options.tolerance_mm:g} mm; {fewest} must."
-        )
+        flat = f"flat on {options.least_share:.0%} and to within {options.tolerance_mm:g} mm"
+        said = f"{seeing} of {len(images)} images show anything {flat}; {fewest} must"
+        raise CalibrationDataError(f"{origin}: {said}.")
     given = labels = None
     if targets is not None:
         # A wall without a single measurement has no place.
@@ -119,10 +115,8 @@ def walls_of_planes(
     joint = match_single_ray(planes) if pixels == 1 else match(planes, options.fewest_images)
     on_wall = joint.wall >= 0
     if not bool(on_wall.any()):
-        raise CalibrationDataError(
-            f"{origin}: no hand-eye transform makes planes of {options.fewest_images} images one "
-            "wall. Do the poses belong to the images, and are they world_from_tool in metres?"
-        )
+        said = f"no hand-eye transform makes planes of {options.fewest_images} images one wall"
+        raise CalibrationDataError(f"{origin}: {said}. Are poses of these images, in metres?")
     if given is None:  # The walls in the order of their pixels.
         support = torch.bincount(joint.wall[on_wall], planes.support[on_wall], len(joint.walls))
         joint = joint.reordered(support.argsort(descending=True, stable=True))
