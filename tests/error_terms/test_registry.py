@@ -34,7 +34,7 @@ WITHOUT = {
     ],
 )
 def test_a_state_of_other_functions_is_refused(kind: str, one: dict, other: dict) -> None:
-    with pytest.raises(StateError, match="Build the module as the saved one was built"):
+    with pytest.raises(StateError, match="Build it alike"):
         model_of(kind, **one).load_state_dict(model_of(kind, **other).state_dict())
 
 

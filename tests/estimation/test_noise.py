@@ -42,7 +42,7 @@ def test_the_variance_is_never_negative_and_no_amplitude_tells_nothing() -> None
 
 
 def test_exact_repeats_and_too_few_pixels_are_refused() -> None:
-    with pytest.raises(CalibrationDataError, match="copies of one frame"):
+    with pytest.raises(CalibrationDataError, match="Copies of one frame"):
         fit_noise(torch.zeros(100), torch.ones(100), "repeats")
     with pytest.raises(CalibrationDataError, match="3 usable differences"):
         fit_noise(torch.ones(3), torch.ones(3), "neighbours")

@@ -99,7 +99,7 @@ def test_files_of_opencv_are_understood(tmp_path: Path, suffix: str) -> None:
         ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "entities"),
         ("<opencv_storage><size>3</size></opencv_storage>", "no camera matrix.*got 'size'"),
         pytest.param("%YAML:1.0\n---\n" + 17_000_000 * " ", "larger than 16 MB", id="large"),
-        (OURS, "hold for 512x424 pixels, the images have 320x240"),
+        (OURS, "hold for 512x424 pixels, images have 320x240"),
         ("K: [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]", "focal lengths of K must be positive"),
         ("K: [[9, 1, 0], [0, 9, 0], [0, 0, 1]]", "skew of 1"),
         ("K: [[1, 0, 0], [2, 1, 0], [0, 0, 1]]", "upper triangular"),

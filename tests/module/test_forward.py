@@ -181,7 +181,7 @@ def test_a_cropped_frame_and_an_unknown_condition_are_refused() -> None:
     for passed, given, said in (
         ((frame[:4],), {}, r"expected shape \(..., 5, 7\)"),
         ((frame.numpy(),), {}, "expected a torch tensor, got ndarray"),
-        ((frame.int(),), {}, "expected a floating-point type"),
+        ((frame.int(),), {}, "expected floating-point metres"),
         ((frame, frame[None]), {}, "expected depth's shape"),
         ((frame,), {"exposure": 1.0}, "'exposure' is no condition"),
         ((frame.expand(2, 5, 7),), {"timestamp_s": torch.ones(3)}, r"shape \[2\]; got shape \[3\]"),

@@ -62,7 +62,7 @@ def test_a_wall_of_limited_size_keeps_every_corner_of_the_view() -> None:
     wall = replace(SPACE, wall_size=(1.2, 1.0))
     found = plan_poses(SMALL, EA, wall, number=8)
     assert float(found.described[:, 0].max()) < 1.5
-    with pytest.raises(ConfigError, match="No view between the given distances"):
+    with pytest.raises(ConfigError, match="No view lies on the wall"):
         plan_poses(SMALL, EA, replace(SPACE, wall_size=(0.2, 0.2)))
 
 

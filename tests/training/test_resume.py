@@ -81,7 +81,7 @@ def test_a_run_of_another_model_and_a_folder_without_one_are_not_resumed(
     trained: Trained, tmp_path: Path
 ) -> None:
     smaller = {**CONFIG, "model": {"terms": CONFIG["model"]["terms"][:1]}}
-    with pytest.raises(ConfigError, match="other terms than the configuration"):
+    with pytest.raises(ConfigError, match="other terms; resume with its own"):
         tofcorr.train(trained.recording, smaller, resume=trained.folder)
     with pytest.raises(CalibrationDataError, match=r"state\.pt: there is no such file"):
         tofcorr.train(trained.recording, CONFIG, resume=tmp_path)

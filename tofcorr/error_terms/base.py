@@ -275,8 +275,8 @@ class DescribedModule(nn.Module):
         for key in dict.fromkeys([*own, *stored]):
             expected, found = own.get(key), stored.get(key)
             if found != json.loads(json.dumps(expected)):
-                said = f"of another model: its '{key}' is {found}, not {expected}"
-                raise StateError(f"{type(self).__name__}: the state is {said}. Build it alike.")
+                said = f"the state is of another model: its '{key}' is {found}, not {expected}"
+                raise StateError(f"{type(self).__name__}: {said}. Build it alike.")
 
     def register_interval(self, prefix: str, interval: Interval) -> None:
         """Keep `centre` and `half_width` of an interval, each behind a prefix, as such numbers."""

@@ -100,7 +100,7 @@ def rigid_transforms(
         said = (
             "the quaternion x y z w has length {:.4g}; expected 1."
             if of_quaternions
-            else "rx, ry, rz are read as an axis times radians, here {:.4g}; give quaternions."
+            else "rx, ry, rz are read as an axis times radians, here {:.4g}; are they Euler angles?"
         )
         raise CalibrationDataError(f"{where(place)}: {said.format(length[place])}")
     transforms = np.tile(np.eye(4), (len(rotation), 1, 1))

@@ -40,7 +40,7 @@ def test_the_walls_speak_where_poses_are_not_those_of_the_camera(
     aside[:3, 3] = [0.12, -0.05, 0.03]
     shifted = replace(scene, exact=scene.exact @ aside)
     imported = run_import("bop", scene_files.write_bop(shifted, tmp_path / "s"), out=tmp_path / "o")
-    assert "away from where its poses place it" in imported.text
+    assert "away from its poses" in imported.text
     found = np.array(imported.report["tool_from_camera"])
     assert apart(found, np.linalg.inv(aside))[0] < 20
 

@@ -46,5 +46,5 @@ def test_too_few_views_and_views_without_tilt_are_refused() -> None:
     generator = np.random.default_rng(5)
     views = [placement(distance) for distance in np.linspace(0.5, 0.8, 6)]
     corners = [project(view) + generator.normal(0, 0.05, (35, 2)) for view in views]
-    with pytest.raises(CalibrationDataError, match="tilt the board about both axes"):
+    with pytest.raises(CalibrationDataError, match="tilt it about both axes"):
         calibrate(corners, BOARD, SIZE)

@@ -61,7 +61,7 @@ def test_the_camera_can_be_calibrated_from_the_boards(tmp_path: Path, run: Run) 
         write_view(folder, f"{i}", where)
     code, _, stderr = run(folder, lens=("--calibrate",))
     assert code == 0
-    assert "The focal length calibrated from 12 views" in stderr
+    assert "The focal length of 12 views" in stderr
     about = report(tmp_path)["camera"]
     # Rendered corners carry a bias of some hundredths of a pixel that no deviation knows of.
     np.testing.assert_allclose(about["K"], CAMERA.matrix, atol=3.0)

@@ -85,7 +85,7 @@ def leave_two(folder: Path) -> None:
     [
         (spoil_all_eight_bit, {}, r"none of 6 views can be imported.*8 bits"),
         (leave_two, {"board": "6x8"}, "but one of 5x7: count inner corners, not squares"),
-        (leave, {"board": "5by7"}, "expected inner corners such as 5x7"),
+        (leave, {"board": "5by7"}, "expected 5x7"),
         (leave, {"board": "2x7"}, "board_columns"),
         (leave, {"lens": ()}, "in one way: --intrinsics FILE"),
         (leave, {"lens": (*FOCAL, "--calibrate")}, "in one way"),
@@ -103,7 +103,7 @@ def leave_two(folder: Path) -> None:
             "no file matches depth",
         ),
         (leave, {"lens": (*LENS, "--square-mm", "-1")}, "square_length"),
-        (leave, {"lens": (*LENS, "--max-reprojection-px", "0.001")}, "0.001 px are allowed"),
+        (leave, {"lens": (*LENS, "--max-reprojection-px", "0.001")}, "0.001 are allowed"),
     ],
 )
 def test_a_hopeless_import_is_one_message_and_leaves_nothing(

@@ -16,7 +16,7 @@ def test_real_trials_become_distances_beside_their_poses(real_data: Path, tmp_pa
     given = (*folders, *named, "--depth-unit-mm", 1)
     imported = run_import("distances", *given, out=tmp_path / "out")
     recording = imported.done
-    assert "a turn about the ray cannot" in imported.text
+    assert "a turn about it cannot be found" in imported.text
     assert recording.planes == "estimated"
     for wall in WALLS:
         poses, distance = read_trial(real_data, wall, "P1")

@@ -128,7 +128,7 @@ def test_other_boards_give_the_plane_even_where_a_part_is_hidden(
 
 @pytest.mark.parametrize(
     ("board", "said"),
-    [("5by7", "expected inner corners"), ("qr:5x7", "expected inner corners"),
+    [("5by7", "expected 5x7"), ("qr:5x7", "expected 5x7"),
      ("charuco:5x7:9X9:2", "share"), ("charuco:5x7:NOPE", "no dictionary of markers 'NOPE'")],
 )  # fmt: skip
 def test_boards_that_do_not_exist_are_refused(board: str, said: str, tmp_path: Path) -> None:

@@ -149,7 +149,7 @@ def test_missing_intrinsics_and_those_of_another_size_are_refused(
     camera.write_text("{width: 640, height: 480, fx: 600, fy: 600, cx: 320, cy: 240}")
     other = run_import("frames", tmp_path, *given, "--intrinsics", camera, out=tmp_path / "out")
     width, height = at_stops.size
-    said = f"the intrinsics hold for 640x480 pixels, the images have {width}x{height}"
+    said = f"the intrinsics hold for 640x480 pixels, images have {width}x{height}"
     assert said in other.text
 
 

@@ -94,7 +94,7 @@ def test_a_folder_with_a_matrix_a_file_names_its_poses(tmp_path: Path) -> None:
         ("# nothing\n", "found none"),
         ("tx,ty,tz\n0,0,0\n", "expected qx, qy, qz, qw or rx, ry, rz"),
         ("x,y,z,roll,pitch,yaw\n0,0,0,1,2,3\n", "Turn roll, pitch and yaw into quaternions"),
-        ("x,y,z,rx,ry,rz\n0,0,0,90,0,45\n", "row 1: rx, .* angle is 100.6; degrees, or Euler"),
+        ("x,y,z,rx,ry,rz\n0,0,0,90,0,45\n", "row 1: rx, .* times radians, here 100.6"),
         ("a.position.x,x,y,z\n0,0,0,0\n", "two columns are 'x'"),
         (ROW.replace(ROW.split()[0], "3.0", 1) + "\n", "pose 0: .*rotation"),
     ],

@@ -174,7 +174,7 @@ def test_poses_of_other_images_and_images_without_anything_flat_are_refused_in_w
     generator = np.random.default_rng(0)
     poses = np.stack([hand_eye_anywhere(generator) for _ in views.depth])
     poses[:, :3, 3] = generator.uniform(-2, 2, (len(poses), 3))
-    with pytest.raises(CalibrationDataError, match="Do the poses belong to the images"):
+    with pytest.raises(CalibrationDataError, match="Are poses of these images"):
         found_in(room, replace(views, world_from_tool=poses))
     depth = generator.uniform(0.5, 3.0, views.depth.shape)
     with pytest.raises(CalibrationDataError, match="0 of 12 images show anything flat"):

@@ -116,7 +116,7 @@ def walls_of_planes(
     on_wall = joint.wall >= 0
     if not bool(on_wall.any()):
         said = f"no hand-eye transform makes planes of {options.fewest_images} images one wall"
-        raise CalibrationDataError(f"{origin}: {said}. Are poses of these images, in metres?")
+        raise CalibrationDataError(f"{origin}: {said}. Are poses of these images?")
     if given is None:  # The walls in the order of their pixels.
         support = torch.bincount(joint.wall[on_wall], planes.support[on_wall], len(joint.walls))
         joint = joint.reordered(support.argsort(descending=True, stable=True))
