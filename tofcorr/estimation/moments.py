@@ -18,7 +18,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -201,20 +200,6 @@ def _entries(
     return torch.cat([normals, rows[..., 3:]], dim=-1)
 
 
-@runtime_checkable
-class Objective(Protocol):
-    """A sum of squared residuals as a function of the parameters."""
-
-    def normal_equations(self, parameters: Parameters) -> NormalEquations:
-        """Return loss, gradient and Gauss-Newton Hessian for a step of `Parameters.moved`."""
-        ...
-
-    @property
-    def num_residuals(self) -> float:
-        """How many residuals the loss sums."""
-        ...
-
-
 class MomentObjective:
     """The loss from per-image moments: microseconds, whatever the number of pixels.
 
@@ -233,8 +218,8 @@ class MomentObjective:
 
     @property
     def num_residuals(self) -> float:
-        """How many residuals the loss sums."""
-        return float(self.moments.count.sum())
+        """How many residuals the loss sums; at least 1."""
+        return float(self.moments.count.sum().clamp(min=1))
 
     @cached_property
     def _joint(self) -> Float[Tensor, "E E"]:

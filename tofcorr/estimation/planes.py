@@ -123,7 +123,7 @@ class _WithWalls(Parameters):
         return moved
 
 
-class _WallObjective:
+class _WallObjective(MomentObjective):
     """The loss of the moments as a function of the unknowns and of the walls, with a prior."""
 
     def __init__(self, moments: ImageMoments, size: int, prior: NormalEquations | None) -> None:
@@ -132,17 +132,16 @@ class _WallObjective:
         # determine, however far off the walls were recorded.
         ridge = torch.eye(size, dtype=torch.float64) / 100**2
         held = NormalEquations(ridge.new_zeros(()), ridge.new_zeros(size), ridge)
-        self.moments, self._prior = moments, held.plus(prior)
+        super().__init__(moments)
+        self._held = held.plus(prior)
 
-    @property
-    def num_residuals(self) -> float:
-        return float(self.moments.count.sum().clamp(min=1))
-
-    def normal_equations(self, parameters: _WithWalls) -> NormalEquations:
+    def normal_equations(self, parameters: Parameters) -> NormalEquations:
         """Return loss, gradient and Gauss-Newton Hessian for a step."""
+        # Every point that the solver asks for is a step from the start: it has walls.
+        assert isinstance(parameters, _WithWalls)
         walls = parameters.walls
         images = joint_image_equations(walls.seen_by(self.moments), parameters, walls)
-        return images.total().plus(self._prior.at(parameters.total))
+        return images.total().plus(self._held.at(parameters.total))
 
 
 def estimate_walls(
@@ -166,9 +165,7 @@ def estimate_walls(
         start.tool_from_camera, start.coefficients, start.hand_eye_is_free, walls=walls, total=zero
     )
     options = SolverOptions(max_iterations=most_steps)
-    objective = _WallObjective(moments, len(zero), prior)
-    # Every point that the solver asks for is a step from the start: it has walls.
-    end = minimise(objective, together, options).parameters  # pyright: ignore[reportArgumentType]
+    end = minimise(_WallObjective(moments, len(zero), prior), together, options).parameters
     assert isinstance(end, _WithWalls)
     found = Parameters(end.tool_from_camera, end.coefficients, end.hand_eye_is_free)
     return found, end.walls

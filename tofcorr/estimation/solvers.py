@@ -21,7 +21,6 @@ from tofcorr.estimation.moments import (
     LEAST_RESIDUAL,
     ImageMoments,
     MomentObjective,
-    Objective,
     Parameters,
 )
 from tofcorr.geometry import se3
@@ -96,7 +95,7 @@ Watcher = Callable[[Solution], bool | None]
 
 
 def minimise(
-    objective: Objective,
+    objective: MomentObjective,
     start: Parameters,
     options: SolverOptions | None = None,
     watcher: Watcher | None = None,

@@ -20,6 +20,7 @@ other, and only together do they put corrected points on the planes.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -115,19 +116,24 @@ def fit(
         # At the least loss, where the gradients of the poses sum to zero.
         covariance = jackknife_covariance(core.moments, optimum, prior, poses, problem.estimated)
         hand_eye_only = hand_eye_alone(problem, core.moments)
-        problem, core, model, outcome, noise, shift = _completed(problem, core, weights)
-        assert core.observability is not None
+        noise = _noise(problem, weights)
+        outcome, with_network, best = None, None, optimum
+        if options.residual is not None:
+            error = _with_pattern(problem, core).error
+            outcome, error.residual, best = fit_residual(problem, core, error, options.residual)
+            with_network = None if error.residual is None else error
+        kept = with_network is not None
+        problem, core, shift = _without_noise_shift(problem, core, weights, noise, kept)
+        if with_network is None:
+            model = _with_pattern(problem, core)
+        else:
+            core = replace(core, solution=replace(core.solution, parameters=best))
+            model = calibrated(with_network, best)
         return Fit(
-            options=core.options,
-            moments=core.moments,
-            start=core.start,
-            solution=core.solution,
-            smoothness=core.smoothness,
-            observability=core.observability,
-            prior=core.prior,
+            **vars(core),
             model=model,
             domain=problem.domain,
-            optimum=optimum if model.error.residual is None else core.solution.parameters,
+            optimum=best,
             hand_eye_only=hand_eye_only,
             covariance=covariance,
             residual=outcome,
@@ -302,34 +308,14 @@ def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
     return CalibrationModel(error, hand_eye)
 
 
-def _completed(
-    problem: Problem, core: Core, weights: PixelWeights | None
-) -> tuple[Problem, Core, CalibrationModel, str | None, DistanceNoise | None, Shift | None]:
-    """Decide on the residual network, take the noise's shift off, and add the fixed pattern.
-
-    Returns:
-        The problem, on the walls that go with the core; the core, without what the noise of the
-        distances moves; its model, with fixed pattern and network; how the network was decided on,
-        the noise and what it moves, each None if unknown.
-    """
-    noise = None if weights is None else weights.noise
-    if noise is None and problem.dataset.has_amplitude:
-        try:
-            noise = estimate_noise(problem.dataset, problem.frames)
-        except CalibrationDataError:
-            noise = None  # The recording does not determine it.
-    if problem.options.residual is None:
-        problem, core, shift = _without_noise_shift(problem, core, weights, noise)
-        return problem, core, _with_pattern(problem, core), None, noise, shift
-    error = _with_pattern(problem, core).error
-    outcome, network, best = fit_residual(problem, core, error, problem.options.residual)
-    with_network = network is not None
-    problem, core, shift = _without_noise_shift(problem, core, weights, noise, with_network)
-    if network is None:
-        return problem, core, _with_pattern(problem, core), outcome, noise, shift
-    error.residual = network
-    core = replace(core, solution=replace(core.solution, parameters=best))
-    return problem, core, calibrated(error, best), outcome, noise, shift
+def _noise(problem: Problem, weights: PixelWeights | None) -> DistanceNoise | None:
+    """Return the noise that weighs the pixels, or else the recording's; None: it is unknown."""
+    if weights is not None and weights.noise is not None:
+        return weights.noise
+    if problem.dataset.has_amplitude:
+        with suppress(CalibrationDataError):  # The recording may not determine it.
+            return estimate_noise(problem.dataset, problem.frames)
+    return None
 
 
 def _with_pattern(problem: Problem, core: Core) -> CalibrationModel:

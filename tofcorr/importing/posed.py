@@ -155,7 +155,6 @@ class PosedImport:
                 *source.warnings,
                 *warnings,
                 *_contradiction(source.tool_from_camera, found.tool_from_camera),
-                *found.warnings(),
             ],
         )
 

@@ -62,7 +62,6 @@ def test_three_walls_and_a_floor_are_found_and_every_view_is_of_its_wall(
     assert (apart(found.tool_from_camera, room.tool_from_camera) < (NEAR_MM, NEAR_DEG)).all()
     for image, wall in zip(found.image, found.wall, strict=True):
         assert (views.plane[image] == shown[wall]).mean() > 0.03
-    assert found.undetermined == []
     assert found.warnings() == []
 
 
@@ -92,7 +91,6 @@ def test_one_wall_is_enough_if_it_is_seen_tilted_about_two_axes(
     found = found_in(room, views)
     assert sorted(planes_shown(room, found)) == list(range(len(planes)))
     assert apart(found.tool_from_camera, room.tool_from_camera)[1] < NEAR_DEG
-    assert found.undetermined == []
 
 
 @pytest.mark.slow
@@ -134,7 +132,7 @@ def test_a_plane_that_belongs_to_no_wall_is_left_out_with_its_distance() -> None
 
 
 @pytest.mark.parametrize("roll", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
-def test_one_wall_seen_head_on_names_what_is_not_determined(roll: float) -> None:
+def test_one_wall_seen_head_on_keeps_the_guess_of_what_is_not_determined(roll: float) -> None:
     generator = np.random.default_rng(10)
     room = Room(planes=(FRONT,), tool_from_camera=hand_eye_anywhere(generator))
     views = room.views(looking_straight(25, roll, generator), generator)
@@ -142,12 +140,6 @@ def test_one_wall_seen_head_on_names_what_is_not_determined(roll: float) -> None
     (wall,) = found.walls
     # What is determined is right: the robot moves along the wall's normal.
     assert np.degrees(np.arccos(-wall[0])) < NEAR_DEG
-    text = "; ".join(found.undetermined)
-    assert "of the hand-eye against the distance of wall 1" in text
-    for symbol in ("t_x", "t_y", "w_z"):
-        assert f"{symbol} of the hand-eye" in text
-    (warning,) = found.warnings()
-    assert warning.startswith("The images do not determine: ")
     # Nothing is invented: along the wall the translation is that of the guess.
     assert np.linalg.norm(found.tool_from_camera[:3, 3]) < 0.02
 

@@ -13,7 +13,6 @@ from tofcorr.importing.walls.hand_eye import (
     Joint,
     match,
     match_single_ray,
-    undetermined,
 )
 from tofcorr.importing.walls.image_planes import ImagePlane, SeenPlanes, WallOptions, seen_planes
 
@@ -34,7 +33,6 @@ class FoundWalls:
         tool_from_camera: The hand-eye transform that goes with the walls, shape (4, 4): a start.
         deviation_mm: Root mean square distance of the planes of single images from their walls.
         misfit_mm: The same where each plane counts 60 mm at most, and on no wall that much.
-        undetermined: Directions of hand-eye and walls that the images do not determine, by name.
         left_out: Why images, and planes of images, are on no wall, by their names.
     """
 
@@ -50,7 +48,6 @@ class FoundWalls:
     tool_from_camera: np.ndarray
     deviation_mm: float
     misfit_mm: float
-    undetermined: list[str]
     left_out: dict[str, str]
 
     def to_mapping(self) -> dict[str, Any]:
@@ -62,15 +59,7 @@ class FoundWalls:
             "walls": [dict(zip(keys, row, strict=True)) for row in rows],
             "tool_from_camera": self.tool_from_camera.tolist(),
             "deviation_mm": self.deviation_mm,
-            "undetermined": self.undetermined,
         }
-
-    def warnings(self) -> list[str]:
-        """Return a sentence about what the images do not determine; none where they do."""
-        if not self.undetermined:
-            return []
-        lacking = f"The images do not determine: {'; '.join(self.undetermined)}"
-        return [f"{lacking}. There the guess stays. Turn the camera about two axes, and roll it."]
 
 
 def walls_of_planes(
@@ -121,10 +110,6 @@ def walls_of_planes(
         support = torch.bincount(joint.wall[on_wall], planes.support[on_wall], len(joint.walls))
         joint = joint.reordered(support.argsort(descending=True, stable=True))
     called = _names(joint, options.up) if given is None else [str(name) for name in given]
-    undecided = undetermined(planes, joint, called)
-    if any("the tilt of floor" in direction for direction in undecided):
-        called = _names(joint, "unknown")
-        undecided = undetermined(planes, joint, called)
     members = [joint.wall == k for k in range(len(called))]
     views = on_wall.nonzero()[:, 0].tolist()
     views.sort(key=lambda k: (int(planes.image[k]), int(joint.wall[k])))
@@ -141,7 +126,6 @@ def walls_of_planes(
         tool_from_camera=joint.tool_from_camera.numpy(),
         deviation_mm=float(deviation[on_wall].square().mean().sqrt()),
         misfit_mm=float(off.square().mean().sqrt()),
-        undetermined=undecided,
         left_out=_left_out(names, planes, joint, options),
     )
 

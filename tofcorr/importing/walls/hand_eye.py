@@ -23,15 +23,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tofcorr.estimation.linear import NormalEquations
-from tofcorr.estimation.moments import HAND_EYE_SYMBOLS, ImageMoments, Parameters
-from tofcorr.estimation.planes import Walls, estimate_walls, joint_image_equations
+from tofcorr.estimation.moments import ImageMoments, Parameters
+from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.robust import robust_weights, sigma_from_mad
-from tofcorr.estimation.uncertainty import (
-    PRIOR_SIGMA,
-    named_components,
-    posterior_covariance,
-    sparse_basis,
-)
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.geometry import se3
 from tofcorr.importing.walls.image_planes import SeenPlanes
 
@@ -503,31 +498,3 @@ def _assigned(planes: SeenPlanes, parameters: Parameters, walls: Tensor) -> Join
     nearest = order[np.unique(pairs, axis=0, return_index=True)[1]]
     alone = torch.full_like(wall, -1).index_copy(0, nearest, wall[nearest])
     return Joint(parameters, walls, alone, deviation)
-
-
-def undetermined(planes: SeenPlanes, joint: Joint, names: Sequence[str]) -> list[str]:
-    """Name the directions of hand-eye and walls that the planes do not determine.
-
-    A direction is undetermined if the planes, each known to 10 mm, say less about it than a prior
-    of 100 mm and 100 mrad.
-
-    Args:
-        planes: The planes of all images, of which some lie on walls.
-        joint: The fit.
-        names: The walls' names.
-    """
-    chosen = joint.wall >= 0
-    planes = planes.take(chosen)
-    walls = Walls(joint.walls[:, :3], joint.walls[:, 3], joint.wall[chosen], planes.world_from_tool)
-    moments = walls.seen_by(_point_moments(planes))
-    each = joint_image_equations(moments, joint.parameters, walls)
-    precision = each.hessian.sum(dim=0) / _TYPICAL**2
-    precision[6:8, 6:8] += torch.diag(1 / _ERROR**2)
-    variance, vectors = torch.linalg.eigh(posterior_covariance(precision))
-    symbols = [f"{symbol} of the hand-eye" for symbol in HAND_EYE_SYMBOLS]
-    symbols += ["constant error", "slope of the error"]
-    for name in names:
-        symbols += [f"the tilt of {name}", f"the tilt of {name}", f"the distance of {name}"]
-    open_ones = sparse_basis(vectors[:, 2 * variance > PRIOR_SIGMA**2]).T
-    found = [" against ".join(named_components(vector, symbols)) for vector in open_ones]
-    return list(dict.fromkeys(found))
