@@ -106,7 +106,7 @@ def _last_line(error: Exception) -> str:
 @out_option("File to write; an older one is replaced.", ReplacedFile())
 @option("--device", "What pt2 is compiled for: cpu or cuda.", default="cpu")
 def export_command(run: Path, name: str, out: Path, device: str) -> None:
-    """Write the corrector of a run, or the camera's pose, once it agrees with the calibration.
+    """Write the corrector of a run, once it agrees with the calibration, or the camera's pose.
 
     Nothing is written when it does not, nor of a run whose verdict is `do not use`, unless it was
     trained with --force.
@@ -123,7 +123,7 @@ def export_command(run: Path, name: str, out: Path, device: str) -> None:
     _refuse_useless(run)
     state = load_calibration(run / STATE_FILE)
     export(name, DepthCorrector.from_state(state).to(device), out, state)
-    click.echo(f"{out}: the calibration {state.name} of {run} as {name}, checked after writing.")
+    click.echo(f"{out}: the calibration {state.name} of {run} as {name}.")
 
 
 def _refuse_useless(run: Path) -> None:

@@ -150,7 +150,7 @@ def test_a_calibration_without_a_robot_is_refused_by_name(
     name: str, file: str, tmp_path: Path
 ) -> None:
     state = calibration(np.eye(4), hand_eye_estimated=False)
-    with pytest.raises(ConfigError, match=rf"{name} export needs.*calibration EA has none"):
+    with pytest.raises(ConfigError, match=rf"{name} needs an estimated.*EA has none"):
         write(name, state, tmp_path / file)
     assert list(tmp_path.iterdir()) == []
 

@@ -1,4 +1,4 @@
-"""The corrector in the formats that robots load, each compared with the float64 model first."""
+"""The calibration as robots load it; correctors are compared with the float64 model first."""
 
 from importlib import import_module
 from pathlib import Path

@@ -1,16 +1,14 @@
 """The camera's pose in the calibration files of easy_handeye (ROS 1) and easy_handeye2 (ROS 2)."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.pose import Mount, transform_of, write_pose
+from tofcorr.correction.export.pose import Mount
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
-from tofcorr.options import dump_yaml, read_yaml
+from tofcorr.files import staged_file
+from tofcorr.options import dump_yaml
 
 _KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
@@ -27,11 +25,11 @@ def export_easy_handeye(
     Args:
         corrector: The float32 runtime; not needed here.
         path: The file to write; an older one is replaced.
-        reference: The calibration that the file must agree with.
+        reference: The calibration.
 
     Raises:
         ConfigError: The ending is another, or the calibration has no estimated hand-eye transform.
-        ExportError: What was written is not the transform, or the file cannot be written.
+        ExportError: The file cannot be written.
     """
     path = Path(path)
     if path.suffix not in (".yaml", ".calib"):
@@ -57,13 +55,5 @@ def export_easy_handeye(
         parameters |= {"name": path.stem, "calibration_type": kind}
         parameters |= {"freehand_robot_movement": True}
         mapping = {"parameters": parameters, "transform": mount.mapping()}
-    write_pose(path, mount.comment() + dump_yaml(mapping), _read, mount)
-
-
-def _read(path: Path) -> np.ndarray:
-    values: Mapping[str, Any] = read_yaml(path)
-    if "transform" in values:
-        return transform_of(values["transform"])
-    found = values["transformation"]
-    rotation = {axis: found[f"q{axis}"] for axis in "xyzw"}
-    return transform_of({"translation": found, "rotation": rotation})
+    with staged_file(path) as part:
+        part.write_text(mount.comment() + dump_yaml(mapping), encoding="utf-8")

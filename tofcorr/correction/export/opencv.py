@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.pose import Mount, write_pose
+from tofcorr.correction.export.pose import Mount
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.model import ErrorModel
+from tofcorr.files import staged_file
 
 Value = str | int | float | np.ndarray | list[dict[str, "Value"]]
 """What a key of cv::FileStorage may hold; matrices have two dimensions, written as double."""
@@ -26,22 +27,20 @@ def export_opencv(corrector: DepthCorrector, path: Path | str, reference: Calibr
     Args:
         corrector: Where the metadata come from.
         path: The file to write; an older one is replaced.
-        reference: The calibration that the file must agree with.
+        reference: The calibration.
 
     Raises:
-        ExportError: What was written is not the calibration, or the file cannot be written.
+        ExportError: The file cannot be written.
     """
     import cv2
 
     mount = Mount(reference, "opencv") if reference.hand_eye_estimated else None
 
-    def write(part: Path) -> None:
+    with staged_file(path) as part:
         storage = cv2.FileStorage(str(part), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
         for key, value in _content(json.loads(corrector.metadata()), reference, mount).items():
             _put(storage, key, value)
         storage.release()
-
-    write_pose(path, write, _transform_in, mount)
 
 
 def _content(metadata: dict, state: CalibrationState, mount: Mount | None) -> dict[str, Value]:
@@ -113,12 +112,3 @@ def _put(storage: Any, key: str, value: Value) -> None:  # noqa: ANN401 - cv2.Fi
             _put(storage, name, one)
         storage.endWriteStruct()
     storage.endWriteStruct()
-
-
-def _transform_in(path: Path) -> np.ndarray:
-    """Return the transform that a file states, shape (4, 4); empty if there is none."""
-    import cv2
-
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    found = storage.getNode("tool_from_camera").mat()
-    return np.zeros((0, 0)) if found is None else found

@@ -1,20 +1,12 @@
 """The pose of the camera on the robot, as the formats for robots write it."""
 
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.state import CalibrationState
-from tofcorr.errors import ConfigError, ExportError
-from tofcorr.files import staged_file
+from tofcorr.errors import ConfigError
 from tofcorr.version import __version__
-
-# Largest difference of any entry of the transform that is read back, metres or no unit. Numbers
-# are written to 1e-10; their products in a rotation matrix add up to a few times that.
-_TOLERANCE = 1e-8
 
 
 class Mount:
@@ -70,7 +62,7 @@ class Mount:
         lines.append(f"Standard errors along x y z of '{parent}': {errors}.")
         if self.accuracy.undetermined:
             lacking = "; ".join(self.accuracy.undetermined)
-            lines.append(f"NOT DETERMINED, nor in the standard errors: {lacking} (camera's axes).")
+            lines.append(f"NOT DETERMINED, nor in these (t along, w about its axes): {lacking}.")
         return lines
 
     def comment(self) -> str:
@@ -78,47 +70,6 @@ class Mount:
         return "".join(f"# {line}\n" for line in self.in_words())
 
 
-def write_pose(
-    path: Path | str,
-    content: str | Callable[[Path], None],
-    read: Callable[[Path], np.ndarray],
-    mount: Mount | None,
-) -> None:
-    """Write a file, read it back, and refuse one that states another transform (4, 4).
-
-    Args:
-        path: The file; an older one is replaced.
-        content: Its text, or what writes it.
-        read: Returns the transform that the file states.
-        mount: The pose; None: there is none to compare with.
-
-    Raises:
-        ExportError: They differ, or the file cannot be written.
-    """
-    with staged_file(path) as part:
-        if isinstance(content, str):
-            part.write_text(content, encoding="utf-8")
-        else:
-            content(part)
-        if mount is None:
-            return
-        found = read(part)
-        if found.shape != mount.transform.shape:
-            raise ExportError(f"{path}: holds no transform after writing; nothing was written.")
-        apart = float(np.abs(found - mount.transform).max())
-        if not apart < _TOLERANCE:
-            raise ExportError(f"{path}: the transform is off by {apart:.1e}; nothing was written.")
-
-
 def decimals(values: Iterable[float]) -> list[str]:
     """Return numbers with ten digits behind the point; no sign before a zero."""
     return [f"{round(value, 10) + 0.0:.10f}" for value in values]
-
-
-def transform_of(mapping: Mapping[str, Any]) -> np.ndarray:
-    """Return the transform (4, 4) of what `Mount.mapping` gave."""
-    transform = np.eye(4)
-    quaternion = [mapping["rotation"][axis] for axis in "xyzw"]
-    transform[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    transform[:3, 3] = [mapping["translation"][axis] for axis in "xyz"]
-    return transform

@@ -4,9 +4,10 @@ import shlex
 from pathlib import Path
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.pose import Mount, decimals, transform_of, write_pose
+from tofcorr.correction.export.pose import Mount, decimals
 from tofcorr.correction.state import CalibrationState
-from tofcorr.options import dump_yaml, read_yaml
+from tofcorr.files import staged_file
+from tofcorr.options import dump_yaml
 
 
 def export_tf(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -15,11 +16,11 @@ def export_tf(corrector: DepthCorrector, path: Path | str, reference: Calibratio
     Args:
         corrector: The float32 runtime; not needed here.
         path: The file to write; an older one is replaced.
-        reference: The calibration that the file must agree with.
+        reference: The calibration.
 
     Raises:
         ConfigError: The calibration has no estimated hand-eye transform.
-        ExportError: What was written is not the transform, or the file cannot be written.
+        ExportError: The file cannot be written.
     """
     mount = Mount(reference, "tf")
     accuracy, names = mount.accuracy, mount.frames
@@ -44,5 +45,5 @@ def export_tf(corrector: DepthCorrector, path: Path | str, reference: Calibratio
         f"commands:\n  ros2: |-\n    ros2 run {program} {shlex.join(words)}\n"
         f"  ros1: |-\n    rosrun {program} {shlex.join([*numbers, names.tool, names.camera])}\n"
     )
-    text = mount.comment() + dump_yaml(mapping) + commands
-    write_pose(path, text, lambda part: transform_of(read_yaml(part)["transform"]), mount)
+    with staged_file(path) as part:
+        part.write_text(mount.comment() + dump_yaml(mapping) + commands, encoding="utf-8")

@@ -2,15 +2,14 @@
 
 import math
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.pose import Mount, decimals, write_pose
+from tofcorr.correction.export.pose import Mount, decimals
 from tofcorr.correction.state import CalibrationState
+from tofcorr.files import staged_file
 
 
 def export_urdf(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -23,14 +22,14 @@ def export_urdf(corrector: DepthCorrector, path: Path | str, reference: Calibrat
     Args:
         corrector: The float32 runtime; not needed here.
         path: The file to write; an older one is replaced.
-        reference: The calibration that the file must agree with.
+        reference: The calibration.
 
     Raises:
         ConfigError: The calibration has no estimated hand-eye transform.
-        ExportError: What was written is not the transform, or the file cannot be written.
+        ExportError: The file cannot be written.
     """
-    mount = Mount(reference, "urdf")
-    write_pose(path, _description(mount), _read, mount)
+    with staged_file(path) as part:
+        part.write_text(_description(Mount(reference, "urdf")), encoding="utf-8")
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:
@@ -68,14 +67,3 @@ def _description(mount: Mount) -> str:
   </joint>
 </robot>
 """
-
-
-def _read(path: Path) -> np.ndarray:
-    """Return the transform that the file states, shape (4, 4)."""
-    origin = ElementTree.fromstring(path.read_text(encoding="utf-8")).find("joint/origin")
-    assert origin is not None
-    transform = np.eye(4)
-    transform[:3, 3] = [float(word) for word in origin.attrib["xyz"].split()]
-    angles = [float(word) for word in origin.attrib["rpy"].split()]
-    transform[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
-    return transform
