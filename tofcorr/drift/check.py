@@ -121,7 +121,7 @@ def check_drift(
         raise CalibrationDataError(f"{dataset.first.path}: {said}; record a wall there.")
     found = sums.estimate()
     low, high = found.value - found.half_width, found.value + found.half_width
-    flatness = math.sqrt(np.mean([one.flatness**2 for one in found.images]))
+    flatness = math.sqrt(np.mean([one.flatness**2 for one in sums.images]))
     verdict: Verdict = "holds" if max(-low, high) <= threshold else "undecided"
     if max(low, -high, flatness) > threshold:
         verdict = "drifted"
@@ -132,7 +132,7 @@ def check_drift(
         interval=(low, high),
         flatness=flatness,
         threshold=threshold,
-        images=found.images,
+        images=sums.images,
         outside=1 - sums.calibrated / max(sums.on_wall, 1),
         form_is_known=reference is not None,
         unlike=0.0 if known.views is None else share_unlike(sums.sums.views, known.views),

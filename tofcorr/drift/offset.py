@@ -46,13 +46,11 @@ class ImageDrift(NamedTuple):
 
     Attributes:
         frame: Its number.
-        offset: How much farther than at calibration the camera reads there, metres.
         flatness: Root mean square departure of its corrected wall from a plane, metres.
         num_pixels: Pixels used.
     """
 
     frame: int
-    offset: float
     flatness: float
     num_pixels: int
 
@@ -63,7 +61,6 @@ class Offset(NamedTuple):
     Attributes:
         value: Of all images, metres.
         half_width: Of its 95 % interval, metres.
-        images: Each by itself.
         disagreement: By how much the images depart from each other, as a standard deviation over
             that of the calibration's images.
         disagrees: Whether that is too much for images of one camera, one robot and flat walls.
@@ -71,7 +68,6 @@ class Offset(NamedTuple):
 
     value: float
     half_width: float
-    images: list[ImageDrift]
     disagreement: float
     disagrees: bool
 
@@ -87,6 +83,7 @@ class OffsetSums:
 
     Attributes:
         sums: Of the images read so far: the offset, the shared wall, its bow, the calibration.
+        images: How flat the wall of each is.
         on_wall: Pixels on the wall that their image shows.
         calibrated: Those of them within the calibrated ranges, which alone are used.
     """
@@ -101,7 +98,7 @@ class OffsetSums:
         self._factor = Curvature(reference.covariance if within is None else within).root
         self.sums = ImageSums(reference.noise)
         self.on_wall = self.calibrated = 0
-        self._images: list[ImageDrift] = []
+        self.images: list[ImageDrift] = []
 
     def read(self) -> Iterator[int]:
         """Correct the images and add those with enough usable pixels; yield their numbers."""
@@ -138,7 +135,7 @@ class OffsetSums:
                 distance = corrected.radial_distance[k].flatten()[used]
                 points = rays.flatten(0, 1)[used] * distance[:, None]
                 flatness = _departure_from_plane(points, shown, used, rays.shape[1])
-                self._images.append(ImageDrift(frame, math.nan, flatness, len(used)))
+                self.images.append(ImageDrift(frame, flatness, len(used)))
                 yield frame
 
     def estimate(self) -> Offset:
@@ -169,9 +166,7 @@ class OffsetSums:
         known = 0.0 if disagrees else known
         of_both = own + known
         spread = (known * usual + own * seen) / of_both if of_both > 0 else usual
-        scores, expected, value, precision = self._solved(
-            sums, noise * spread, precision / spread / alike
-        )
+        *_, value, precision = self._solved(sums, noise * spread, precision / spread / alike)
         few = 1 + self._shared_walls
         # If the calibration were exact and the wall had no bow; with the bow; and with both.
         of_images, with_bow, variance = (
@@ -185,11 +180,9 @@ class OffsetSums:
             (max(variance - with_bow, 0.0), max(reference.independent_poses - 1, 1.0)),
         )
         freedom = variance**2 / sum(part**2 / own for part, own in parts)
-        offsets = (value + scores / expected).tolist()
         return Offset(
             value=value,
             half_width=student_quantile(1 - LEVEL / 2, freedom) * math.sqrt(variance),
-            images=[one._replace(offset=x) for one, x in zip(self._images, offsets, strict=True)],
             disagreement=disagreement,
             disagrees=disagrees,
         )

@@ -92,6 +92,6 @@ class DriftResult:
             "unlike_calibrated_views": self.unlike,
             "images": [
                 {"frame": frame, "flatness_mm": 1e3 * flatness, "pixels": pixels}
-                for frame, _, flatness, pixels in self.images
+                for frame, flatness, pixels in self.images
             ],
         }

@@ -171,11 +171,6 @@ class Curvature:
         root = self.vectors * torch.where(self.resolved, self.values, 0.0).sqrt()[..., None, :]
         return root / self.scale[..., :, None]
 
-    @property
-    def condition(self) -> float:
-        """Condition number of one scaled matrix, rounding and all."""
-        return float(self.values.max() / self.values.min().clamp(min=_TINY))
-
 
 def left_out_steps(
     each: NormalEquations, hessian: Float[Tensor, "P P"]

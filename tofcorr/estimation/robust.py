@@ -103,15 +103,12 @@ def robust_scale(residuals: Float[Tensor, "S"]) -> float:
     return sigma_from_mad(float(residuals.abs().median()))
 
 
-def outlying_images(
-    frames: np.ndarray, rms: np.ndarray, threshold: float = 3.5
-) -> list[dict[str, Any]]:
+def outlying_images(frames: np.ndarray, rms: np.ndarray) -> list[dict[str, Any]]:
     """Return the images whose error is much larger than that of the others, the largest first.
 
     Args:
         frames: Global numbers, shape (N,).
         rms: Their root mean square errors, shape (N,), metres.
-        threshold: Of the robust z score; Iglewicz and Hoaglin (1993) advise 3.5.
 
     Returns:
         Of each its global number, its error in millimetres, and how many robust standard deviations
@@ -128,7 +125,7 @@ def outlying_images(
     found = [
         {"frame": int(frame), "rms_mm": float(1e3 * error), "z": float(z)}
         for frame, error, z in zip(frames[usable], rms[usable], deviation / spread, strict=True)
-        if z > threshold
+        if 2 * z > 7  # Iglewicz and Hoaglin (1993) advise 3.5.
     ]
     return sorted(found, key=lambda outlier: -outlier["z"])
 

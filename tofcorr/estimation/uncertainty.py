@@ -163,7 +163,6 @@ class Observability(NamedTuple):
     Attributes:
         directions: Every direction, the weakest first.
         confounded: Correlations of pairs that the images hardly separate, strongest first.
-        condition: Condition number of the scaled normal equations.
         covariance: Of all unknowns, with the wide prior, shape (P, P).
         vectors: The directions as unit vectors in the columns, shape (P, P).
         precision: Of all unknowns, without the wide prior, shape (P, P).
@@ -172,7 +171,6 @@ class Observability(NamedTuple):
 
     directions: list[Direction]
     confounded: dict[tuple[str, str], float]
-    condition: float
     covariance: Tensor
     vectors: Tensor
     precision: Tensor
@@ -229,7 +227,6 @@ def observability(
     return Observability(
         [_direction(vectors[:, k], variances[k], correlation, names) for k in range(len(names))],
         pairs,
-        Curvature(precision).condition,
         posterior,
         vectors,
         precision,

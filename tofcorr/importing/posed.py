@@ -39,8 +39,9 @@ from tofcorr.plausibility.mistakes import FAR_BETTER, IN_IMAGES, IN_POSES
 from tofcorr.progress import through
 
 _LAG_OF_STOPS = 0.02
-"""A refined lag that differs by more than this from the first (seconds) changes which images are
-at rest: the margin that stops are given."""
+"""Seconds before and after an image in which the tool must stand still besides the uncertainty of
+the lag: an exposure and the jitter of a time stamp. A refined lag that differs by more from the
+first changes which images are at rest."""
 
 _NEAREST, _FARTHEST = 0.03, 50.0
 """Metres: nearer even single-pixel sensors give no distance, but depth in kilometres, or a unit
@@ -165,13 +166,11 @@ class PosedImport:
         timed = self._times is not None and self._track.timestamp is not None
         return Lag(seconds=self._options.lag_s) if timed else None
 
-    def _choose(self, lag: Lag | None, margin: float = 0.02) -> Chosen:
+    def _choose(self, lag: Lag | None) -> Chosen:
         """Pair images with poses, and keep those of stops.
 
         Args:
             lag: Of the images' clock; None: none is known.
-            margin: Seconds before and after an image in which the tool must stand still besides the
-                uncertainty of the lag: an exposure and the jitter of a time stamp.
 
         Raises:
             CalibrationDataError: No image is left.
@@ -186,7 +185,7 @@ class PosedImport:
         elif track.lists_stops(tolerance):
             stop = nearest(track.timestamp, times[images] - late)
         else:
-            stop = find_stops(track, times[images] - late, margin + 2 * error)
+            stop = find_stops(track, times[images] - late, _LAG_OF_STOPS + 2 * error)
         take, moving = stop < 0, images[stop < 0]
         if options.moving == "leave_out":
             refused |= {names[int(k)]: "the tool was moving" for k in moving}

@@ -106,15 +106,11 @@ class ImagesOfPlanes:
         self.source, self._options = source, options
         self._planes: dict[int, list[ImagePlane]] = {}
 
-    def look(
-        self, sieve: Sieve, looked_at: int = 4096
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def look(self, sieve: Sieve) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Read every image once, and keep a few numbers of each.
 
         Args:
             sieve: Sets aside the images that cannot be read.
-            looked_at: Pixels of an image that are compared with the image before: their median
-                change is known to a sixtieth of the noise, a fraction of a millimetre.
 
         Returns:
             Which images can be read, shape (I,), bool; the median depth of each, metres, NaN
@@ -136,7 +132,8 @@ class ImagesOfPlanes:
                 self.camera = self.source.intrinsics.camera((width, height))
                 self.rays = ray_directions(self.camera)
             depth = of_size(image, self.camera).depth
-            few = depth.ravel()[:: max(1, depth.size // looked_at)]
+            # The median change of so many pixels is known to a sixtieth of their noise.
+            few = depth.ravel()[:: max(1, depth.size // 4096)]
             if np.isfinite(few).any():
                 median[k] = np.nanmedian(few)
             if len(before) and np.isfinite(moved := np.abs(few - before)).any():

@@ -323,8 +323,9 @@ def refine_lag(
     return replace(first, seconds=seconds, standard_error=_jackknife_error(best, len(times)))
 
 
-def _jackknife_error(estimate: Callable[[np.ndarray], float], count: int, parts: int = 10) -> float:
-    """Return the standard error of an estimate from a mask of `count` data, leaving out parts."""
+def _jackknife_error(estimate: Callable[[np.ndarray], float], count: int) -> float:
+    """Return the standard error of an estimate from a mask of `count` data, leaving out tenths."""
+    parts = 10
     part = np.arange(count) * parts // count
     left_out = np.array([estimate(part != k) for k in range(parts)])
     return float(np.sqrt((parts - 1) * left_out.var()))

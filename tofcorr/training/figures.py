@@ -1,6 +1,5 @@
 """Figures of a calibration: profiles of errors and frames, as numbers, as colours, and drawn."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,9 +14,6 @@ from tofcorr.training.calibration import Calibration
 if TYPE_CHECKING:  # Matplotlib takes longer to import than a short fit.
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Images = Sequence[Mapping[str, np.ndarray]]
-"""For each frame the errors `before` and `after`, shape (H, W), mm; NaN where not used."""
 
 _STAGES = {
     "before": ("before", "tab:red"),
@@ -63,33 +59,6 @@ def ends_of(x: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def columns_of_errors(images: Images) -> list[tuple[np.ndarray, float]]:
-    """Return errors before, after, and after on a finer scale: frames below one another, and limit.
-
-    Returns:
-        Errors with free rows between the frames, mm, and the limits of their colours, mm: all but
-        one pixel in fifty are within.
-    """
-
-    def stacked(stage: str) -> np.ndarray:
-        gap = np.full((gap_rows(len(images[0][stage])), images[0][stage].shape[1]), np.nan)
-        return np.concatenate([part for one in images for part in (one[stage], gap)][:-1])
-
-    before, after = stacked("before"), stacked("after")
-    common, own = (
-        float(np.nanquantile(np.abs(column), 1 - 1 / 50)) or 1.0
-        if np.isfinite(column).any()
-        else 1.0
-        for column in (before, after)
-    )
-    return [(before, common), (after, common), (after, own)]
-
-
-def gap_rows(height: int) -> int:
-    """Return the rows left free between two frames, pixels."""
-    return max(height // 25, 1)
-
-
 def coloured(image: np.ndarray, limit: float) -> np.ndarray:
     """Return an image of errors (H, W) in colours, shape (H, W, 3), uint8; NaN is grey."""
     place = (np.clip(image / limit, -1, 1) + 1) / 2 * (len(_SCALE) - 1)
@@ -99,63 +68,46 @@ def coloured(image: np.ndarray, limit: float) -> np.ndarray:
     return shown.round().astype(np.uint8)
 
 
-def error_picture(images: Images, titles: Sequence[str]) -> tuple[np.ndarray, str]:
-    """Return errors before, after, and after once more on a finer scale, and what it shows.
-
-    Args:
-        images: The errors.
-        titles: One a frame.
+def error_picture(calibration: Calibration) -> tuple[np.ndarray, str]:
+    """Return errors of some frames before, after, and after once more on a finer scale, in colours.
 
     Returns:
-        One row a frame, (H, W, 3), uint8; and the words, in Markdown. Pictures narrower than 600
-        pixels are enlarged by a whole factor.
+        One row a frame, from the best corrected to the worst, shape (H, W, 3), uint8; and what it
+        shows, in Markdown. Pictures narrower than 600 pixels are enlarged by a whole factor.
     """
-    columns = columns_of_errors(images)
-    first, second, third = (coloured(column, limit) for column, limit in columns)
-    free = np.full((len(first), gap_rows(first.shape[1]), 3), 255, dtype=np.uint8)
-    picture = np.concatenate([first, free, second, free, third], axis=1)
+    data, stages, titles = calibration.data, calibration.stages, []
+    gap, columns = max(data.first.camera.height // 25, 1), {"before": [], "after": []}
+    for frame in frames_to_show(calibration):
+        (batch,) = data.batches(np.array([frame]))
+        for stage, column in columns.items():
+            error = errors_along_ray(data, stages[stage], batch)[0][0].numpy()
+            column.append(np.pad(error, ((0, gap), (0, gap)), constant_values=np.nan))
+        half = "held out" if frame in calibration.test else "fitted"
+        titles.append(f"{len(titles) + 1}. frame {frame}, {data.targets[frame]}, {half}")
+    before, after = (np.concatenate(column) for column in columns.values())
+    # All but one pixel in fifty are within the limits of the colours.
+    sizes = (np.abs(one[np.isfinite(one)]) for one in (before, after))
+    common, own = (float(np.quantile(one, 1 - 1 / 50)) or 1.0 if len(one) else 1.0 for one in sizes)
+    shown = (before, common), (after, common), (after, own)
+    picture = np.concatenate([coloured(*one) for one in shown], axis=1)
     factor = -(-600 // picture.shape[1])
-    rows = "\n".join(f"{n}. {title.replace(chr(10), ', ')}" for n, title in enumerate(titles, 1))
-    scales = f"Left: before, up to {columns[1][1]:.1f} mm; middle: after; right: after, up to"
-    scales += f" {columns[2][1]:.2f} mm. From top to bottom:\n\n{rows}"
-    words = f"Errors along the ray: blue too near, red too far, grey not used. {scales}"
-    return picture.repeat(factor, axis=0).repeat(factor, axis=1), words
+    words = (
+        "Errors along the ray: blue too near, red too far, grey not used. Left: before, up to "
+        f"{common:.1f} mm; middle: after; right: after, up to {own:.2f} mm. From top to bottom:\n\n"
+    )
+    return picture.repeat(factor, axis=0).repeat(factor, axis=1), words + "\n".join(titles)
 
 
-def frames_to_show(calibration: Calibration, shown: int = 5, pixels: int = 3_000_000) -> np.ndarray:
-    """Return global numbers of frames from the best corrected to the worst, at regular ranks.
-
-    Args:
-        calibration: The fitted model.
-        shown: How many: as many as fit on a page.
-        pixels: About how many are measured to choose them; bounds the time on long recordings.
-    """
+def frames_to_show(calibration: Calibration) -> np.ndarray:
+    """Return global numbers of five frames from the best corrected to the worst, by their ranks."""
     data = calibration.data
-    most = max(pixels // (data.first.camera.height * data.first.camera.width), shown)
+    # Three million pixels are measured to choose them, about.
+    most = max(3_000_000 // (data.first.camera.height * data.first.camera.width), 5)
     ranked = thinned(calibration.frames, most)
     errors = frame_errors(data, {"after": calibration.stages["after"]}, ranked)["after"]
     used = errors.count > 0
     order = np.argsort(errors.squared[used] / errors.count[used])
-    return thinned(errors.frames[used][order], shown)
-
-
-def error_images(
-    calibration: Calibration, frames: np.ndarray
-) -> tuple[list[dict[str, np.ndarray]], list[str]]:
-    """Return each frame's errors `before` and `after` along the ray, (H, W), mm, and its title.
-
-    Args:
-        calibration: The fitted model.
-        frames: Global numbers, in any order.
-    """
-    data, stages, images, titles = calibration.data, calibration.stages, [], []
-    for frame in frames:
-        (batch,) = data.batches(np.array([frame]))
-        errors = {s: errors_along_ray(data, stages[s], batch)[0] for s in ("before", "after")}
-        images.append({stage: error[0].numpy() for stage, error in errors.items()})
-        half = "held out" if frame in calibration.test else "fitted"
-        titles.append(f"frame {frame}, {data.targets[frame]}\n{half}")
-    return images, titles
+    return thinned(errors.frames[used][order], 5)
 
 
 def save_figure(figure: "Figure", path: Path) -> np.ndarray:
@@ -223,46 +175,32 @@ def draw_profile(
     axes.fill_between(middle, mean - spread, mean + spread, color=(colour, 0.2), linewidth=0)
 
 
-def residual_figure(images: Images, titles: Sequence[str]) -> "Figure":
-    """Draw the errors of some frames before and after, and after once more on a finer scale.
-
-    Args:
-        images: The errors.
-        titles: One a frame.
-    """
+def residual_figure(calibration: Calibration) -> "Figure":
+    """Draw what `error_picture` returns, with its words."""
     from matplotlib.figure import Figure
 
-    height, width = images[0]["before"].shape
-    figure = Figure(figsize=(10, 3 * len(images) * height / width + 1), layout="constrained")
-    # One picture a column: an axes a frame takes three times as long to draw.
-    panels = figure.subplots(1, 3)
-    headings = "before", "after, same scale", "after, own scale"
-    columns = columns_of_errors(images)
-    for axes, heading, (column, limit) in zip(panels, headings, columns, strict=True):
-        axes.set_title(heading, fontsize="medium")
-        axes.set(facecolor="0.75", xticks=[], yticks=[])
-        picture = axes.imshow(column, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto")
-        figure.colorbar(picture, ax=axes, location="bottom", label="error along the ray [mm]")
-    rows = height + gap_rows(height)
-    middles = np.arange(len(images)) * rows + (height - 1) / 2
-    panels[0].set_yticks(middles, titles, rotation=90, va="center", fontsize="small")
-    panels[0].tick_params(length=0)
+    picture, words = error_picture(calibration)
+    height = 10 * picture.shape[0] / picture.shape[1] + 2
+    figure = Figure(figsize=(10, height), layout="constrained")
+    axes = figure.subplots()
+    axes.imshow(picture)
+    axes.set_axis_off()
+    axes.set_title(words, fontsize="small", loc="left")
     return figure
 
 
-def points_figure(calibration: Calibration, frame: int, points: int = 4000) -> "Figure":
+def points_figure(calibration: Calibration, frame: int) -> "Figure":
     """Draw a frame's points on its plane at each stage, with the distance to it stretched.
 
     Args:
         calibration: The fitted model.
         frame: Global number of the frame.
-        points: About how many of its points.
     """
     from matplotlib.figure import Figure
 
     data, clouds = calibration.data, {}
     (batch,) = data.batches(np.array([frame]))
-    used = torch.from_numpy(thinned(batch.valid[0].flatten().nonzero()[:, 0].numpy(), points))
+    used = torch.from_numpy(thinned(batch.valid[0].flatten().nonzero()[:, 0].numpy(), 4000))
     rays, along = data.ray_directions().flatten(0, 1)[used], batch.radial_distance.flatten()[used]
     for name, model in calibration.stages.items():
         error, cosine = errors_along_ray(data, model, batch)

@@ -50,18 +50,16 @@ def masks_against_garbage(options: MaskOptions, inspection: Inspection) -> dict[
     return {"mask": "ransac", "mask_tolerance_mm": 1e3 * FAR_OFF}
 
 
-def frames_left_out(
-    inspection: Inspection, training: Iterable[np.ndarray], fewest: int = 4
-) -> tuple[int, ...]:
+def frames_left_out(inspection: Inspection, training: Iterable[np.ndarray]) -> tuple[int, ...]:
     """Return the frames that disagree with all others; none where too few would be left.
 
     Args:
         inspection: What was odd about the recordings.
         training: Global numbers of the frames to fit, an array a fit.
-        fewest: Frames left to fit on: as `split_frames` asks for, and one more.
     """
     frames = tuple(inspection.outlying)
-    enough = all((~np.isin(own, frames)).sum() >= fewest for own in training)
+    # As many to fit on as `split_frames` asks for, and one more.
+    enough = all((~np.isin(own, frames)).sum() >= 4 for own in training)
     return frames if enough else ()
 
 
@@ -246,12 +244,11 @@ def beyond_noise(held_out: float | None, noise: float) -> str | None:
     return f"{off}: poses scatter, or the model lacks a term; `tofcorr diagnose` tells which."
 
 
-def report_text(report: Mapping[str, Any], most_warnings: int = 5) -> str:
+def report_text(report: Mapping[str, Any]) -> str:
     """Return errors, hand-eye translation, advice and warnings, a line each.
 
     Args:
         report: The content of report.json.
-        most_warnings: Printed, without one that is the reason of the verdict; report.json has all.
     """
     lines = [report["headline"]] if report["headline"] else []
     # The errors as aligned columns, millimetres.
@@ -274,9 +271,9 @@ def report_text(report: Mapping[str, Any], most_warnings: int = 5) -> str:
             for pose in advice["poses"]
         ]
     found = [warning for warning in report["warnings"] if warning != report["reason"]]
-    lines += [f"Warning: {warning}" for warning in found[:most_warnings]]
-    if len(found) > most_warnings:
-        lines.append(f"{len(found) - most_warnings} more warnings are in report.json.")
+    lines += [f"Warning: {warning}" for warning in found[:5]]
+    if len(found) > 5:
+        lines.append(f"{len(found) - 5} more warnings are in report.json.")
     return "\n".join([*lines, f"Verdict: {report['verdict']}. {report['reason']}"])
 
 

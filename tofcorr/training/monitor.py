@@ -17,7 +17,7 @@ from tofcorr.geometry import se3
 from tofcorr.pixels.sample import sample_pixels
 from tofcorr.progress import event_writer
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.figures import ends_of, error_images, error_picture, frames_to_show, profile
+from tofcorr.training.figures import ends_of, error_picture, profile
 from tofcorr.training.judgement import report_text
 
 if TYPE_CHECKING:
@@ -134,6 +134,6 @@ def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
             known = errors[chosen & np.isfinite(errors)]
             if len(known):
                 writer.add_histogram(f"error_mm/{stage}_{half}", known)
-    image, words = error_picture(*error_images(calibration, frames_to_show(calibration)))
+    image, words = error_picture(calibration)
     writer.add_image("frames/error_before_and_after", image, dataformats="HWC")
     writer.add_text("frames/error_before_and_after", words)

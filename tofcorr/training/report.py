@@ -77,14 +77,14 @@ def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
     }
 
 
-def correction_curves(fit: Fit, points: int = 21) -> dict[str, list[dict[str, float]]]:
+def correction_curves(fit: Fit) -> dict[str, list[dict[str, float]]]:
     """Return the predicted error with its standard error over the calibrated ranges.
 
     The curves are those of the image's centre. Along `distance` the amplitude is the one typical of
     each distance (the middle of A D^2, within the calibrated range); along `amplitude` the distance
     is the middle one. A curve may be known well although its coefficients are not.
     """
-    domain = fit.domain
+    domain, points = fit.domain, 21
     middle = torch.full((points,), domain.radial_distance.centre, dtype=torch.float64)
     distance = torch.linspace(*domain.radial_distance, points, dtype=torch.float64)
     if domain.amplitude is None or domain.normalised_amplitude is None:
@@ -205,8 +205,6 @@ def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
             {"first": first, "second": second, "correlation": correlation}
             for (first, second), correlation in fit.observability.confounded.items()
         ],
-        # JSON has no infinity.
-        "condition": min(fit.observability.condition, 1e300),
         "prior": [] if fit.prior is None else fit.prior.names,
         "support": support.to_mapping(),
     }

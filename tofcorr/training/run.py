@@ -35,8 +35,6 @@ from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import stages
 from tofcorr.training.calibration import Calibration, TrainingOptions, calibrate
 from tofcorr.training.figures import (
-    error_images,
-    frames_to_show,
     points_figure,
     profile_figure,
     residual_figure,
@@ -176,7 +174,7 @@ class TrainingResult:
 
         The frames range from the best corrected to the worst.
         """
-        return residual_figure(*error_images(self.calibration, frames_to_show(self.calibration)))
+        return residual_figure(self.calibration)
 
     def plot_points(self, frame: int) -> "Figure":
         """Draw the points of one frame on its plane at each stage, their distance stretched.

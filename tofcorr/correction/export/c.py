@@ -233,10 +233,10 @@ def long_number(value: float) -> str:
     return _special(value) or f"{value:.16e}"
 
 
-def lines(words: Iterable[object], in_a_line: int = 6) -> str:
-    """Return words behind commas, so many in a line."""
+def lines(words: Iterable[object]) -> str:
+    """Return words behind commas, six in a line."""
     every = list(map(str, words))
-    parts = (every[k : k + in_a_line] for k in range(0, len(every), in_a_line))
+    parts = (every[k : k + 6] for k in range(0, len(every), 6))
     return "\n".join("  " + ", ".join(part) + "," for part in parts)
 
 
@@ -260,17 +260,14 @@ class Pieces:
     coefficients: np.ndarray
 
 
-def pieces_of(term: SignalTerm, limits: Domain, most_pieces: int = 4096) -> Pieces:
+def pieces_of(term: SignalTerm, limits: Domain) -> Pieces:
     """Return the pieces of a term over the calibrated ranges, to a fifth of `AGREEMENT`.
 
     Each segment is halved until they follow the term, at most seven times: 2^7 pieces of a smooth
     function over the whole range resolve more than any calibration does.
 
-    Args:
-        term: The term.
-        limits: Its ranges.
-        most_pieces: With two variables, 4096 times 64 numbers of 4 bytes fill a quarter of a
-            megabyte, which still stays in a second-level cache.
+    With two variables, 4096 times 64 numbers of 4 bytes fill a quarter of a megabyte, which still
+    stays in a second-level cache: there are no more pieces.
 
     Raises:
         ConfigError: So many pieces as there may be do not follow the term.
@@ -278,7 +275,7 @@ def pieces_of(term: SignalTerm, limits: Domain, most_pieces: int = 4096) -> Piec
     axes = term.axes() or _smooth(term, limits)
     for halvings in range(8):
         finer = tuple(axis._replace(segments=axis.segments * 2**halvings) for axis in axes)
-        if np.prod([axis.segments for axis in finer]) > most_pieces and halvings:
+        if np.prod([axis.segments for axis in finer]) > 4096 and halvings:
             break
         found = _interpolated(term, finer)
         if _error(term, found) < AGREEMENT / 5:
@@ -302,21 +299,17 @@ def _interpolated(term: SignalTerm, axes: tuple[Axis, ...]) -> Pieces:
     points = 0.5 - 0.5 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)
     to_powers = np.linalg.inv(np.vander(points, 4, increasing=True))
     values = _values(term, axes, points)
-    if len(axes) == 1:
-        coefficients = np.einsum("pi,si->sp", to_powers, values)
-    else:
-        coefficients = np.einsum("pi,qj,srij->srpq", to_powers, to_powers, values)
-    return Pieces(axes=axes, coefficients=coefficients.astype(np.float32))
+    for _ in axes:  # Along the last axis, which becomes the first of those within a segment.
+        values = np.moveaxis(values @ to_powers.T, -1, -len(axes))
+    return Pieces(axes=axes, coefficients=values.astype(np.float32))
 
 
 def _error(term: SignalTerm, pieces: Pieces) -> float:
     """Return the largest error of the pieces at probes of every segment, metres."""
     places = np.linspace(0.0, 1.0, 13)  # More than three times the points that fix a cubic.
-    powers = np.vander(places, 4, increasing=True)
-    if len(pieces.axes) == 1:
-        found = np.einsum("sp,ip->si", pieces.coefficients, powers)
-    else:
-        found = np.einsum("srpq,ip,jq->srij", pieces.coefficients, powers, powers)
+    powers, found = np.vander(places, 4, increasing=True), pieces.coefficients
+    for _ in pieces.axes:
+        found = np.moveaxis(found @ powers.T, -1, -len(pieces.axes))
     return float(np.abs(found - _values(term, pieces.axes, places)).max())
 
 

@@ -190,18 +190,18 @@ def match(planes: SeenPlanes, fewest: int) -> Joint:
     return _nearest_of_best([_followed(planes, start, fewest) for start in starts])
 
 
-def match_single_ray(planes: SeenPlanes, directions: int = 1500) -> Joint:
+def match_single_ray(planes: SeenPlanes) -> Joint:
     """Find a one-pixel sensor's hand-eye and the walls it looked at.
 
     What cannot be seen, the turn about the ray at least, stays near the identity.
 
     Args:
         planes: One point an image, its wall known by label.
-        directions: Directions of the ray that are tried: 1500 are some 5 degrees apart.
     """
     assert planes.label is not None
     ray = torch.nn.functional.normalize(planes.points[0, 0], dim=0)
-    # Directions spread evenly: a Fibonacci lattice.
+    # Directions spread evenly, some 5 degrees apart: a Fibonacci lattice.
+    directions = 1500
     place = torch.arange(directions, dtype=torch.float64) + 0.5
     z, angle = 1 - 2 * place / directions, math.pi * (1 + math.sqrt(5)) * place
     radius = (1 - z.square()).sqrt()

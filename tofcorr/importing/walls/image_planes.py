@@ -238,13 +238,13 @@ def plane_masks(
     return near & (near.sum(dim=0) == 1)
 
 
-def _described(rays: Tensor, mask: Tensor, gradient: Tensor, most: int = 20_000) -> ImagePlane:
+def _described(rays: Tensor, mask: Tensor, gradient: Tensor) -> ImagePlane:
     """Describe the plane g . x = 1 that was fitted to the pixels of a mask (H, W).
 
-    About `most` of them do: noise of 10 mm then moves the plane by 0.1 mm.
+    About 20 000 of them do: noise of 10 mm then moves the plane by 0.1 mm.
     """
     used = mask.flatten().nonzero()[:, 0]
-    direction = rays.flatten(0, 1)[used[:: max(1, len(used) // most)]].double()
+    direction = rays.flatten(0, 1)[used[:: max(1, len(used) // 20_000)]].double()
     points = direction / (direction @ gradient)[:, None]
     mean = points.mean(dim=0)
     values, vectors = torch.linalg.eigh((points - mean).T @ (points - mean) / len(points))
