@@ -131,7 +131,7 @@ def test_one_reflectivity_is_named_only_if_the_model_has_an_intensity(
     assert "one reflectivity" in warned("white")
     dataset = walls["white"]
     support = recording_support(dataset, np.arange(dataset.num_frames), true_hand_eye(dataset))
-    assert not shortcomings(support, moves=True, with_intensity=False)
+    assert not list(shortcomings(support, moves=True, with_intensity=False))
 
 
 def test_undetermined_directions_keep_the_prior_and_it_moves_no_other(fits: FitOf) -> None:
@@ -159,7 +159,7 @@ def test_a_direction_known_only_through_jitter_stays_near_the_recorded_guess(
 
 
 def test_undetermined_directions_can_be_refused(walls: dict[str, Dataset]) -> None:
-    with pytest.raises(CalibrationDataError, match=r"do not determine: .*t_.*tilted"):
+    with pytest.raises(CalibrationDataError, match=r"do not determine: .*t_.*tilt"):
         fitted(walls["one axis"], free_directions="refuse")
 
 

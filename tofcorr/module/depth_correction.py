@@ -5,11 +5,11 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 import torch
-from pydantic import InstanceOf
+from pydantic import AfterValidator, InstanceOf
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
@@ -90,10 +90,16 @@ class Labels(Options):
     hand_eye_estimated: bool = True
 
 
+def _numbers(values: Tensor) -> Tensor:
+    if bool(values.isnan().any()):
+        raise ValueError("holds what is not a number")
+    return values
+
+
 class _ModuleFile(CalibrationExtras):
     """What a file of `DepthCorrection.save` holds besides format and version."""
 
-    state: dict[str, InstanceOf[Tensor]]
+    state: dict[str, Annotated[InstanceOf[Tensor], AfterValidator(_numbers)]]
 
 
 class DepthCorrection(FrameCorrection):
@@ -392,7 +398,6 @@ class DepthCorrection(FrameCorrection):
             module.to(state["error_model.constant"].dtype).load_state_dict(state)
             module.hand_eye.twist.requires_grad_(labels.hand_eye_estimated)
             module.extras = entry.extras()
-            _refuse_no_numbers(state)
             module.to_state()  # Refuses other numbers than the terms have.
         except (ConfigError, StateError) as error:
             raise CalibrationDataError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
@@ -427,13 +432,6 @@ class DepthCorrection(FrameCorrection):
         module.options = options
         module._take_over(state)
         return module
-
-
-def _refuse_no_numbers(state: Mapping[str, Tensor]) -> None:
-    """Refuse values that no parameter and no buffer can have."""
-    for name, values in state.items():
-        if bool(values.isnan().any()):
-            raise ValueError(f"'{name}' holds what is not a number")
 
 
 def _untrained(options: TrainingOptions, domain: Domain) -> ErrorModel:

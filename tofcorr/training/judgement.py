@@ -12,7 +12,7 @@ from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.sample import MaskOptions
 from tofcorr.plausibility.finding import FAR_OFF, Inspection, in_words
 from tofcorr.training.calibration import TrainingOptions
-from tofcorr.training.support import Support, hardly_tilted, shortcomings, worst_sigma
+from tofcorr.training.support import Support, shortcomings, worst_sigma
 
 Training = TypeVar("Training", bound=TrainingOptions)
 Verdict = Literal["good", "usable", "do not use"]
@@ -99,16 +99,15 @@ def judge(
         robot_moves: Whether a robot moved the camera.
     """
     free = fit.solution.parameters.hand_eye_is_free
-    needed = shortcomings(support, moves=free, with_intensity=fit.model.error.needs_amplitude())
+    with_intensity = fit.model.error.needs_amplitude()
     said = [*_of_errors(fit, errors, 1e3 * inspection.look.noise), *_of_directions(fit)]
-    frontal = hardly_tilted(support)
-    said.extend(("usable", one) if one == frontal else ("good", one) for one in needed)
+    for serious, one in shortcomings(support, moves=free, with_intensity=with_intensity):
+        said.append(("usable" if serious else "good", one))
     if beyond := beyond_noise(errors["after"]["test"]["rms"], 1e3 * inspection.look.noise_rms):
         said.append(("usable", beyond))
     # From n images a standard error is known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
     if (images := fit.moments.num_images) < 10:
-        few = f"Only {images} images were fitted; standard errors are rough below 10."
-        said.append(("good", few))
+        said.append(("good", f"Only {images} images were fitted: standard errors are rough."))
     if fit.residual:
         said.append(("good", fit.residual))
     if not robot_moves:
@@ -157,17 +156,12 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
     # Shorter distances have smaller noise, so that unknown walls move nearer. No camera's error
     # grows by a third of the distance.
     if fit.walls is not None and fit.gain < 2 / 3:
-        yield (
-            DO_NOT_USE,
-            f"Where 1 m is measured, the fit leaves {fit.gain:.2f} m. Record poses nearer and "
-            "farther, or measure the wall's plane.",
-        )
+        left = f"Where 1 m is measured, the fit leaves {fit.gain:.2f} m"
+        yield DO_NOT_USE, f"{left}. Record poses nearer and farther, or measure the wall's plane."
     # No model can foresee noise: below a tenth of it a fit has collapsed.
     if not fitted >= noise / 10 and math.isfinite(noise):
-        yield (
-            DO_NOT_USE,
-            f"The fit leaves {fitted:.2g} mm of {noise:.1f} mm noise: too few different frames.",
-        )
+        left = f"The fit leaves {fitted:.2g} mm of {noise:.1f} mm noise"
+        yield DO_NOT_USE, f"{left}: too few different frames."
     if held_out > _WORSE * bare:
         yield DO_NOT_USE, f"{measured}: the depth correction makes them worse."
     elif held_out > _NO_GAIN * bare and held_out > 3 * noise:
@@ -192,39 +186,28 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
         yield "usable" if max(fit.misfit.size) > _WEAK else "good", fit.misfit.lacking()
     if not solution.converged and solution.stopped != "not_finite":
         yield "usable", solution.message
-    wide = 1e3 * PRIOR_SIGMA
+    wide, of_pose = 1e3 * PRIOR_SIGMA, "usable" if free else "good"
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
     weak = [one for one in fit.observability.directions if one.sigma > _WEAK]
     of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
     others = [one for one in weak if not set(one.shares) <= curves]
     if undetermined := [one.in_words() for one in others if one.is_undetermined]:
-        yield (
-            "usable" if free else "good",
-            f"The images do not determine {'; '.join(undetermined)}: a prior of {wide:g} mm and "
-            f"{wide:g} mrad is used instead. Record more tilts and distances.",
-        )
+        lacking = f"{'; '.join(undetermined)}: a prior of {wide:g} mm and {wide:g} mrad is used"
+        yield of_pose, f"The images do not determine {lacking}. Record more tilts and distances."
     if uncertain := [one for one in others if not one.is_undetermined]:
         of_hand_eye = any(name.startswith(("t_", "w_")) for one in uncertain for name in one.shares)
         words = "; ".join(f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in uncertain[:3])
-        yield (
-            "usable" if free and of_hand_eye else "good",
-            f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad): {words}.",
-        )
+        count = f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad)"
+        yield of_pose if of_hand_eye else "good", f"{count}: {words}."
     if free:
         covariance = fit.hand_eye_covariance
         shift, turn = (worst_sigma(covariance[axes, axes]) for axes in (slice(3), slice(3, 6)))
         if max(shift, turn) > _WEAK:
-            yield (
-                "usable",
-                f"The hand-eye is known to {1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only: "
-                "record more tilts and distances.",
-            )
+            size = f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only"
+            yield "usable", f"The hand-eye is known to {size}: record more tilts and distances."
     if of_curves:
-        yield (
-            "good",
-            "Parts of the curves are set by the smoothing penalty, not by data: their standard "
-            f"deviations reach {1e3 * max(of_curves):.0f} mm.",
-        )
+        size = f"their standard deviations reach {1e3 * max(of_curves):.0f} mm"
+        yield "good", f"Parts of the curves are set by the smoothing penalty, not by data: {size}."
 
 
 def beyond_noise(held_out: float | None, noise: float) -> str | None:

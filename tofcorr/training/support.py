@@ -1,7 +1,7 @@
 """What the poses and the target cover, in numbers, and what a calibration would need besides."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,43 +72,38 @@ def recording_support(
 _ENOUGH_TILT = 5
 
 
-def hardly_tilted(support: Support) -> str | None:
-    """Return one sentence if a moving camera saw all walls from the front; None: it did not."""
-    strong, _ = support.tilt_deg
-    if strong >= _ENOUGH_TILT:
-        return None
-    needed = f"(standard deviation {strong:.1f} degrees, {_ENOUGH_TILT} needed on two axes)"
-    return f"The camera is hardly tilted {needed}: the hand-eye rests on the model's form."
-
-
-def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list[str]:
-    """Return what a calibration would need and the recording does not cover, one sentence each.
+def shortcomings(
+    support: Support, *, moves: bool, with_intensity: bool
+) -> Iterator[tuple[bool, str]]:
+    """Yield what a calibration would need and the recording does not cover.
 
     Args:
         support: What it covers.
         moves: Whether a hand-eye transform is estimated.
         with_intensity: Whether the model has an intensity term.
+
+    Yields:
+        Whether the result is worse for it in any case, and one sentence.
     """
-    (strong, weak), frontal = support.tilt_deg, hardly_tilted(support) if moves else None
-    found = [] if frontal is None else [frontal]
-    if moves and frontal is None and weak < _ENOUGH_TILT:
+    strong, weak = support.tilt_deg
+    if moves and strong < _ENOUGH_TILT:
+        needed = f"(standard deviation {strong:.1f} degrees, {_ENOUGH_TILT} needed on two axes)"
+        yield True, f"The camera is hardly tilted {needed}: the hand-eye rests on the model's form."
+    elif moves and weak < _ENOUGH_TILT:
         roll = support.roll_deg or 0.0
         # More makes up for tilt about one axis only.
         hint = "" if roll > 10 else f" and hardly rolled ({roll:.1f} degrees)"
         needed = f"(standard deviation {strong:.1f} and {weak:.1f} degrees, {_ENOUGH_TILT} needed)"
-        found.append(f"The camera is tilted about one axis only {needed}{hint}: tilt or roll it.")
+        yield False, f"The camera is tilted about one axis only {needed}{hint}: tilt or roll it."
     low, high = support.distance_m
     # Below half of its centre the distance term can hardly be separated from the constant.
     if high - low < (high + low) / 4:
         ends = f"({low:.2f} to {high:.2f} m): c0 cannot be separated from t_z"
-        found.append(f"The range of distances is narrow {ends}; add nearer and farther views.")
+        yield False, f"The range of distances is narrow {ends}; add nearer and farther views."
     ratio = support.reflectivity_ratio
     if with_intensity and ratio is not None and ratio < ENOUGH_REFLECTIVITY:
         needed = f"(bright to dark {ratio:.1f} to 1, {ENOUGH_REFLECTIVITY} to 1 needed)"
-        found.append(
-            f"The target has one reflectivity {needed}: add a checkerboard or a grey wall."
-        )
-    return found
+        yield False, f"The target has one reflectivity {needed}: add a checkerboard or a grey wall."
 
 
 def worst_sigma(covariance: Tensor) -> float:

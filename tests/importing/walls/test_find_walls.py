@@ -62,7 +62,6 @@ def test_three_walls_and_a_floor_are_found_and_every_view_is_of_its_wall(
     assert (apart(found.tool_from_camera, room.tool_from_camera) < (NEAR_MM, NEAR_DEG)).all()
     for image, wall in zip(found.image, found.wall, strict=True):
         assert (views.plane[image] == shown[wall]).mean() > 0.03
-    assert found.warnings() == []
 
 
 def test_walls_are_named_by_their_pixels_and_the_lowest_horizontal_one_is_the_floor() -> None:
