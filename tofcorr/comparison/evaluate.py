@@ -233,8 +233,8 @@ class EvaluationResult:
                 share = abs(found.mean) / one.estimate(protocol, metric, first).mean
                 better = f"{second if found.mean > 0 else first} better by {100 * share:.0f} %"
                 verdict = better if found.significant else "no difference found"
-                p = "<0.0001" if found.p_value < 1e-4 else f"{found.p_value:.4f}"
-                rows.append([f"{one.name}: {first} / {second}", _interval(found), p, verdict])
+                cells = [_interval(found), f"{found.p_value:.2g}", verdict]
+                rows.append([f"{one.name}: {first} / {second}", *cells])
         name = "mean absolute error" if metric == "mean_abs_mm" else "RMS"
         source = "folds" if protocol == "folds" else "random splits, corrected for their overlap"
         return Table(

@@ -14,6 +14,7 @@ from tofcorr.comparison.options import SelectionOptions, comparability_notes, ma
 from tofcorr.comparison.statistics import Ranking, Table, rank
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.files import staged_folder
 from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
@@ -23,9 +24,6 @@ from tofcorr.plausibility.examine import vet
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import number_or_none
 
-# Unknowns that a residual network counts for: more than any curve has, so that it is chosen only
-# where no curve comes within one standard error of it. Its true number would do the same.
-_NETWORK_UNKNOWNS = 1000
 _HEADINGS = {
     "image": "Images held out",
     "distance": "Bands of distance held out",
@@ -241,4 +239,6 @@ def _complexity(training: TrainingOptions, domain: Domain, dataset: Dataset) -> 
         unknowns += domain.height * domain.width
     if training.planes == "unknown":
         unknowns += 3 * len(name_walls(dataset)[1])
-    return unknowns + (training.residual is not None) * _NETWORK_UNKNOWNS
+    if training.residual is not None:
+        unknowns += ResidualNetwork(training.residual.network, domain).weight_vector().numel()
+    return unknowns

@@ -20,10 +20,6 @@ from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.geometry.se3 import product, projected, transformed
 
-# Largest deviation of R^T R from the identity (no unit). More than that is a mistake rather than
-# rounding: float32 rounds to 1e-7.
-_RIGIDITY_TOLERANCE = 1e-6
-
 
 class HandEye(nn.Module):
     r"""A rigid transform near an initial guess, optimised without constraints.
@@ -132,7 +128,8 @@ def _rigid(transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> Tensor
     """Return a float64 copy of `transform`, after checking that it is rigid."""
     matrix = torch.as_tensor(transform, dtype=torch.float64).detach().clone()
     try:
-        se3.refuse_unless_rigid(matrix.cpu().numpy(), _RIGIDITY_TOLERANCE)
+        # More is a mistake rather than rounding.
+        se3.refuse_unless_rigid(matrix.cpu().numpy(), 10 * torch.finfo(torch.float32).eps)
     except ValueError as error:
         raise ValueError(f"A hand-eye transform: {error}, got {matrix.tolist()}.") from None
     return matrix

@@ -126,7 +126,7 @@ class Domain:
         """
         if self.amplitude is None or self.normalised_amplitude is None:
             raise CalibrationDataError("An intensity term needs amplitude.npy; or choose others.")
-        return max(self.amplitude.high * LOG_FLOOR, 1e-30)
+        return max(self.amplitude.high * LOG_FLOOR, float(np.finfo(np.float32).tiny))
 
     def interval(self, variable: Variable) -> Interval:
         """Return the calibrated range of a variable.

@@ -108,7 +108,7 @@ class Design:
             form = term.polynomial()
             if form is not None and form.variable == "distance":
                 u = term.basis(distance, amplitude)[0].detach()
-                if torch.allclose(form.centre + form.half_width * u, distance, rtol=1e-14):
+                if torch.allclose(form.centre + form.half_width * u, distance, rtol=_EXACT):
                     return number, float(form.centre), float(form.half_width)
             number += len(term.symbols)
         return None

@@ -385,7 +385,7 @@ def estimate(sums: GroupSums, prior_precision: Tensor, start: Variances, of: Cla
     for _ in range(60):
         before = variances
         variances = _updated(sums, unknowns_given(sums, prior_precision, before), of)
-        if _change(before, variances) < 0.01:
+        if 100 * _change(before, variances) < 1:
             break
     return unknowns_given(sums, prior_precision, variances)
 

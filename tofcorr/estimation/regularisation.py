@@ -103,8 +103,7 @@ def with_strengths(
     middle = STRENGTHS[len(STRENGTHS) // 2]
     chosen = [replace(p, strength=middle) if p.strength == "auto" else p for p in penalties]
     images = MomentObjective(moments, smoothness(chosen, total_weight(moments), start))
-    roughly = SolverOptions(max_iterations=20, tolerance=1e-3)
-    around = minimise(images, start, roughly).parameters
+    around = minimise(images, start, SolverOptions(max_iterations=20)).parameters
     equations = images.image_equations(around)
     weights = moments.gram[:, -1, -1]
 

@@ -345,7 +345,7 @@ def _with_pattern(problem: Problem, core: Core) -> CalibrationModel:
     variance = within.sum() / (number - 1).clamp(min=0).sum().clamp(min=1)
     own = torch.where(seen, variance / square, torch.inf)
     spread = pattern.options.spread_mm  # type: ignore[attr-defined]
-    of_offsets = torch.as_tensor(0.0 if spread == "auto" else (1e-3 * spread) ** 2)
+    of_offsets = torch.as_tensor(0.0 if spread == "auto" else (spread / 1000) ** 2)
     if spread == "auto" and bool(seen.any()):
         of_offsets = (mean[seen].square().mean() - own[seen].mean()).clamp(min=0)
     # Without spread and without uncertainty, the offsets are the means: zero.

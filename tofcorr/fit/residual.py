@@ -139,17 +139,11 @@ def _train(
 def _minimise(unknowns: Sequence[Tensor], loss_of: Callable[[], Tensor], iterations: int) -> None:
     """Minimise a loss without unit, 1 at the start, by L-BFGS.
 
-    The tolerances, on gradient and change, are far below what a held-out error can tell; the
-    limit on iterations ends most trainings.
+    The limit on iterations ends most trainings; the tolerances are far below what a held-out error
+    can tell.
     """
-    optimiser = torch.optim.LBFGS(
-        unknowns,
-        max_iter=iterations,
-        history_size=20,
-        tolerance_grad=1e-9,
-        tolerance_change=1e-10,
-        line_search_fn="strong_wolfe",
-    )
+    search = {"max_iter": iterations, "history_size": 20, "line_search_fn": "strong_wolfe"}
+    optimiser = torch.optim.LBFGS(unknowns, **search)
 
     def closure() -> Tensor:
         optimiser.zero_grad()

@@ -137,7 +137,7 @@ def _without_repeats(time: np.ndarray, poses: np.ndarray, source: str) -> np.nda
         raise CalibrationDataError(f"{source}: pose {place}: expected increasing times, {stamps}.")
     same = np.flatnonzero(time == before)
     for place in same:
-        if not np.allclose(poses[place], poses[place - 1], atol=1e-6):
+        if not np.allclose(poses[place], poses[place - 1]):
             said = f"pose {place} repeats the time {time[place]:.6f} s"
             raise CalibrationDataError(f"{source}: {said}; are stamps rounded?")
     return np.setdiff1d(np.arange(len(time)), same)

@@ -12,10 +12,6 @@ from tofcorr.errors import ExportError
 
 Correct = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
-# Pixels this close to an edge of the validity range, relative, may be valid or not: rounding to
-# float32 decides. A hundred times the resolution of float32, for the products of variables.
-_EDGE = 1e-5
-
 
 def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
     """Return frames inside and around the calibrated ranges, with every kind of missing return.
@@ -49,9 +45,10 @@ def require_parity(correct: Correct, state: CalibrationState, tolerance: float =
     depth, amplitude = (frame.double() for frame in frames)
     corrected, valid = correct(*frames)
     expected, expected_valid = reference(depth, amplitude), reference.valid(depth, amplitude)
-    # Nudging the inputs by a rounding error changes the validity of a pixel on an edge.
-    on_edge = torch.zeros_like(expected_valid)
-    for d, a in ((1 + _EDGE, 1.0), (1 - _EDGE, 1.0), (1.0, 1 + _EDGE), (1.0, 1 - _EDGE)):
+    # Nudging the inputs by some roundings of float32, for the products of variables, changes the
+    # validity of a pixel on an edge: it may be valid or not.
+    on_edge, edge = torch.zeros_like(expected_valid), 100 * torch.finfo(torch.float32).eps
+    for d, a in ((1 + edge, 1.0), (1 - edge, 1.0), (1.0, 1 + edge), (1.0, 1 - edge)):
         on_edge |= reference.valid(depth * d, amplitude * a) != expected_valid
     lost = corrected.isfinite() != expected.isfinite()
     mistaken = int((lost | ((valid != expected_valid) & ~on_edge)).sum())

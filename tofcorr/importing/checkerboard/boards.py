@@ -23,9 +23,6 @@ _SMALL_IMAGE_PIXELS = 1_000_000
 """Largest number of pixels of an image that is enlarged before the search: adaptive thresholds need
 several pixels per square. Set by hand."""
 
-_REFINEMENT_SCALE = 2
-"""Enlargement for the refinement of corners. Set by hand."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class FlatBoard(ABC):
@@ -271,13 +268,13 @@ def _enlarged(image: np.ndarray, scale: int) -> np.ndarray:
 
 def _to_subpixels(image: np.ndarray, corners: np.ndarray, half_window: float) -> np.ndarray:
     """Refine corners (N, 2) on an image of floats, within a window (half its side, pixels)."""
-    window = 2 * (max(2, round(_REFINEMENT_SCALE * half_window)),)
+    window, scale = 2 * (max(2, round(2 * half_window)),), 2
     # Pixel centres are at integers, so enlarging shifts the origin by half a pixel.
-    there = ((corners + 0.5) * _REFINEMENT_SCALE - 0.5).astype(np.float32)
+    there = ((corners + 0.5) * scale - 0.5).astype(np.float32)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    larger = _enlarged(image, _REFINEMENT_SCALE)
+    larger = _enlarged(image, scale)
     refined = cv2.cornerSubPix(larger, np.ascontiguousarray(there), window, (-1, -1), stop)
-    return _unscaled(refined, _REFINEMENT_SCALE)
+    return _unscaled(refined, scale)
 
 
 def _unscaled(pixels: np.ndarray, scale: int) -> np.ndarray:
