@@ -289,8 +289,8 @@ class RuntimeRange(nn.Module):
 class RuntimeErrorModel(nn.Module):
     """The predicted error times a factor, in the form that is fastest to evaluate.
 
-    Constant and pixel terms become one image. All polynomials in one variable become one
-    polynomial, evaluated in place; every other term runs as it is, in float32. The condition terms
+    Constant and pixel terms become one image. The polynomial in a variable is evaluated in place;
+    every other term runs as it is, in float32. The condition terms
     of a frame sum to one number, which `set_conditions` adds to the image.
 
     Args:
@@ -312,18 +312,18 @@ class RuntimeErrorModel(nn.Module):
 
     def __init__(self, model: ErrorModel, limits: Domain, factor: float) -> None:
         super().__init__()
-        sums, others = summed_polynomials(model)
+        found, others = polynomials(model)
         self.factor: float = factor
         near, strong = limits.radial_distance, limits.amplitude or EVERYTHING
-        self.distance = RuntimePolynomial(sums.get("distance"), near, factor)
-        self.amplitude = RuntimePolynomial(sums.get("amplitude"), strong, factor)
-        normalised = sums.get("normalised_amplitude")
+        self.distance = RuntimePolynomial(found.get("distance"), near, factor)
+        self.amplitude = RuntimePolynomial(found.get("amplitude"), strong, factor)
+        normalised = found.get("normalised_amplitude")
         bounds = limits.normalised_amplitude or EVERYTHING
         self.normalised = RuntimePolynomial(normalised, bounds, factor)
-        polynomials = (self.distance, self.amplitude, self.normalised)
-        self.left_over: float = sum(one.left_over for one in polynomials)
+        parts = (self.distance, self.amplitude, self.normalised)
+        self.left_over: float = sum(one.left_over for one in parts)
         self.others = _frozen(others)
-        self.has_amplitude: bool = "amplitude" in sums
+        self.has_amplitude: bool = "amplitude" in found
         self.has_normalised: bool = normalised is not None
         self.needs_amplitude: bool = model.needs_amplitude()
         offset = factor * (model.pixel_error().detach() + self.left_over)
@@ -533,22 +533,17 @@ def _numbers(tensor: Tensor) -> str:
     return kind + str(8 * tensor.element_size())
 
 
-def summed_polynomials(model: ErrorModel) -> tuple[dict[str, ScaledPolynomial], list[SignalTerm]]:
-    """Return the sum of the polynomials in each variable, and the terms that are in none."""
-    sums: dict[str, ScaledPolynomial] = {}
+def polynomials(model: ErrorModel) -> tuple[dict[str, ScaledPolynomial], list[SignalTerm]]:
+    """Return a polynomial in each variable that has one, and the other terms."""
+    found: dict[str, ScaledPolynomial] = {}
     others: list[SignalTerm] = []
     for term in model.signal_terms:
         own: ScaledPolynomial | None = term.polynomial()  # type: ignore[operator, assignment]
-        before = own and sums.get(own.variable)
-        if own is None or (before and before[2:] != own[2:]):
+        if own is None or own.variable in found:
             others.append(term)  # type: ignore[arg-type]
-            continue
-        if before:
-            parts = [one.coefficients.detach().cpu() for one in (before, own)]
-            total = torch.nn.utils.rnn.pad_sequence(parts, batch_first=True).sum(0)
-            own = own._replace(coefficients=total)
-        sums[own.variable] = own
-    return sums, others
+        else:
+            found[own.variable] = own
+    return found, others
 
 
 def separated(error: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -23,8 +23,8 @@ from torch import Tensor
 from tofcorr.correction.corrector import (
     DepthCorrector,
     RuntimeErrorModel,
+    polynomials,
     separated,
-    summed_polynomials,
 )
 from tofcorr.correction.export.parity import Correct, probe_frames, require_parity
 from tofcorr.correction.model import AGREEMENT
@@ -170,7 +170,7 @@ def _filled_in(state: CalibrationState, metadata: str, name: str) -> dict[str, A
     amplitudes = limits.amplitude or EVERYTHING
     runtime = RuntimeErrorModel(model, limits, 1.0)
     row_error, column_error, rest = separated(model.pixel_error() + runtime.left_over)
-    pieces = [pieces_of(term, limits) for term in summed_polynomials(model)[1]]
+    pieces = [pieces_of(term, limits) for term in polynomials(model)[1]]
     variables = {axis.variable for one in pieces for axis in one.axes}
     needs_amplitude = model.needs_amplitude()
     most = state.saturation_amplitude
