@@ -517,7 +517,7 @@ def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> N
         )
     if list(amplitude.shape) != list(depth.shape):
         raise ValueError(
-            f"amplitude: expected shape {list(depth.shape)}, got {list(amplitude.shape)}."
+            f"amplitude: expected depth's shape {list(depth.shape)}, got {list(amplitude.shape)}."
         )
     if depth.dtype != torch.float32 or amplitude.dtype != torch.float32:
         raise ValueError(

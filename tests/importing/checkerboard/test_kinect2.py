@@ -20,7 +20,8 @@ INTRINSICS = intrinsics_from_numbers(
 def import_views(real_data: Path, wildcard: str, out: Path) -> tuple[dict[str, Any], Recording]:
     depth, infrared = f"{wildcard}_sync_depth.png", f"{wildcard}_sync_ir.png"
     board = {"board_columns": 5, "board_rows": 7, "square_length": 0.03}
-    options = CheckerboardOptions(depth_pattern=depth, infrared_pattern=infrared, **board)
+    names = {"infrared_pattern": infrared, "amplitude_pattern": infrared}
+    options = CheckerboardOptions(depth_pattern=depth, **names, **board)
     folder = real_data / "kinect2_checkerboard"
     report = import_checkerboard(folder, out, options, INTRINSICS)
     return report, Recording.open(out)

@@ -103,7 +103,7 @@ def leave_two(folder: Path) -> None:
             "no file matches depth",
         ),
         (leave, {"lens": (*LENS, "--square-mm", "-1")}, "square_length"),
-        (leave, {"lens": (*LENS, "--max-reprojection-px", "0.001")}, "0.001 are allowed"),
+        (leave, {"lens": (*LENS, "--max-reprojection-px", "0.001")}, "at most 0.001 px"),
     ],
 )
 def test_a_hopeless_import_is_one_message_and_leaves_nothing(

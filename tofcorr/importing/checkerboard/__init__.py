@@ -71,6 +71,7 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     intrinsics = take_intrinsics(given)
     given |= given.pop("board")
     given["square_length"] = given.pop("square_mm") / 1000
-    given["depth_unit"] = given.pop("depth_unit_mm") / 1000
+    given["amplitude_pattern"] = given["infrared_pattern"]
+    given["coding"] = {"unit_mm": given.pop("depth_unit_mm"), "invalid": ()}
     options = CheckerboardOptions.from_mapping(given, "tofcorr import checkerboard")
     print_report(import_checkerboard(folder, out, options, intrinsics), out)

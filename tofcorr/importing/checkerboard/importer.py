@@ -82,7 +82,8 @@ class CheckerboardOptions(Options):
 
     Attributes:
         depth_pattern: Names of the depth images, with `{view}` or wildcards.
-        infrared_pattern: Names of the infrared images.
+        infrared_pattern: Names of the infrared images, in which the boards are found.
+        amplitude_pattern: Names of the amplitude images; None: there are none.
         board_kind: One of `tofcorr.importing.checkerboard.boards.BOARDS`.
         board_columns: Inner corners in a row; squares or tags of other kinds.
         board_rows: The same in a column.
@@ -90,7 +91,7 @@ class CheckerboardOptions(Options):
         board_share: Side of the markers, or space between tags, as a share of a side; None: the
             kind's usual one.
         square_length: Side of a square or tag, metres.
-        depth_unit: Metres per count of the depth images; 0 counts mean no return.
+        coding: How the numbers of the depth images are to be read.
         depth_kind: `z`: along the optical axis; `radial`: along the ray.
         saturation_counts: Infrared counts from which a pixel is saturated; None: never.
         margin_squares: How far the mask extends beyond the outermost inner corners, in squares. Up
@@ -101,13 +102,14 @@ class CheckerboardOptions(Options):
 
     depth_pattern: str = "{view}_depth.png"
     infrared_pattern: str = "{view}_ir.png"
+    amplitude_pattern: str | None = "{view}_ir.png"
     board_kind: Literal["checkerboard", "charuco", "apriltag"] = "checkerboard"
     board_columns: CornerCount
     board_rows: CornerCount
     board_dictionary: str | None = None
     board_share: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     square_length: Positive
-    depth_unit: Positive = 1e-3
+    coding: DepthCoding = DepthCoding(invalid=())
     depth_kind: DepthKind = "z"
     saturation_counts: Positive | None = 65535.0
     margin_squares: Annotated[float, Field(gt=-1.0, le=2.0)] = 0.0
@@ -156,9 +158,6 @@ def import_checkerboard(
     out: Path,
     options: CheckerboardOptions,
     intrinsics: GivenIntrinsics | None,
-    *,
-    coding: DepthCoding | None = None,
-    amplitude_pattern: str | None = None,
 ) -> dict[str, Any]:
     """Turn images of a board into a recording, with `import.json` beside the arrays.
 
@@ -170,18 +169,12 @@ def import_checkerboard(
         out: The recording to write; it must not exist yet.
         options: How to read the images.
         intrinsics: The camera intrinsics; None: calibrate them from the board.
-        coding: How depth is to be read, where the infrared images may be previews; None: as
-            `options` say, and infrared counts are the amplitudes.
-        amplitude_pattern: With `coding`, names of the amplitude images; None: there are none.
 
     Raises:
         CalibrationDataError: No view can be used, the intrinsics do not fit the images, a unit
             must be wrong, or `out` exists or cannot be written.
     """
-    if coding is None:
-        coding = DepthCoding(unit_mm=1000 * options.depth_unit, invalid=())
-        amplitude_pattern = options.infrared_pattern
-    prepare = BoardImport(folder, options, intrinsics, coding, amplitude_pattern).prepare
+    prepare = BoardImport(folder, options, intrinsics).prepare
     return run_import(str(folder), options, prepare, out)
 
 
@@ -192,17 +185,12 @@ class BoardImport:
     _rays: np.ndarray
 
     def __init__(
-        self,
-        folder: Path,
-        options: CheckerboardOptions,
-        intrinsics: GivenIntrinsics | None,
-        coding: DepthCoding,
-        amplitude_pattern: str | None,
+        self, folder: Path, options: CheckerboardOptions, intrinsics: GivenIntrinsics | None
     ) -> None:
-        self._folder, self._options, self._coding = folder, options, coding
+        self._folder, self._options, self._coding = folder, options, options.coding
         self._intrinsics, self._board = intrinsics, options.board()
         patterns = {"depth": options.depth_pattern, "infrared": options.infrared_pattern}
-        patterns |= {"amplitude": amplitude_pattern} if amplitude_pattern else {}
+        patterns |= {"amplitude": options.amplitude_pattern} if options.amplitude_pattern else {}
         self._files, self._alone = files_of_views(folder, patterns)
         self._corners: dict[str, np.ndarray] = {}
         self._sizes: dict[str, tuple[int, int]] = {}

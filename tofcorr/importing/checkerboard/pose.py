@@ -120,7 +120,7 @@ def estimate_pose(
         best, *others = poses_of(corners, board, camera, used)
     if not best.reprojection_rms <= max_reprojection:
         missed = (
-            f"{best.reprojection_rms:.2f} px (root mean square), {max_reprojection:g} are allowed"
+            f"{best.reprojection_rms:.2f} px of at most {max_reprojection:g} px"
         )
         raise RefusedViewError(f"the corners miss the board by {missed}; is it bent, or blurred?")
     for other in others:

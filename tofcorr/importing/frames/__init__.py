@@ -82,16 +82,15 @@ def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, An
     corners = given["grey_pattern"] or amplitude
     if corners is None or given["square_mm"] is None:
         raise ConfigError("a board needs --square-mm, and --grey (or --amplitude) to find it in.")
-    coding = take_coding(given)
     mapping = given["board"] | {
         "depth_pattern": given["depth_pattern"],
         "infrared_pattern": corners,
+        "amplitude_pattern": amplitude,
         "square_length": given["square_mm"] / 1000,
-        "depth_unit": (coding.unit_mm or 1.0) / 1000,
+        "coding": take_coding(given),
         "depth_kind": given["depth_kind"],
         "saturation_counts": given["saturation_amplitude"],
         "modulation_frequency": given["modulation_frequency_hz"],
     }
     options = CheckerboardOptions.from_mapping(mapping, "tofcorr import frames")
-    lens, images = take_intrinsics(given), {"coding": coding, "amplitude_pattern": amplitude}
-    return import_checkerboard(folder, out, options, lens, **images)
+    return import_checkerboard(folder, out, options, take_intrinsics(given))
