@@ -82,10 +82,9 @@ def _refuse_another_camera(
     camera, made_for = recording.camera, metadata.camera
     size = (made_for.width or camera.width, made_for.height or camera.height)
     if size != (camera.width, camera.height):
-        said = (
-            f"{camera.width}x{camera.height} pixels, but {model} was made for {size[0]}x{size[1]}"
-        )
-        raise CalibrationDataError(f"{recording.path}: frames are {said}.")
+        frames = f"frames are {camera.width}x{camera.height} pixels"
+        said = f"{frames}, but {model} was made for {size[0]}x{size[1]}"
+        raise CalibrationDataError(f"{recording.path}: {said}.")
     lens = (made_for.K, made_for.distortion)
     if lens not in ((camera.matrix, camera.distortion), (None, None)):
         other = f"{recording.path} has another lens calibration than {model} was made with"

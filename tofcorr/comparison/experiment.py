@@ -230,9 +230,8 @@ class ModelFitter:
             moments = self._of_all_frames[model.name].images(train.tolist())
         found = fit(dataset, train, training, self.domain, moments=moments)
         if not found.solution.converged:
-            self.warnings.append(
-                f"{model.name}, fitted to {len(train)} frames: {found.solution.message}"
-            )
+            fitted = f"{model.name}, fitted to {len(train)} frames"
+            self.warnings.append(f"{fitted}: {found.solution.message}")
         planes = self._judged_against(found.walls, model.name, held_out, found.model)
         return FittedModel(found.model, held_out, planes)
 

@@ -272,9 +272,7 @@ class SelectionOptions(ComparisonOptions):
             # Three tilted views are the least that determine a hand-eye transform from planes; the
             # fit itself refuses what more unknowns need.
             elif left[scarce] < 3:
-                skipped[by] = (
-                    f"without {scarce} {left[scarce]} poses are left to fit, and 3 are needed."
-                )
+                skipped[by] = f"without {scarce} {left[scarce]} poses are left, 3 are needed."
             else:
                 found[by] = groups
         if not found:

@@ -209,9 +209,7 @@ class CameraGeometry(nn.Module):
         size = list(self.radial_of_depth.shape)
         if depth.dim() < 2 or list(depth.shape[-2:]) != size:
             got = f"got {list(depth.shape)}. Was the frame cropped, binned or transposed?"
-            raise FrameError(
-                f"depth: expected shape (..., {size[0]}, {size[1]}) of the camera; {got}"
-            )
+            raise FrameError(f"depth: expected shape (..., {size[0]}, {size[1]}); {got}")
         if amplitude is not None and amplitude.shape != depth.shape:
             shapes = f"expected depth's shape {[*depth.shape]}, got {[*amplitude.shape]}"
             raise FrameError(f"amplitude: {shapes}.")

@@ -75,9 +75,7 @@ def check(
     low, high = result.interval
     # A certain drift is refused if it is most likely beyond what any camera has.
     if abs(result.offset) > LARGEST_GAP and not low <= 0 <= high and not force:
-        said = (
-            f"the distances would be {1e3 * result.offset:+.0f} mm off, and no camera drifts so far"
-        )
+        said = f"distances would be {1e3 * result.offset:+.0f} mm off, and no camera drifts so far"
         advice = "check unit and kind of the depth, the mask and the wall, or add --force"
         raise CalibrationDataError(f"{dataset.first.path}: {said}: {advice} (Python: force=True).")
     result = replace(result, headline=headline or result.headline)
@@ -158,9 +156,7 @@ def _refuse_unfit(state: CalibrationState, dataset: Dataset, wall: Wall) -> None
     reason = None
     if first.camera != state.camera or first.depth_kind != state.depth_kind:
         size = f"{state.camera.width}x{state.camera.height} pixels, {state.depth_kind} depth"
-        reason = (
-            f"this is not the camera that was calibrated: expected {size}, the same K and lens."
-        )
+        reason = f"this is not the camera that was calibrated: expected {size}, the same lens."
     elif wall == "one" and not dataset.moves:
         reason = "one wall needs a robot that moves, and no pose changes; use the wall per image."
     elif wall == "recorded" and dataset.planes_are_estimated:

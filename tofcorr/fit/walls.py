@@ -92,10 +92,10 @@ def recorded_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Foun
     # A wall has three unknowns, and one image determines about three: fewer than three images
     # contribute little to the other unknowns.
     for place in np.flatnonzero(count < (1 if dataset.planes_are_estimated else 3))[:1]:
-        said = f"of each wall, '{names[numbers[place]]}' has {count[place]}"
-        advice = "(one target, and one plane in frames.csv). Record more, or measure that wall."
+        said = "unknown needs at least 3 images of each wall (target and plane in frames.csv)"
+        said = f"{said}, '{names[numbers[place]]}' has {count[place]}"
         raise CalibrationDataError(
-            f"{dataset.first.path}: planes: unknown needs at least 3 images {said} {advice}"
+            f"{dataset.first.path}: planes: {said}. Record more, or measure."
         )
     columns = "normal_world", "offset", "world_from_tool"
     normal, offset, pose = (dataset.column(name)[frames] for name in columns)

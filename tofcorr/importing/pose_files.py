@@ -73,9 +73,7 @@ def _guessed_format(path: Path) -> str:
     number, fields = lines[0]
     if len(fields) not in (4, 8, 12, 13, 16, 17):
         said = f"line {number} has {len(fields)} numbers"
-        raise CalibrationDataError(
-            f"{path}: {said}; expected 8 (TUM), 12, 16 (matrices) or a header."
-        )
+        raise CalibrationDataError(f"{path}: {said}; expected 8 (TUM), 12, 16 or a header.")
     return "tum" if len(fields) == 8 else "matrices"
 
 

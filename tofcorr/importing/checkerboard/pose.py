@@ -119,9 +119,7 @@ def estimate_pose(
         used = inliers
         best, *others = poses_of(corners, board, camera, used)
     if not best.reprojection_rms <= max_reprojection:
-        missed = (
-            f"{best.reprojection_rms:.2f} px of at most {max_reprojection:g} px"
-        )
+        missed = f"{best.reprojection_rms:.2f} px of at most {max_reprojection:g} px"
         raise RefusedViewError(f"the corners miss the board by {missed}; is it bent, or blurred?")
     for other in others:
         # Poses whose normals differ by less than 3 degrees are the same pose.

@@ -278,12 +278,8 @@ def _images(
         partner = by_time[nearest(amplitude.stamps[by_time], depth.stamps)]
         gap = np.abs(depth.stamps - amplitude.stamps[partner])
         if (gap > _SAME_IMAGE).all():
-            said = (
-                f"no image of {amplitude.topic} is within {_SAME_IMAGE:g} s of one of {depth.topic}"
-            )
-            raise CalibrationDataError(
-                f"{depth.bag.path}: {said}; the nearest is {gap.min():.3f} s off."
-            )
+            said = f"no image of {amplitude.topic} is near one of {depth.topic}"
+            raise CalibrationDataError(f"{depth.bag.path}: {said}, to {gap.min():.3f} s at best.")
         reason = f"{amplitude.topic} has no image of its time"
         refused = {names[k]: reason for k in order if gap[k] > _SAME_IMAGE}
         order = order[gap[order] <= _SAME_IMAGE]

@@ -156,9 +156,7 @@ def _left_out(
         found[k][names[k]] = "none of its planes is on a wall" if k in seen else flat
     for k in (joint.wall < 0).nonzero()[:, 0].tolist():
         off, image = float(joint.deviation[k]), int(planes.image[k])
-        far = (
-            f"{1000 * off:.0f} mm from the nearest wall" if math.isfinite(off) else "faces no wall"
-        )
+        far = f"{1000 * off:.0f} mm from the nearest wall" if math.isfinite(off) else "faces none"
         name = f"{names[image]}, plane {int(planes.number[k]) + 1}"
         found[image][name] = f"{far}, or not seen in enough images"
     return {name: reason for own in found.values() for name, reason in own.items()}
