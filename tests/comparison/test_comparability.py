@@ -27,8 +27,8 @@ def test_models_that_differ_in_their_terms_alone_need_no_note() -> None:
         ({"planes": "unknown"}, "with estimated walls."),
         (
             {"outlier_window_mm": 15.0, "weights": {"noise": True, "robust": "cauchy"}},
-            "to other pixels than those measured (the recording's mask, raw error within 15 mm of "
-            "the median), with pixels weighted by their noise, with robust weights (cauchy).",
+            "to other pixels than those measured (the recording's mask, outlier_window_mm: 15.0), "
+            "with pixels weighted by their noise, with robust weights (cauchy).",
         ),
     ],
 )
@@ -44,7 +44,7 @@ def test_the_pixels_measured_are_said_mask_by_mask() -> None:
     masks = {"mask": "ransac", "mask_tolerance_mm": 20.0, "edge_contrast": 2.0, "grazing_deg": 40.0}
     *_, measured = notes({"weights": {"noise": True}}, **masks, planes="known")
     assert (
-        "(the recording's mask, within 20 mm of the image's largest plane, off edges of contrast "
-        "2, seen at less than 40 degrees)" in measured
+        "(the recording's mask, edge_contrast: 2.0, grazing_deg: 40.0, mask: ransac, "
+        "mask_tolerance_mm: 20.0)" in measured
     )
     assert measured.endswith("against the recorded planes.")

@@ -353,14 +353,6 @@ def _how_fitted(training: TrainingOptions, common: MaskOptions) -> str:
 
 
 def _pixels(masks: MaskOptions) -> str:
-    """Return in words which pixels the masks leave."""
-    said = ["the recording's mask"]
-    if masks.outlier_window_mm is not None:
-        said.append(f"raw error within {masks.outlier_window_mm:g} mm of the median")
-    if masks.mask == "ransac":
-        said.append(f"within {masks.mask_tolerance_mm:g} mm of the image's largest plane")
-    if masks.edge_contrast is not None:
-        said.append(f"off edges of contrast {masks.edge_contrast:g}")
-    if masks.grazing_deg is not None:
-        said.append(f"seen at less than {masks.grazing_deg:g} degrees")
-    return ", ".join(said)
+    """Return which pixels the masks leave: the options that are no default, as they are written."""
+    chosen = masks_of(masks).model_dump(exclude_defaults=True).items()
+    return ", ".join(["the recording's mask", *(f"{name}: {value}" for name, value in chosen)])

@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.error_terms.model import Pixels
 from tofcorr.estimation.linear import AddedColumns, Curvature, NormalEquations, pose_products
 from tofcorr.estimation.robust import LEVEL, student_quantile
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
@@ -49,8 +48,6 @@ class MisfitPixels:
         weight: Of each pixel in the fit, shape (M,).
         on_wall: Where the rays meet the planes, along two directions of the wall, from its middle,
             shape (M, 2), metres.
-        before: What the same pixel measured in the frame before, metres, and its amplitude there,
-            shape (2, M); NaN: nothing.
         recording: Whose camera it is.
         walls_estimated: Whether the walls were estimated with the rest.
     """
@@ -60,7 +57,6 @@ class MisfitPixels:
     pose: Tensor
     weight: Tensor
     on_wall: Tensor
-    before: Tensor
     recording: Recording
     walls_estimated: bool
 
@@ -127,40 +123,15 @@ def misfit_pixels(data: Dataset, fit: Fit, frames: np.ndarray) -> MisfitPixels |
     pixels, equal = seen.pixels, torch.ones_like(seen.residual)
     if not data.has_amplitude:
         pixels = pixels._replace(amplitude=torch.nan * equal)
-    before = _before(data, of, sample.pixels)
-    if data.first.depth_kind == "z":
-        before[0] /= sample.ray[:, 2]
     return MisfitPixels(
         linear=replace(seen, pixels=pixels, unknowns=unknowns),
         frame=sample.frame,
         pose=torch.from_numpy(np.unique(data.pose_groups()[chosen], return_inverse=True)[1]),
         weight=equal if fit.weights is None else fit.weights.of_sample(sample),
         on_wall=on_wall - on_wall.median(dim=0).values,
-        before=before,
         recording=data.first,
         walls_estimated=fit.walls is not None,
     )
-
-
-def _before(data: Dataset, of: np.ndarray, pixels: Pixels) -> Tensor:
-    """Return depth and amplitude of the same pixels in the frame before, (2, M); NaN: nothing.
-
-    Args:
-        data: The recordings.
-        of: Global number of each pixel's frame, shape (M,).
-        pixels: Their places.
-    """
-    found, place = np.full((2, len(of)), np.nan), (pixels.rows.numpy(), pixels.columns.numpy())
-    rows, columns = (one.astype(int) for one in place)
-    start = 0
-    for recording in data.recordings:
-        own = (of > start) & (of < start + recording.num_frames)
-        at = of[own] - start - 1, rows[own], columns[own]
-        for line, images in zip(found, (recording.depth, recording.amplitude), strict=True):
-            line[own] = np.nan if images is None else images[at]
-        start += recording.num_frames
-    found[0, ~(found[0] > 0)] = np.nan
-    return torch.from_numpy(found)
 
 
 Probes = dict[str, tuple[str, Tensor]]
@@ -197,10 +168,6 @@ def probes(seen: MisfitPixels) -> Probes:
     amplitude = seen.linear.pixels.amplitude
     (s, t), when = seen.on_wall.unbind(dim=1), _standard(seen.frame.to(torch.float64))
     one, none, u = torch.ones_like(x), torch.zeros_like(x), _standard(distance)
-    # Amplitude ratios are cut, so that single dark pixels do not decide.
-    before, amplitude_before = seen.before
-    change = torch.where(before.isfinite(), before - distance, 0.0)
-    light = (amplitude_before / amplitude).clamp(max=20).nan_to_num()
     frequency = seen.recording.modulation_frequency
 
     def of_phase(further: Tensor) -> Tensor:
@@ -216,7 +183,6 @@ def probes(seen: MisfitPixels) -> Probes:
     found = {
         "incidence": ("follow the angle of incidence", error(1 / facing - 1, (1 - facing) ** 2)),
         "order": ("follow the order of the frames", error(when, when**2)),
-        "previous_frame": ("follow the frame before", error(change, light * of_phase(change))),
         "focal_length": ("are those of another focal length", lens((x, y))),
         "aspect": (tilted, lens((x, -y), (y, x))),
         "principal_point": ("are those of another principal point", lens((one, none), (none, one))),
@@ -242,6 +208,7 @@ def probes(seen: MisfitPixels) -> Probes:
         phase = 4 * phase_from_radial_distance(distance, frequency)
         found["circular"] = ("repeat over the distance", error(phase.sin(), phase.cos()))
     if bright is not None:
+        # The ratio is cut, so that single dark pixels do not decide.
         ratio = (amplitude.median() / amplitude).clamp(max=20)
         together = "follow amplitude and distance together"
         found["amplitude_by_distance"] = (together, error(bright * u))
