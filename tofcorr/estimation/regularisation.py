@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.estimation.linear import RESOLVED, NormalEquations, solved
+from tofcorr.estimation.linear import RESOLVED, solved
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, Prior
 from tofcorr.estimation.solvers import SolverOptions, minimise
 
@@ -108,7 +108,16 @@ def with_strengths(
     weights = moments.gram[:, -1, -1]
 
     def held_out(tried: list[Penalty]) -> float:
-        return sum(_held_out(equations, weights, around, tried, fold) for fold in folds)
+        """Return the loss of the images of each fold under the fit to all others."""
+        total = 0.0
+        for fold in folds:
+            test = torch.zeros(len(weights), dtype=torch.bool)
+            test[torch.as_tensor(fold, dtype=torch.long)] = True
+            kept, without = (equations.of(which).total() for which in (~test, test))
+            prior = smoothness(tried, float(weights[~test].sum()), around)
+            kept = kept.plus(None if prior is None else prior.equations(around))
+            total += float(without.at(-solved(kept.hessian, kept.gradient, RESOLVED)).loss)
+        return total
 
     for k in unknown * (2 if len(unknown) > 1 else 1):
         tried = [
@@ -116,22 +125,6 @@ def with_strengths(
         ]
         chosen = min(tried, key=held_out)
     return chosen
-
-
-def _held_out(
-    equations: NormalEquations,
-    weights: Float[Tensor, "N"],
-    around: Parameters,
-    penalties: Sequence[Penalty],
-    fold: Sequence[int],
-) -> float:
-    """Return the loss of some images under the fit to all others."""
-    test = torch.zeros(len(weights), dtype=torch.bool)
-    test[torch.as_tensor(fold, dtype=torch.long)] = True
-    kept, held_out = (equations.of(which).total() for which in (~test, test))
-    prior = smoothness(penalties, float(weights[~test].sum()), around)
-    kept = kept.plus(None if prior is None else prior.equations(around))
-    return float(held_out.at(-solved(kept.hessian, kept.gradient, RESOLVED)).loss)
 
 
 def time_constant(moments: ImageMoments, around: Parameters, time: Float[Tensor, "N"]) -> float:

@@ -185,7 +185,6 @@ class Observability(NamedTuple):
 def observability(
     moments: ImageMoments,
     optimum: Parameters,
-    threshold: float = 0.95,
     prior: Prior | None = None,
     walls: Walls | None = None,
 ) -> Observability:
@@ -194,9 +193,6 @@ def observability(
     Args:
         moments: Moments of the images fitted.
         optimum: The parameters at the optimum.
-        threshold: Absolute correlation from which a pair is reported. The default, 0.95, is set by
-            hand: the standard errors of such a pair are more than three times those of either
-            parameter alone.
         prior: The smoothing penalties, if they were part of the loss; they count as information.
         walls: Walls that were estimated as well.
     """
@@ -222,10 +218,18 @@ def observability(
     pairs = {
         (names[a], names[b]): float(correlation[a, b])
         for a, b in zip(left[order].tolist(), right[order].tolist(), strict=True)
-        if abs(correlation[a, b]) >= threshold
+        # The standard errors of such a pair are more than three times those of either alone.
+        if 20 * abs(correlation[a, b]) >= 19
     }
+
+    def direction(k: int) -> Direction:
+        shares = named_components(vectors[:, k], names)
+        first = [names.index(name) for name in list(shares)[:2]]
+        both = float(correlation[first[0], first[1]]) if len(first) > 1 else None
+        return Direction(float(variances[k]) ** 0.5, shares, both)
+
     return Observability(
-        [_direction(vectors[:, k], variances[k], correlation, names) for k in range(len(names))],
+        [direction(k) for k in range(len(names))],
         pairs,
         posterior,
         vectors,
@@ -250,18 +254,6 @@ def sparse_basis(basis: Float[Tensor, "P k"]) -> Float[Tensor, "P k"]:
         found.append(vector)
         left = left - vector[:, None] * (vector @ left)
     return torch.stack(found, dim=1) if found else basis
-
-
-def _direction(
-    vector: Float[Tensor, "P"],
-    variance: Float[Tensor, ""],
-    correlation: Float[Tensor, "P P"],
-    names: list[str],
-) -> Direction:
-    shares = named_components(vector, names)
-    first = [names.index(name) for name in list(shares)[:2]]
-    both = float(correlation[first[0], first[1]]) if len(first) > 1 else None
-    return Direction(float(variance) ** 0.5, shares, both)
 
 
 def named_components(vector: Float[Tensor, "P"], names: list[str]) -> dict[str, float]:

@@ -39,15 +39,6 @@ def lines_of(text: str) -> list[Line]:
     return [(number, fields) for number, fields in enumerate(split, start=1) if fields]
 
 
-def numbers_in(line: Line, path: Path, counts: tuple[int, ...]) -> np.ndarray:
-    """Return the numbers of a line, which must be finite and as many as expected.
-
-    Raises:
-        CalibrationDataError: They are not; the message names file and line.
-    """
-    return finite_numbers(line[1], f"{path}, line {line[0]}", counts)
-
-
 def finite_numbers(value: Any, where: str, counts: tuple[int, ...] = ()) -> np.ndarray:  # noqa: ANN401
     """Return a value from a file, nested lists too, as a row of float64.
 

@@ -17,7 +17,6 @@ from tofcorr.importing.numbers import (
     finite_numbers,
     lines_of,
     load_numbers,
-    numbers_in,
     read_text,
 )
 from tofcorr.importing.pose_track import PoseTrack
@@ -111,7 +110,8 @@ def rigid_transforms(
 def _read_tum(path: Path) -> PoseTrack:
     """Read TUM's lines: `timestamp tx ty tz qx qy qz qw`, metres and seconds."""
     lines = lines_of(read_text(path))
-    rows = np.reshape([numbers_in(line, path, (8,)) for line in lines], (-1, 8))
+    every = [finite_numbers(fields, f"{path}, line {k}", (8,)) for k, fields in lines]
+    rows = np.reshape(every, (-1, 8))
     poses = rigid_transforms(rows[:, 1:4], rows[:, 4:], lambda k: f"{path}, line {lines[k][0]}")
     return PoseTrack.checked(poses, str(path), rows[:, 0])
 
@@ -163,7 +163,8 @@ def _rows(path: Path, counts: tuple[int, ...]) -> np.ndarray:
         if not values.size or values.size // len(np.atleast_1d(values)) not in counts:
             raise CalibrationDataError(f"{path}: expected (P, 4, 4) or (P, 16), is {values.shape}.")
         return values.astype(np.float64).reshape(len(values), -1)
-    rows = [numbers_in(line, path, counts) for line in lines_of(read_text(path))]
+    lines = lines_of(read_text(path))
+    rows = [finite_numbers(fields, f"{path}, line {k}", counts) for k, fields in lines]
     widths = {len(row) for row in rows} or {16}
     if len(widths) > 1:
         raise CalibrationDataError(f"{path}: its lines have {sorted(widths)} numbers each.")

@@ -63,7 +63,7 @@ def test_every_large_plane_is_found_once_and_pixels_are_given_to_the_right_one(
         walls = [k for k in found if k is not None]
         assert len(walls) == len(set(walls))
         distance, rays = torch.from_numpy(depth), torch.from_numpy(camera.rays)
-        gradients = torch.stack([plane.gradient for plane in planes])
+        gradients = torch.stack([-plane.normal / plane.offset for plane in planes])
         tolerance = OPTIONS.tolerance_mm * 1e-3
         masks = plane_masks(distance, distance.isfinite(), rays, gradients, tolerance).numpy()
         for k, mask in zip(found, masks, strict=True):
@@ -116,7 +116,7 @@ def test_without_noise_the_plane_is_exact() -> None:
         (plane,) = planes_of(exact, depth)
         normal = pose[:3, :3].T @ np.array(ROOM[1][0])
         true = -normal / (np.array(ROOM[1][0]) @ pose[:3, 3] + ROOM[1][1])
-        np.testing.assert_allclose(plane.gradient.numpy(), true, atol=1e-9)
+        np.testing.assert_allclose((-plane.normal / plane.offset).numpy(), true, atol=1e-9)
         points = depth[..., None] * exact.camera.rays
         flat = points[np.isfinite(depth)]
         # Four points stand for all: they have the same mean and second moments.

@@ -5,7 +5,6 @@ Everything that the package `rosbags` raises on a damaged file becomes one sente
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from functools import partial
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -258,46 +257,48 @@ def open_bag(
             if not depth.stamped:
                 said = f"The headers of {depth.topic} hold no time stamps"
                 warnings.append(f"{said}; the times of receipt are used.")
-            of_bag = partial(RobotImages, intrinsics=given, track=track, warnings=warnings)
-            images = _images(depth, amplitude, coding, of_bag)
-        yield images
+            # In the order of their times.
+            order = np.argsort(depth.stamps, kind="stable")
+            names = [f"{stamp:.6f}" for stamp in depth.stamps]
+            refused, partner = Refused(), order
+            if amplitude is not None:
+                partner, gap = _partners(depth, amplitude)
+                reason = f"{amplitude.topic} has no image of its time"
+                refused = {names[k]: reason for k in order if gap[k] > _SAME_IMAGE}
+                order = order[gap[order] <= _SAME_IMAGE]
+
+        def read(number: int) -> DepthImage:
+            place, beside = int(order[number]), None
+            if amplitude is not None:
+                beside = amplitude.image(int(partner[place])), amplitude.topic
+            return coded_image(coding, (depth.image(place), depth.topic), beside)
+
+        yield RobotImages(
+            origin=str(path),
+            names=[names[k] for k in order],
+            intrinsics=given,
+            read=read,
+            track=track,
+            times=depth.stamps[order],
+            refused=refused,
+            warnings=warnings,
+            camera_frame=depth.frame_id.lstrip("/"),
+        )
 
 
-def _images(
-    depth: TopicMessages,
-    amplitude: TopicMessages | None,
-    coding: DepthCoding,
-    of_bag: partial[RobotImages],
-) -> RobotImages:
-    """Put the messages of depth, and of amplitude if there are any, in the order of their times."""
-    order = np.argsort(depth.stamps, kind="stable")
-    names = [f"{stamp:.6f}" for stamp in depth.stamps]
-    refused, partner = Refused(), order
-    if amplitude is not None:
-        by_time = np.argsort(amplitude.stamps, kind="stable")
-        partner = by_time[nearest(amplitude.stamps[by_time], depth.stamps)]
-        gap = np.abs(depth.stamps - amplitude.stamps[partner])
-        if (gap > _SAME_IMAGE).all():
-            said = f"no image of {amplitude.topic} is near one of {depth.topic}"
-            raise CalibrationDataError(f"{depth.bag.path}: {said}, to {gap.min():.3f} s at best.")
-        reason = f"{amplitude.topic} has no image of its time"
-        refused = {names[k]: reason for k in order if gap[k] > _SAME_IMAGE}
-        order = order[gap[order] <= _SAME_IMAGE]
+def _partners(depth: TopicMessages, amplitude: TopicMessages) -> tuple[np.ndarray, np.ndarray]:
+    """Return the amplitude image nearest in time to each of depth, and the seconds between them.
 
-    def read(number: int) -> DepthImage:
-        place, beside = int(order[number]), None
-        if amplitude is not None:
-            beside = amplitude.image(int(partner[place])), amplitude.topic
-        return coded_image(coding, (depth.image(place), depth.topic), beside)
-
-    return of_bag(
-        origin=str(depth.bag.path),
-        names=[names[k] for k in order],
-        read=read,
-        times=depth.stamps[order],
-        refused=refused,
-        camera_frame=depth.frame_id.lstrip("/"),
-    )
+    Raises:
+        CalibrationDataError: None is of the time of any.
+    """
+    by_time = np.argsort(amplitude.stamps, kind="stable")
+    partner = by_time[nearest(amplitude.stamps[by_time], depth.stamps)]
+    gap = np.abs(depth.stamps - amplitude.stamps[partner])
+    if (gap > _SAME_IMAGE).all():
+        said = f"no image of {amplitude.topic} is near one of {depth.topic}"
+        raise CalibrationDataError(f"{depth.bag.path}: {said}, to {gap.min():.3f} s at best.")
+    return partner, gap
 
 
 def _check_image_topics(bag: Bag, depth: str, amplitude: str | None) -> None:

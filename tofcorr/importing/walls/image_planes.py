@@ -63,11 +63,6 @@ class ImagePlane(NamedTuple):
     support: int
     points: Tensor
 
-    @property
-    def gradient(self) -> Tensor:
-        """The vector g of the plane g . x = 1, shape (3,), per metre."""
-        return -self.normal / self.offset
-
 
 @dataclass(frozen=True)
 class SeenPlanes:
