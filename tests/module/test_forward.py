@@ -184,7 +184,7 @@ def test_a_cropped_frame_and_an_unknown_condition_are_refused() -> None:
         ((frame.int(),), {}, "expected floating-point metres"),
         ((frame, frame[None]), {}, "expected depth's shape"),
         ((frame,), {"exposure": 1.0}, "'exposure' is no condition"),
-        ((frame.expand(2, 5, 7),), {"timestamp_s": torch.ones(3)}, r"shape \[2\]; got shape \[3\]"),
+        ((frame.expand(2, 5, 7),), {"timestamp_s": torch.ones(3)}, r"shape \[2\]; got \[3\]"),
     ):
         with pytest.raises(FrameError, match=said):
             module(*passed, **given)

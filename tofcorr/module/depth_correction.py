@@ -491,7 +491,7 @@ def open_dataset(recordings: Recordings, camera: CameraIntrinsics) -> Dataset:
     found = dataset.first.camera
     if found != camera:
         said = f"is of the camera {found}, the module was built for {camera}"
-        raise CalibrationDataError(f"{dataset.first.path}: {said}. Build it with recording.camera.")
+        raise CalibrationDataError(f"{dataset.first.path}: {said}: build one of recording.camera.")
     return dataset
 
 

@@ -233,10 +233,10 @@ def long_number(value: float) -> str:
     return _special(value) or f"{value:.16e}"
 
 
-def lines(words: Iterable[object]) -> str:
-    """Return words behind commas, six in a line."""
+def lines(words: Iterable[object], in_a_line: int = 6) -> str:
+    """Return words behind commas, so many in a line."""
     every = list(map(str, words))
-    parts = (every[k : k + 6] for k in range(0, len(every), 6))
+    parts = (every[k : k + in_a_line] for k in range(0, len(every), in_a_line))
     return "\n".join("  " + ", ".join(part) + "," for part in parts)
 
 
