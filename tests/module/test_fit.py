@@ -144,7 +144,7 @@ def test_ranges_may_come_from_a_recording_of_the_same_camera(wall: Recording) ->
     report = module.fit([wall])
     assert report.after.rms < report.before.rms
     assert np.allclose(report.tool_from_camera, module.hand_eye().detach())
-    with pytest.raises(CalibrationDataError, match="build one of recording.camera"):
+    with pytest.raises(CalibrationDataError, match=r"build one of recording\.camera"):
         DepthCorrection(CAMERA, terms="e0").fit(wall)
     with pytest.raises(ConfigError, match="not a known key"):
         DepthCorrection(wall.camera, terms="e0").fit(wall, ["solver.iterations=3"])

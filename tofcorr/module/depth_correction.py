@@ -473,7 +473,7 @@ def resolve_domain(ranges: Domain | Recordings | None, camera: CameraIntrinsics)
         ConfigError: `camera` is something else, such as the recording.
     """
     if not isinstance(camera, CameraIntrinsics):
-        got = f"expected a CameraIntrinsics, got {type(camera).__name__}"
+        got = f"expected a tofcorr.CameraIntrinsics, got {type(camera).__name__}"
         raise ConfigError(f"camera: {got}. A recording holds its own, as recording.camera.")
     if ranges is None or isinstance(ranges, Domain):
         return replace(ranges or _USUAL, height=camera.height, width=camera.width)
