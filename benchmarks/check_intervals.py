@@ -84,8 +84,8 @@ def one_draw(number: int, seed: int, folder: Path) -> list[Values]:
     model = MODELS[int(generator.integers(len(MODELS)))]
     options = resolve_options(TrainingOptions, model).model_copy(update={"advice": 0})
     result = train(folder / "train", options)
-    state, frames = calibration_state(result.data, options, result.fit), result.calibration.frames
-    reference = estimate_reference(result.data, frames, result.fit, state.noise)
+    state, seen = calibration_state(result.data, options, result.fit), result.calibration.frames
+    reference = estimate_reference(result.data, seen, result.fit, state.noise)
     later = check_options(camera, max(FRAMES), generator)
     same = recorded(later, folder / "unchanged", frames, 0.0)
     moved = recorded(later, folder / "drifted", max(FRAMES), DRIFT_MM)

@@ -96,11 +96,3 @@ def test_a_turned_principal_point_is_a_turned_camera(seen: MisfitPixels) -> None
     columns = probes(seen)["principal_point"][1][middle]
     turns = torch.stack([seen.linear.unknowns[middle, 4], -seen.linear.unknowns[middle, 3]], dim=1)
     torch.testing.assert_close(columns, turns, rtol=0.01, atol=0.01)
-
-
-def test_the_frame_before_is_that_of_the_recording(plain: Case, seen: MisfitPixels) -> None:
-    depth = plain[0].first.depth
-    first = seen.frame == 0
-    assert bool(seen.before[0, first].isnan().all())
-    known = seen.before[0, seen.frame == 5]
-    assert bool(np.isin(known[known.isfinite()].numpy(), depth[4].astype(np.float64)).all())

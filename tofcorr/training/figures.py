@@ -12,6 +12,7 @@ from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
 from tofcorr.training.calibration import Calibration
 
 if TYPE_CHECKING:  # Matplotlib takes longer to import than a short fit.
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _STAGES = {
@@ -134,16 +135,13 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
     panels = figure.subplots(1, 2)
     x, last = sample.covariates[covariate], list(sample.errors_mm.values())[-1]
     ends, tested = ends_of(x), np.isin(sample.frame, held_out)
-    every = np.ones(len(x), dtype=bool)
-    lines = [
-        *((0, error, every, *_STAGES.get(k, (k, "k"))) for k, error in sample.errors_mm.items()),
-        *((1, last, ~tested, "fitted", "tab:blue"), (1, last, tested, "held out", "tab:green")),
-    ]
-    for panel, error, chosen, label, colour in (one for one in lines if one[2].any()):
-        middle, mean, spread = profile(x[chosen], error[chosen], ends)
-        panels[panel].plot(middle, mean, color=colour, label=label)
-        band = {"color": (colour, 1 / 5), "linewidth": 0}
-        panels[panel].fill_between(middle, mean - spread, mean + spread, **band)
+    for stage, error in sample.errors_mm.items():
+        label, colour = _STAGES.get(stage, (stage, "k"))
+        draw_profile(panels[0], x, error, colour, label)
+    halves = (~tested, "tab:blue", "fitted"), (tested, "tab:green", "held out")
+    for chosen, colour, label in halves:
+        if chosen.any():
+            draw_profile(panels[1], x[chosen], last[chosen], colour, label, ends)
     titles = "All stages: mean, and one standard deviation", "After correction"
     for axes, title in zip(panels, titles, strict=True):
         axes.axhline(0, color="0.4")
@@ -152,6 +150,29 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
         axes.legend(loc="upper right", fontsize="small")
         axes.grid(color="0.9")
     return figure
+
+
+def draw_profile(
+    axes: "Axes",
+    x: np.ndarray,
+    error: np.ndarray,
+    colour: str,
+    label: str,
+    ends: tuple[float, float] | None = None,
+) -> None:
+    """Draw the mean of an error over a covariate, and a band of one standard deviation.
+
+    Args:
+        axes: Where to draw.
+        x: The covariate, shape (M,).
+        error: The error of each pixel, shape (M,).
+        colour: Of line and band.
+        label: Of the line.
+        ends: Range of the covariate; None: see `ends_of`.
+    """
+    middle, mean, spread = profile(x, error, ends)
+    axes.plot(middle, mean, color=colour, label=label)
+    axes.fill_between(middle, mean - spread, mean + spread, color=(colour, 0.2), linewidth=0)
 
 
 def residual_figure(calibration: Calibration) -> "Figure":

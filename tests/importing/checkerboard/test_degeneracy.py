@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from importing.checkerboard.rendered_board import BOARD, CAMERA, placement, project
 
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.boards import Board
 from tofcorr.importing.checkerboard.pose import poses_of
 
@@ -19,7 +20,7 @@ LONGER = replace(CAMERA, matrix=((1.01 * FX, 0.0, CX), (0.0, 1.01 * FY, CY), LAS
     [(LARGER, CAMERA, 1e-4, 1e-4), (BOARD, LONGER, 0.5, 2e-3)],
 )
 def test_larger_squares_and_a_longer_focal_length_hide_in_the_slope(
-    board: Board, camera: object, worse: float, exact: float
+    board: Board, camera: CameraIntrinsics, worse: float, exact: float
 ) -> None:
     generator = np.random.default_rng(6)
     every = np.ones(35, dtype=bool)
