@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.stats import binomtest, norm
-from sklearn.metrics import f1_score, roc_auc_score
+from scipy.stats import binomtest, mannwhitneyu, norm
 
 from benchmarks.sealed.answers import Outcome
 
@@ -118,7 +117,7 @@ def area_score(tier: str, what: str, positives: Values, negatives: Values, targe
     m, n = len(positives), len(negatives)
     if not m or not n:
         return Score(tier, what, math.nan, (0.0, 1.0), m, target)
-    a = float(roc_auc_score([1] * m + [0] * n, [*positives, *negatives]))
+    a = float(mannwhitneyu(positives, negatives).statistic) / (m * n)
     q1, q2 = a / (2 - a), 2 * a * a / (1 + a)
     square = a * (1 - a) + (m - 1) * (q1 - a * a) + (n - 1) * (q2 - a * a)
     half = float(norm.ppf(0.975)) * math.sqrt(max(square, 0.0) / (m * n))
@@ -131,9 +130,10 @@ def macro_f1(cases: Sequence[Outcome]) -> float:
     scores = []
     for name in names:
         judged = [one for one in cases if name not in one.truths - one.must_find]
-        true = [name in one.must_find for one in judged]
-        said = [name in one.said.effects for one in judged]
-        scores += [f1_score(true, said)] if any(true) or any(said) else []
+        true = sum(name in one.must_find for one in judged)
+        said = [one for one in judged if name in one.said.effects]
+        hits = sum(name in one.must_find for one in said)
+        scores += [2 * hits / (true + len(said))] if true or said else []
     return float(np.mean(scores)) if scores else math.nan
 
 

@@ -12,8 +12,8 @@ from tofcorr.options import configs_folder
 
 RUNNING = [page for page in PAGES if page not in ADDING and "```python" in page.read_text("utf-8")]
 
-# Options of a diagnosis that takes a third of the time, on a third of the pixels.
-QUICK = {"bootstraps": 19, "most_pixels": 20_000}
+# Options of a diagnosis that takes a fifth of the time, on a fraction of the pixels.
+QUICK = {"bootstraps": 19, "most_pixels": 8_000}
 
 
 @pytest.fixture

@@ -21,8 +21,8 @@ TEXTS = ("LICENSE", "CHANGELOG.md", "CITATION.cff")
 SIMULATE_AND_TRAIN = """
 from tofcorr.cli.main import group
 for words in (
-    "simulate --config demo --out recording",
-    "train --config ea --set solver.max_iterations=30 --recording recording --out run",
+    "simulate --config demo --frames 16 --out recording",
+    "train --config ea --set solver.max_iterations=30 --recording recording --no-figures --out run",
 ):
     group(words.split(), standalone_mode=False)
 """

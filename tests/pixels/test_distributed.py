@@ -11,6 +11,8 @@ import numpy as np
 import yaml
 from simulated_walls import simulated_wall
 
+from tofcorr.options import resolve_options
+from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import train
 
 TRAIN = str(Path(__file__).resolve().parents[2] / "scripts" / "train.py")
@@ -47,9 +49,11 @@ def numbers_in(value: Any) -> list[float]:
 
 def test_two_processes_fit_what_one_fits(tmp_path: Path) -> None:
     recording = simulated_wall(tmp_path / "recording").first.path
-    train(recording, "ea", out=tmp_path / "one")
+    quick = ("advice=0", "figures=false")
+    train(recording, resolve_options(TrainingOptions, "ea", quick), out=tmp_path / "one")
+    words = [word for change in quick for word in ("--set", change)]
     files = ("--recording", str(recording), "--out", str(tmp_path / "two"))
-    start_both((TRAIN, "--config", "ea", "--set", "advice=0", *files))
+    start_both((TRAIN, "--config", "ea", *words, *files))
     for file, part in (
         ("report.json", "hand_eye"),
         ("report.json", "error_mm"),
