@@ -174,8 +174,7 @@ def _write_drive(folder: Path) -> None:
 @click.argument("folder", type=click.Path(exists=True, path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
 @_only
-@click.option("--command", "wanted", multiple=True, help="Only these commands (and `train`).")
-def run_command(folder: Path, out: Path, only: tuple[str, ...], wanted: tuple[str, ...]) -> None:
+def run_command(folder: Path, out: Path, only: tuple[str, ...]) -> None:
     """Give the recordings of FOLDER to the commands; OUT gets what they write."""
     for name, commands in _inputs().items():
         if only and name not in only:
@@ -185,8 +184,7 @@ def run_command(folder: Path, out: Path, only: tuple[str, ...], wanted: tuple[st
         own.mkdir(parents=True)
         began, said = time.monotonic(), ""
         for command in commands:
-            if not wanted or command.split()[0] in (*wanted, "train", "import"):
-                said += f"$ {command}\n{_call(_filled(command, name, folder, own))}\n"
+            said += f"$ {command}\n{_call(_filled(command, name, folder, own))}\n"
         said = said.replace(str(own), "OUT").replace(str(folder), "IN")
         (own / "said.txt").write_text(said.removesuffix("\n"))
         _correct_some(own)

@@ -175,7 +175,6 @@ CELLS: dict[str, Damage] = {
     r"frame 1, column 'target': .*name": cells(1, target=" "),
     r"frame 1, column 'integration_time_us': .*positive": cells(1, integration_time_us="-5"),
     r"'body_temperature_c': .*finite": cells(1, body_temperature_c="inf"),
-    r"frame 1, column 'ambient': .*'dark'": cells(1, ambient="dark"),
     r"frame 2, column 'tx': .*metres, at most": cells(2, tx="-2e6"),
     r"frame 2, column 'qx': .*at most 1e\+12": cells(2, qx="1e200"),
     r"frame 2, column 'body_temperature_c': .*finite": cells(2, body_temperature_c="1e300"),

@@ -164,7 +164,6 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
     cases = [
         (tmp_path / "none.ts", source, "none.ts: there is no such file"),
         (tmp_path, source, "is a folder; expected the corrector.ts of a run"),
-        (corrector, tmp_path / "nowhere", "nowhere: there is no such folder."),
         (corrector, garbage, "garbage.ts: is a file; a recording is a folder"),
         (garbage, source, "garbage.ts: is not the corrector.ts of a run"),
         (pickled, source, "weights.pt: not a TorchScript module"),

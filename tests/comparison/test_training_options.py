@@ -71,29 +71,34 @@ def unknowns(found: FittedModel) -> torch.Tensor:
     return torch.cat([transform, found.model.error.coefficient_vector()])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.fixture(scope="module", params=KINDS)
+def found(recording: Recording, request: pytest.FixtureRequest) -> tuple[str, torch.Tensor]:
+    """Each kind of fit, and its unknowns."""
+    return request.param, unknowns(fitted(recording, request.param))
+
+
 def test_held_out_images_leave_the_fit_bit_identical(
-    recording: Recording, shuffled: Recording, kind: str
+    recording: Recording, shuffled: Recording, found: tuple[str, torch.Tensor]
 ) -> None:
-    assert torch.equal(unknowns(fitted(recording, kind)), unknowns(fitted(shuffled, kind)))
+    kind, own = found
+    assert torch.equal(own, unknowns(fitted(shuffled, kind)))
     if kind == "plain":
         # A fit that saw them would be another one.
         seen = (fitted(one, kind, np.arange(8, 32)) for one in (recording, shuffled))
         assert float(torch.sub(*map(unknowns, seen)).abs().max()) > 1e-3
 
 
-@pytest.mark.parametrize("kind", KINDS)
 def test_a_model_is_fitted_as_a_training_on_the_same_frames_would_fit_it(
-    recording: Recording, kind: str
+    recording: Recording, found: tuple[str, torch.Tensor]
 ) -> None:
+    kind, own = found
     asked = options({"name": "EA", "model": EA} | KINDS[kind])
     dataset, training = Dataset((recording,)), asked.training(asked.models[0])
     robust = training.weights.robust != "none"
     used = usable_pixels(dataset, training, robust=robust, frames=TRAIN)
     expected = fit(used, TRAIN, training, ModelFitter(dataset, asked).domain).model
-    found = unknowns(fitted(recording, kind))
     expected = unknowns(FittedModel(expected, HELD_OUT))
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(own, expected, rtol=0, atol=1e-6)
 
 
 def misplaced(recording: Recording) -> Dataset:
