@@ -9,7 +9,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.result import DiagnosisResult, render
 from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(bootstraps=40)
@@ -48,6 +48,11 @@ def nothing_named(nothing_study: Study) -> NamedEffects:
 @pytest.fixture(scope="session")
 def time_diagnosis(time_missing: Recording) -> DiagnosisResult:
     return diagnose(time_missing, config=OPTIONS)
+
+
+@pytest.fixture(scope="session")
+def page(time_diagnosis: DiagnosisResult) -> str:
+    return render(time_diagnosis)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import pytest
 from diagnosed_recordings import PLAIN
 
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.report.result import DiagnosisResult, render
+from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.sensor.model import SensorModel
 from tofcorr.simulation.simulator import simulate
 
@@ -16,7 +16,7 @@ WIGGLING = {"name": "wiggling", "sin_4": 0.012, "cos_4": 0.006}
 
 
 def test_a_diagnosis_degrades_ideal_frames_of_poses_held_out(
-    time_diagnosis: DiagnosisResult,
+    time_diagnosis: DiagnosisResult, page: str
 ) -> None:
     """Where every effect can be shown in an image, they are as near as the last stage."""
     found, gap = time_diagnosis.degraded, time_diagnosis.gap
@@ -28,7 +28,7 @@ def test_a_diagnosis_degrades_ideal_frames_of_poses_held_out(
     assert found.gap.interval[0] <= found.gap <= found.gap.interval[1]
     block = json.loads(json.dumps(time_diagnosis.to_mapping()["degraded"]))
     assert block["gap_mm"] == pytest.approx(1e3 * found.gap, abs=1e-3)
-    assert "Ideal frames, degraded" in render(time_diagnosis)
+    assert "Ideal frames, degraded" in page
 
 
 @pytest.mark.slow

@@ -122,10 +122,6 @@ def without_effects(result: DiagnosisResult) -> DiagnosisResult:
     return replace(result, effects=(), cause_sets=(), gap_steps=(), shares=(left,))
 
 
-def as_found(result: DiagnosisResult) -> DiagnosisResult:
-    return result
-
-
 Kind = Callable[[DiagnosisResult], DiagnosisResult]
 
 
@@ -133,11 +129,6 @@ Kind = Callable[[DiagnosisResult], DiagnosisResult]
 def rendered(time_diagnosis: DiagnosisResult) -> Callable[[Kind], str]:
     """The page of each kind of findings, rendered once."""
     return cache(lambda kind: render(kind(time_diagnosis)))
-
-
-@pytest.fixture(scope="module")
-def page(rendered: Callable[[Kind], str]) -> str:
-    return rendered(as_found)
 
 
 @needs_browser
@@ -171,11 +162,11 @@ def test_the_browser_would_see_what_is_cut_silent_or_wrong(page: str, tmp_path: 
 
 
 def test_every_picture_of_every_kind_of_report_has_words(
-    rendered: Callable[[Kind], str], time_diagnosis: DiagnosisResult
+    rendered: Callable[[Kind], str], page: str, time_diagnosis: DiagnosisResult
 ) -> None:
-    for kind in (with_simulator, without_effects, as_found):
-        result, shown = kind(time_diagnosis), html.unescape(rendered(kind))
-        figures = result.all_figures()
+    kinds = [(kind(time_diagnosis), rendered(kind)) for kind in (with_simulator, without_effects)]
+    for result, whole in (*kinds, (time_diagnosis, page)):
+        figures, shown = result.all_figures(), html.unescape(whole)
         assert ("where_as_given" in figures) == (result.stages[0].gap is not None)
         for name in figures:
             figure = shown[shown.index(f'<figure id="{name}">') :].split("</figure>")[0]
