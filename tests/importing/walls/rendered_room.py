@@ -185,7 +185,9 @@ def imported(
     images = RobotImages(
         origin="room",
         names=names,
-        intrinsics=GivenIntrinsics(matrix=camera.matrix, distortion=(), source="room"),
+        intrinsics=GivenIntrinsics(
+            matrix=camera.matrix, distortion=camera.distortion, source="room"
+        ),
         read=read,
         track=PoseTrack.checked(poses, "room"),
         targets=targets,
