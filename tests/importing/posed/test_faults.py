@@ -56,6 +56,11 @@ def without_one_image(recorded: Recorded) -> Recorded:
     return replace(dropped, exact=recorded.exact[:-1])
 
 
+def every_second(recorded: Recorded) -> Recorded:
+    """Return half of the images: what all other mistakes are tried before needs no more."""
+    return recorded.take(np.arange(0, len(recorded.exact), 2))
+
+
 @pytest.mark.parametrize(
     ("mistake", "said"),
     [
@@ -88,11 +93,11 @@ def without_one_image(recorded: Recorded) -> Recorded:
         (with_poses(lambda poses: poses[1:]), r"\d+ poses and \d+ images"),
         (with_poses(in_millimetres), "Are the translations in millimetres"),
         (
-            lambda images: replace(images, depth_mm=images.depth_mm[:, :, ::-1]),
+            lambda images: replace(every_second(images), depth_mm=images.depth_mm[::2, :, ::-1]),
             "mm with the columns mirrored",
         ),
         (
-            lambda images: replace(images, depth_mm=images.depth_mm // 10),
+            lambda images: replace(every_second(images), depth_mm=images.depth_mm[::2] // 10),
             "all distances multiplied by 10: is --depth-unit-mm right",
         ),
         pytest.param(
