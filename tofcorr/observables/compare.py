@@ -13,21 +13,18 @@ from tofcorr.data.recording import Recording
 from tofcorr.observables.measure import (
     DropoutMeasurement,
     NoiseMeasurement,
-    border_of,
     dropouts_of,
     noise_of,
     noise_source,
 )
 from tofcorr.observables.pairs import (
-    LEAST_POSES,
     Matched,
     Random,
     matched,
     permutation_p,
-    reach,
     sign_flip_p,
 )
-from tofcorr.observables.read import Observed, observe, quotient
+from tofcorr.observables.read import Observed, observe
 
 Block = dict[str, Any]
 # Smallest deviation that is reported: of a ratio from one, and of a correlation; and of the shares
@@ -281,9 +278,6 @@ def _compare_amplitude(
 ) -> Block | None:
     """Compare the amplitudes: real over simulated, in the same pixels or relative to cos / d^2.
 
-    The slope is the standard deviation of ln real amplitude over that of ln simulated amplitude;
-    target patterns that lie differently do not change it. The border is the outer eighth.
-
     Args:
         both: The pixels to compare; those of other poses matched by cos / d^2.
         real: Holds the amplitude of each row of the recording's table, also of missing pixels.
@@ -300,76 +294,21 @@ def _compare_amplitude(
     sums = both.sums(logs[0], logs[1])
     if not all(map(len, sums.total)):
         return None
-    means = sums.means()
-    interval = sums.difference_interval()
-    slope = ends = border = border_p = None
-    if both.paired:
-        products = _products(logs[0], logs[1], both.real.pose)
-        slope = _slope(products.sum(0))
-        if len(products) >= LEAST_POSES:
-            without = np.array([_slope(products.sum(0) - own) for own in products])
-            half = reach([(without, products[:, 0])])
-            ends = slope - half, slope + half
-        contrast = _border_contrast(both, logs[0] - logs[1], border_of(real.map.shape))
-        if len(contrast):
-            border, border_p = float(np.exp(contrast.mean())), sign_flip_p(contrast, random)
+    means, interval = sums.means(), sums.difference_interval()
     ratio, p_value = float(np.exp(means[0] - means[1])), sums.difference_p(random)
-    # An interval without 1 is significant at its own 95 %, whatever level is asked for.
-    beyond = None if ends is None or ends[0] <= 1.0 <= ends[1] else 0.0
+    cause = "light source or unit of the amplitude"
     return {
         "ratio": _significant(ratio),
         "ratio_ci": interval and [_significant(end) for end in np.exp(interval).tolist()],
         "p_value": p_value,
-        "slope": _significant(slope),
-        "slope_ci": ends and [_significant(end) for end in ends],
-        "border_ratio": _significant(border),
-        "border_p_value": border_p,
         "same_poses": both.paired,
-        "explained_by": _causes(
-            level,
-            ("light source or unit of the amplitude", ratio - 1.0, p_value, _MATERIAL),
-            ("response that is not linear", slope and slope - 1.0, beyond, _MATERIAL),
-            ("vignetting of lens and light source", border and border - 1.0, border_p, _MATERIAL),
-        ),
+        "explained_by": _causes(level, (cause, ratio - 1.0, p_value, _MATERIAL)),
     }
 
 
-def _products(real: np.ndarray, sim: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the sums of 1, x, y, xx, yy over the pixels of each pose, (P, 5)."""
-    known = np.isfinite(real) & np.isfinite(sim)
-    real, sim = real[known], sim[known]
-    _, row = np.unique(pose[known], return_inverse=True)
-    columns = (np.ones_like(real), real, sim, real**2, sim**2)
-    return np.stack([np.bincount(row, column) for column in columns], axis=1)
-
-
-def _slope(sums: np.ndarray) -> float:
-    """Return the standard deviation of the real over that of the simulated ln amplitude."""
-    count, x, y, xx, yy = sums
-    real, sim = xx / count - (x / count) ** 2, yy / count - (y / count) ** 2
-    return float(max(real / sim, 0.0) ** 0.5) if sim > 0 else float("nan")
-
-
-def _border_contrast(both: Matched, ratio: np.ndarray, border: np.ndarray) -> np.ndarray:
-    """Return the mean of each pose at the border less that in the centre, of poses that have both.
-
-    Args:
-        both: The pixels, paired.
-        ratio: Ln of real over simulated amplitude in each, shape (M,).
-        border: Where the border is, shape (H, W), bool.
-    """
-    side = border.ravel()[both.real.pixel]
-    known = np.isfinite(ratio)
-    place = (2 * both.real.pose + side)[known]
-    size = 2 * int(both.real.pose.max()) + 2
-    means = quotient(np.bincount(place, ratio[known], size), np.bincount(place, minlength=size))
-    contrast = means[1::2] - means[::2]
-    return contrast[np.isfinite(contrast)]
-
-
-def _significant(value: float | None) -> float | None:
-    """Return five significant digits: units of amplitude differ widely. None: not known."""
-    return None if value is None or not np.isfinite(value) else float(f"{value:.5g}")
+def _significant(value: float) -> float:
+    """Return five significant digits: units of amplitude differ widely."""
+    return float(f"{value:.5g}")
 
 
 def _log(values: np.ndarray) -> np.ndarray:

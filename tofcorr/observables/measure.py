@@ -401,7 +401,9 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
     saturated = observed.saturated / pixels
     if not stated:
         saturated = table.frames[beyond].sum() / max(table.frames.sum(), 1)
-    border = border_of(observed.map_frames.shape)
+    height, width = observed.map_frames.shape
+    border = np.ones((height, width), dtype=bool)  # The outer eighth on each side.
+    border[height // 8 : height - height // 8, width // 8 : width - width // 8] = False
     border_share, centre_share = (
         float(observed.map_missing[where].sum() / max(observed.map_frames[where].sum(), 1))
         for where in (border, ~border)
@@ -418,14 +420,6 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
         amplitude_recorded=recorded,
         observed=observed,
     )
-
-
-def border_of(shape: tuple[int, ...]) -> np.ndarray:
-    """Return True in the outer eighth of an image (H, W) on each side, bool."""
-    height, width = shape
-    border = np.ones((height, width), dtype=bool)
-    border[height // 8 : height - height // 8, width // 8 : width - width // 8] = False
-    return border
 
 
 def _saturation(observed: Observed, amplitude: np.ndarray) -> tuple[float | None, bool]:

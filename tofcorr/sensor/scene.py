@@ -18,7 +18,7 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.sensor_file import SensorFile
 from tofcorr.simulation.effects.base import AMPLITUDE, FREQUENCY, CatalogueEffect, EffectInputs
 from tofcorr.simulation.effects.registry import build_effects
-from tofcorr.simulation.hooks import Effect, FrameFacts
+from tofcorr.simulation.hooks import FrameFacts
 
 # Conditions count up to this share of their range beyond it (no unit). Derived: a parabola that
 # errs by 1 at most within a range errs by 2 an eighth of it further, by 7 half of it further.
@@ -291,7 +291,7 @@ class ImageEffect(nn.Module):
         super().__init__()
         self.effect = effect
         stages = [(group, f"on_{stage}") for group in Group for stage in group.value]
-        acts = [g for g, hook in stages if getattr(type(effect), hook) is not getattr(Effect, hook)]
+        acts = [group for group, hook in stages if hasattr(effect, hook)]
         self.group = Group.FRAME if effect.of_frame else [Group.DELAY, *acts][-1]
         self.coefficients = nn.Parameter(effect.coefficients.clone())
 

@@ -186,31 +186,10 @@ class FrameState:
 
 
 class Effect:
-    """An effect that the plain sensor lacks; override the stages where it acts.
+    """An effect that the plain sensor lacks: `on_<stage>(state)` for the stages where it acts.
 
     One object handles all frames of a simulation, in order, so it may keep values from frame to
     frame. It draws random numbers from `state.generator` only.
     """
 
     name: ClassVar[str] = ""
-
-    def on_pose(self, state: FrameState) -> None:
-        """Change the true poses of camera and target."""
-
-    def on_geometry(self, state: FrameState) -> None:
-        """Change true distances, incidence angles or positions on the target."""
-
-    def on_light(self, state: FrameState) -> None:
-        """Change the light that arrives."""
-
-    def on_delay(self, state: FrameState) -> None:
-        """Delay the signal of each pixel."""
-
-    def on_signal(self, state: FrameState) -> None:
-        """Mix signals: other paths, neighbouring pixels."""
-
-    def on_taps(self, state: FrameState) -> None:
-        """Change the electrons that the taps collect."""
-
-    def on_readout(self, state: FrameState) -> None:
-        """Change what the camera reports."""

@@ -86,7 +86,8 @@ class SensorPipeline:
         for name in STAGES:
             getattr(self, f"_{name}")(state)
             for effect in self._effects:
-                getattr(effect, f"on_{name}")(state)
+                if hasattr(effect, f"on_{name}"):
+                    getattr(effect, f"on_{name}")(state)
         return state
 
     def _pose(self, state: FrameState) -> None:

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, partialmethod
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -148,41 +148,24 @@ class DiagnosisResult:
 
         return FIGURES[name](self)
 
-    def plot_gap(self) -> "Figure":
-        """Draw the gap at each stage, with intervals."""
-        return self._draw("stages")
-
-    def plot_attribution(self) -> "Figure":
-        """Draw the share of each cause in the squared gap, with intervals."""
-        return self._draw("attribution")
-
-    def plot_where_as_given(self) -> "Figure":
-        """Draw the bias of the simulator as given; of the fitted one without a simulator."""
-        return self._draw("where_as_given")
-
-    def plot_where(self) -> "Figure":
-        """Draw the bias after recalibration, and with the effects, along covariates."""
-        return self._draw("where")
-
-    def plot_image(self) -> "Figure":
-        """Draw the mean residual over the image at each stage."""
-        return self._draw("map")
-
-    def plot_pose_series(self) -> "Figure":
-        """Draw the mean residual of each pose in the order of the recording."""
-        return self._draw("series")
-
-    def plot_effects(self) -> "Figure":
-        """Draw what each effect closes, with intervals, and its score."""
-        return self._draw("which")
-
-    def plot_absorption(self) -> "Figure":
-        """Draw the share of each effect that calibration and other effects absorb."""
-        return self._draw("aliases")
-
-    def plot_poses(self) -> "Figure":
-        """Draw the held-out error of each pose before and after the effects."""
-        return self._draw("poses")
+    plot_gap = partialmethod(_draw, "stages")
+    """Draw the gap at each stage, with intervals."""
+    plot_attribution = partialmethod(_draw, "attribution")
+    """Draw the share of each cause in the squared gap, with intervals."""
+    plot_where_as_given = partialmethod(_draw, "where_as_given")
+    """Draw the bias of the simulator as given; of the fitted one without a simulator."""
+    plot_where = partialmethod(_draw, "where")
+    """Draw the bias after recalibration, and with the effects, along covariates."""
+    plot_image = partialmethod(_draw, "map")
+    """Draw the mean residual over the image at each stage."""
+    plot_pose_series = partialmethod(_draw, "series")
+    """Draw the mean residual of each pose in the order of the recording."""
+    plot_effects = partialmethod(_draw, "which")
+    """Draw what each effect closes, with intervals, and its score."""
+    plot_absorption = partialmethod(_draw, "aliases")
+    """Draw the share of each effect that calibration and other effects absorb."""
+    plot_poses = partialmethod(_draw, "poses")
+    """Draw the held-out error of each pose before and after the effects."""
 
 
 def content_of(result: DiagnosisResult) -> dict[str, Any]:
