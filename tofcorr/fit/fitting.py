@@ -62,7 +62,6 @@ from tofcorr.fit.weighting import PixelWeights, first_weights
 from tofcorr.pixels.dataset import Dataset, thread_number
 from tofcorr.pixels.passes import image_moments
 from tofcorr.pixels.sample import (
-    cosine_of_incidence,
     distance_to_plane,
     estimate_noise,
     pixels_of_image,
@@ -334,8 +333,7 @@ def _with_pattern(problem: Problem, core: Core) -> CalibrationModel:
     total = rays.new_zeros(4, *rays.shape[:2])
     for batch in dataset.batches(problem.frames, device):
         here = rays.to(device)
-        found = distance_to_plane(model, batch, here)
-        cosine = cosine_of_incidence(model, batch, here)
+        found, cosine = distance_to_plane(model, batch, here)
         sums = torch.stack([cosine * found, cosine**2, found**2, torch.ones_like(found)])
         total += (sums * batch.valid.to(found)).sum(dim=1).cpu()
     product, square, residual, number = total

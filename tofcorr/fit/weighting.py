@@ -76,7 +76,7 @@ class PixelWeights:
         """Return amplitudes, 1 where not valid, and distances to the plane under the model."""
         amplitude, distance = batch.amplitude, batch.radial_distance
         if self.model is not None:
-            distance = distance_to_plane(self.model, batch, self.ray_directions)
+            distance, _ = distance_to_plane(self.model, batch, self.ray_directions)
         return None if amplitude is None else torch.where(batch.valid, amplitude, 1.0), distance
 
     def _of(self, amplitude: Tensor | None, distance: Tensor) -> Tensor:

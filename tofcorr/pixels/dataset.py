@@ -292,27 +292,23 @@ def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
 
 
 def covered_domain(
-    dataset: Dataset,
-    frames: Sequence[int] | np.ndarray,
-    outside_share: float = 0.001,
-    pixels: int = 200_000,
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, outside_share: float = 0.001
 ) -> Domain:
     """Return image size, and the central 99.8 % of distances and amplitudes of usable pixels.
 
-    A regular sample of pixels is looked at, the same number in every frame.
+    A regular sample of 200 000 pixels, at least 50 a frame, is looked at.
 
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames.
         outside_share: Share of the values left out at either end of a range: a few stray pixels
             must not widen the range in which a correction is valid.
-        pixels: About how many the ranges are determined from, at least 50 a frame.
 
     Raises:
         CalibrationDataError: No pixel of these frames is usable.
     """
     first = dataset.first
-    per_frame = max(pixels // max(len(frames), 1), 50)
+    per_frame = max(200_000 // max(len(frames), 1), 50)
     step = max(first.camera.height * first.camera.width // per_frame, 1)
     if dataset.exclude is None:
         parts = [_sample(one, local, step) for one, _, local in dataset.by_recording(frames)]

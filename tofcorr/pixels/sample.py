@@ -118,8 +118,8 @@ def draw_pixels(
 
 def distance_to_plane(
     model: CalibrationModel, batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]
-) -> Float[Tensor, "B H W"]:
-    """Return the signed distance of every corrected point to its plane.
+) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+    """Return the signed distance of every corrected point to its plane, and the cosine of its ray.
 
     Pixels that are not valid are read as 1 m and amplitude 1, so that no NaN reaches the model.
 
@@ -129,7 +129,8 @@ def distance_to_plane(
         ray_directions: Unit rays in the camera frame, shape (H, W, 3).
 
     Returns:
-        Shape (B, H, W), metres, positive on the normal's side; meaningless where not valid.
+        Distances, shape (B, H, W), metres, positive on the normal's side, meaningless where not
+        valid; and the cosine between ray and normal, shape (B, H, W), negative in front of a plane.
     """
     distance = torch.where(batch.valid, batch.radial_distance, 1.0)
     amplitude = batch.amplitude
@@ -137,16 +138,9 @@ def distance_to_plane(
         amplitude = torch.where(batch.valid, amplitude, 1.0)
     planes = batch.normal_tool, batch.offset_tool
     with torch.no_grad():
-        return model.residual(distance, amplitude, ray_directions, *planes, batch.conditions)
-
-
-def cosine_of_incidence(
-    model: CalibrationModel, batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]
-) -> Float[Tensor, "B H W"]:
-    """Return the cosine between ray and plane normal, shape (B, H, W); negative in front of it."""
-    with torch.no_grad():
+        found = model.residual(distance, amplitude, ray_directions, *planes, batch.conditions)
         normal = batch.normal_tool @ model.hand_eye()[:3, :3]
-    return (ray_directions @ normal.T).permute(2, 0, 1)
+    return found, (ray_directions @ normal.T).permute(2, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -182,8 +176,6 @@ def sample_pixels(
     dataset: Dataset,
     stages: Mapping[str, CalibrationModel],
     frames: Sequence[int] | np.ndarray,
-    pixels: int = 300_000,
-    most_read: int = 4_000_000,
 ) -> PixelSample:
     """Draw pixels at random from some frames, and compute their errors.
 
@@ -194,12 +186,11 @@ def sample_pixels(
         stages: The models whose errors are wanted; the last one's hand-eye defines incidence.
         frames: Global numbers of the frames; of long recordings only some frames, evenly spread,
             are read.
-        pixels: About how many are drawn: enough for narrow bins.
-        most_read: About how many they are drawn from: bounds the time on long recordings.
     """
     camera = dataset.first.camera
-    read = thinned(np.asarray(frames), max(most_read // (camera.height * camera.width), 1))
-    drawn = draw_pixels(dataset, read, pixels, seed=0)
+    # Of four million pixels, which bounds the time, enough for narrow bins.
+    read = thinned(np.asarray(frames), max(4_000_000 // (camera.height * camera.width), 1))
+    drawn = draw_pixels(dataset, read, 300_000, seed=0)
     covariates = {
         "distance [m]": drawn.pixels.radial_distance,
         "row [pixel]": drawn.pixels.rows,
@@ -230,17 +221,13 @@ def errors_along_ray(
 ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
     """Return measured minus true distance in mm (B, H, W), NaN where not valid, and cosines."""
     rays = dataset.ray_directions().to(batch.radial_distance)
-    residual = distance_to_plane(model, batch, rays)
-    cosine = cosine_of_incidence(model, batch, rays)
+    residual, cosine = distance_to_plane(model, batch, rays)
     return torch.where(batch.valid, 1e3 * residual / cosine, torch.nan), cosine
 
 
 def estimate_noise(
     dataset: Dataset,
     frames: Sequence[int] | np.ndarray,
-    differences: int = 500_000,
-    pixels: int = 2_000_000,
-    fewest_frames: int = 8,
 ) -> DistanceNoise:
     """Return the noise of a measured distance as a function of its amplitude.
 
@@ -249,10 +236,6 @@ def estimate_noise(
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames.
-        differences: About how many the noise is fitted to.
-        pixels: Without repeated poses, neighbours are compared in evenly spread images of about so
-            many pixels in all. More would hardly change the result.
-        fewest_frames: They are no fewer images than this.
 
     Raises:
         CalibrationDataError: There are no amplitudes, too few pixels, or most differences are zero.
@@ -268,7 +251,8 @@ def estimate_noise(
         ]
     else:
         camera = dataset.first.camera
-        enough = max(pixels // (camera.height * camera.width), fewest_frames)
+        # Two million pixels, in eight images at least: more would hardly change the result.
+        enough = max(2_000_000 // (camera.height * camera.width), 8)
         some = np.linspace(0, len(frames) - 1, min(len(frames), enough)).astype(int)
         rays = dataset.ray_directions()
         parts = [
@@ -276,7 +260,7 @@ def estimate_noise(
             for one in dataset.batches(frames[some])
             if one.amplitude is not None  # Required above.
         ]
-    share = max(sum(len(part[0]) for part in parts) // differences, 1)
+    share = max(sum(len(part[0]) for part in parts) // 500_000, 1)
     difference = torch.cat([part[0][::share] for part in parts])
     amplitude = torch.cat([part[1][::share] for part in parts])
     return fit_noise(difference, amplitude, "repeats" if len(repeated) else "neighbours")
@@ -305,7 +289,6 @@ def without_outliers(
     dataset: Dataset,
     window_mm: float | None,
     frames: Sequence[int] | np.ndarray | None = None,
-    pixels: int = 2_000_000,
 ) -> Dataset:
     """Return the data set with every pixel left out whose raw error is off by more than a window.
 
@@ -318,7 +301,6 @@ def without_outliers(
         dataset: The recordings.
         window_mm: Largest distance from the median raw error, millimetres; None keeps all.
         frames: Global numbers of the frames that the median is taken over; None: all.
-        pixels: About how many, evenly spread, the median is taken over.
 
     Raises:
         CalibrationDataError: No usable pixel looks at its plane.
@@ -327,13 +309,13 @@ def without_outliers(
         return dataset
     transform, rays = recorded_hand_eye(dataset), dataset.ray_directions()
     num_frames = dataset.num_frames if frames is None else len(frames)
-    step = -(-num_frames * rays[..., 0].numel() // pixels)
+    # Two million pixels, evenly spread, give the median.
+    step = -(-num_frames * rays[..., 0].numel() // 2_000_000)
     errors = [
         raw_errors(batch, rays, transform)[batch.valid & batch.radial_distance.isfinite()][::step]
         for batch in dataset.batches(frames)
     ]
-    finite = torch.cat(errors)
-    finite = finite[finite.isfinite()]
+    finite = torch.cat([own[own.isfinite()] for own in errors])
     if not finite.numel():
         raise CalibrationDataError(
             f"{dataset.first.path}: outlier_window_mm needs pixels that look at their plane, and "

@@ -124,20 +124,20 @@ def place_of(study: Study, chosen: Tensor) -> str:
 
 
 def _places(
-    study: Study, chosen: Tensor, *, groups: int = 8, edge_ratio: float = 1.5
+    study: Study, chosen: Tensor, *, edge_ratio: float = 1.5
 ) -> Iterator[tuple[str, Tensor]]:
     """Yield a clause and the pixels, (M,), for each kind of place that is crowded.
 
     Args:
         study: The recording.
         chosen: Which pixels, shape (M,), bool.
-        groups: Tiles along each side of the image, groups of a covariate with equally many pixels,
-            and the most frames that are listed. Chosen.
         edge_ratio: Brightest over darkest pixel of a 3 x 3 neighbourhood that holds an edge of the
             target. Chosen: neighbours of one reflectivity differ by a few per cent and by noise.
     """
     observations, width = study.observations, study.observations.recording.camera.width
     row, column = observations.pixel // width, observations.pixel % width
+    # Tiles along a side, groups of like distance, and the most frames that are listed. Chosen.
+    groups = 8
     found = {"at the rim of the target's mask": _at_edges(observations, observations.on_target, 1)}
     if observations.amplitude_images is not None:
         at_edges = _at_edges(observations, observations.amplitude_images, edge_ratio)

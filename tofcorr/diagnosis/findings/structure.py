@@ -152,29 +152,23 @@ class Structure(NamedTuple):
     p_value: float = 1.0
 
 
-def shared_by_poses(
-    study: Study,
-    residual: Tensor,
-    *,
-    significant: float = 3.0,
-    least_poses: int = 3,
-    brightnesses: int = 40,
-) -> Structure:
+def shared_by_poses(study: Study, residual: Tensor) -> Structure:
     """Return the largest of what poses share by pixel, place on the target, and brightness.
+
+    It counts from three standard errors on, by convention, in cells that three poses show: they
+    give three pairs.
 
     Args:
         study: The recording.
         residual: Without each pose's offset and tilts, shape (M,), metres.
-        significant: Structure counts from this many standard errors on. The usual convention.
-        least_poses: Cells that fewer poses show are not used. Chosen: three give three pairs.
-        brightnesses: Groups of pixels of like brightness. Chosen: over a range of 1 to 30 in
-            amplitude they differ by 9 %, far less than what errors of the amplitude need to change.
     """
     units, share, found = study.sums.num_units, study.fit.share, Structure()
     order = brightness_of(study.observations).argsort().argsort()
-    for cells in (study.observations.pixel, _places(study), order * brightnesses // len(order)):
+    # Over a range of 1 to 30 in amplitude, 40 groups differ by 9 %, far less than what errors of
+    # the amplitude need to change.
+    for cells in (study.observations.pixel, _places(study), order * 40 // len(order)):
         own, count = _per_cell(study.unit_of_pixel, cells, share * residual, share)
-        used = (count > 0).sum(0) >= least_poses
+        used = (count > 0).sum(0) >= 3
         if not bool(used.any()):
             continue
         # All poses at first, then all but one at a time.
@@ -187,7 +181,7 @@ def shared_by_poses(
         spread = mean[1:] - mean[1:].mean()
         error = float(((units - 1) / units * spread.square().sum()).sqrt())
         square = float(mean[0])
-        if square > max(significant * error, found.square):
+        if square > max(3 * error, found.square):
             found = Structure(square, error)
     return found
 
@@ -236,15 +230,12 @@ def unlike_waves(study: Study, chosen: Sequence[str]) -> Structure:
     return Structure(float(beyond * (own / weight).mean()), p_value=p_value)
 
 
-def _energies(
-    study: Study, left: Tensor, *, most_pixels: int = 100_000, ridge: float = 1e-6
-) -> tuple[Tensor, Tensor, Tensor]:
+def _energies(study: Study, left: Tensor, *, ridge: float = 1e-6) -> tuple[Tensor, Tensor, Tensor]:
     """Return squared scores of every pose and wave, what is seen of each, and summed weights.
 
     Args:
         study: The recording.
         left: The residual, shape (M,), metres.
-        most_pixels: Pixels that are used, at most, evenly spread. Chosen: 50 ms.
         ridge: Added to the pose's equations, as a share of their diagonal, so that they can be
             solved for poses of few pixels. Chosen, far above rounding.
 
@@ -252,7 +243,7 @@ def _energies(
         (U, K), with mean `seen` under white noise of the level assumed; (U, K), 0 to 1; and (U,),
         1 / m^2.
     """
-    step = slice(None, None, max(1, len(left) // most_pixels))
+    step = slice(None, None, max(1, len(left) // 100_000))  # More would take longer than 50 ms.
     observations, weight = study.observations.at(step), study.weight[step]
     pose, count = study.system.pose[step], study.system.pose.shape[1]
     columns = torch.cat([pose, _waves(study, step), left[step, None]], dim=1)
@@ -270,22 +261,18 @@ def _energies(
     return (scores * size[:, -1:]) ** 2, seen, whole.clamp(min=TINY)
 
 
-def _waves(study: Study, step: slice, *, least: float = 16.0, most: int = 5) -> Tensor:
-    """Return all waves but a pose's own offset and tilts, (M, K).
+def _waves(study: Study, step: slice) -> Tensor:
+    """Return all waves but a pose's own offset and tilts, (M, K), of some pixels.
 
-    Args:
-        study: The recording.
-        step: Which pixels.
-        least: Length of a wave, pixels: filters of 3 to 7 taps leave at least 80 % of the noise's
-            energy at it. Derived for a Gaussian of 1.2 pixels.
-        most: Half waves along one side, at most. Chosen to bound the time: 20 waves.
+    A wave is 16 pixels long at least: filters of 3 to 7 taps leave at least 80 % of the noise's
+    energy at it (derived for a Gaussian of 1.2 pixels). Five half waves along one side, 20 waves in
+    all, bound the time.
     """
     camera, inputs = study.inputs.camera, study.inputs
     sides = (camera.width, inputs.columns), (camera.height, inputs.rows)
-    across, down = (max(1, min(most, int(2 * pixels / least))) for pixels, _ in sides)
+    across, down = (max(1, min(5, pixels // 8)) for pixels, _ in sides)
     of_x, of_y = (
-        [torch.cos(k * torch.pi / 2 * (place[step] + 1)) for k in range(most + 1)]
-        for _, place in sides
+        [torch.cos(k * torch.pi / 2 * (place[step] + 1)) for k in range(6)] for _, place in sides
     )
     waves = [
         of_x[i] * of_y[j]

@@ -174,16 +174,13 @@ def covariates(study: Study) -> dict[str, Tensor]:
     return {name: values for name, values in found.items() if bool(values.isfinite().all())}
 
 
-def _edges(values: np.ndarray, *, bins: int = 8, few: int = 1000) -> np.ndarray:
+def _edges(values: np.ndarray) -> np.ndarray:
     """Return edges of bins with equally many pixels; a covariate of few levels gets a bin each.
 
-    Args:
-        values: Of the covariate, shape (M,).
-        bins: At most so many. Chosen: few enough that each holds many poses.
-        few: Values that are looked at first. Chosen: of most covariates they already tell that
-            there are many levels.
+    There are eight at most, few enough that each holds many poses.
     """
-    levels = np.unique(values[:few])
+    bins = 8
+    levels = np.unique(values[:1000])  # Of most covariates these tell that there are many.
     if len(levels) <= bins:
         levels = np.unique(values)
     if len(levels) > bins:
@@ -194,11 +191,7 @@ def _edges(values: np.ndarray, *, bins: int = 8, few: int = 1000) -> np.ndarray:
 
 
 def flipped(
-    study: Study,
-    residual: Tensor,
-    chosen: Sequence[str] | None = None,
-    *,
-    most_pixels: int = 20_000,
+    study: Study, residual: Tensor, chosen: Sequence[str] | None = None
 ) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
     """Return what gives sums of residuals, observed and when whole poses flip their sign.
 
@@ -210,8 +203,6 @@ def flipped(
         study: The recording.
         residual: Shape (M,), metres.
         chosen: Effects of the model that was fitted; None: the residual is of no fit.
-        most_pixels: Pixels that tell how much of a sum a fit takes, at most, evenly spread. Chosen:
-            a sum over a tenth of them is known to 2 %.
 
     Returns:
         Takes weighted residuals of every bin and pose, shape (bins, U), the bin of each pixel,
@@ -226,7 +217,8 @@ def flipped(
     weighted = (ols.scale * study.fit.share * residual)[:, None]
     scores = [study.observations.products(own, weighted)[..., 0] for own in columns]
     theta = torch.linalg.solve(ols.normal(chosen), torch.cat(scores, dim=1).T @ signs)
-    step = max(1, len(residual) // most_pixels)
+    # So many, evenly spread, tell how much of a sum a fit takes: over a tenth of them to 2 %.
+    step = max(1, len(residual) // 20_000)
     some = slice(None, None, step)
     taken = step * study.weight[some, None] * torch.cat([own[some] for own in columns], dim=1)
 
