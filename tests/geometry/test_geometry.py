@@ -112,17 +112,6 @@ def test_derivative_of_the_exponential_is_exact(scale: float) -> None:
     assert torch.autograd.gradcheck(se3.exp, twist.requires_grad_())
 
 
-def test_quarter_turn_about_z_from_its_quaternion() -> None:
-    half = math.sqrt(0.5)
-    transform = se3.matrix_from_quaternion_translation(
-        torch.tensor([0.0, 0.0, half, half], dtype=torch.float64),
-        torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64),
-    )
-    point = transform @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(point, torch.tensor([1.0, 3.0, 3.0, 1.0]).double())
-    assert float(se3.rotation_angle(transform[:3, :3])) == pytest.approx(math.pi / 2)
-
-
 @given(values=twists)
 def test_signed_distance_does_not_depend_on_the_frame(values: list[float]) -> None:
     world_from_frame = se3.exp(torch.tensor(values, dtype=torch.float64))

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions, Value, condition
 from tofcorr.data.arrays import LARGEST_DISTANCE
@@ -117,11 +118,11 @@ def read_table(path: Path) -> FrameTable:
     for name in (*TRANSLATION, "d"):
         far = np.abs(number[name]) > LARGEST_DISTANCE
         _refuse(far, cells[name], name, f"metres, at most {LARGEST_DISTANCE:g}", path)
+    # kornia normalises them, and has the scalar first.
+    rotation = quaternion_to_rotation_matrix(torch.from_numpy(quaternion[:, [3, 0, 1, 2]]))
     return FrameTable(
         timestamp=number[TIMESTAMP],
-        world_from_tool=se3.matrix_from_quaternion_translation(
-            torch.from_numpy(quaternion), torch.from_numpy(translation)
-        ).numpy(),
+        world_from_tool=se3.assemble(rotation, torch.from_numpy(translation)).numpy(),
         normal_world=normal / length[:, None],
         offset=number["d"] / length,
         target=np.array(cells["target"]),

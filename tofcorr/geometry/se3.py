@@ -204,28 +204,6 @@ def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
     return exact
 
 
-def matrix_from_quaternion_translation(quaternion_xyzw: Tensor, translation: Tensor) -> Tensor:
-    """Build transforms from quaternions and translations.
-
-    Args:
-        quaternion_xyzw: Quaternions with the scalar last, normalised here, shape (..., 4).
-        translation: Translations, shape (..., 3), metres.
-
-    Returns:
-        Transforms, shape (..., 4, 4).
-    """
-    x, y, z, w = torch.nn.functional.normalize(quaternion_xyzw, dim=-1).unbind(-1)
-    rotation = torch.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-            *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-            *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-        ],
-        dim=-1,
-    ).reshape(*x.shape, 3, 3)
-    return assemble(rotation, translation)
-
-
 def rotation_angle(rotation: Tensor) -> Tensor:
     """Return the angle of rotations (..., 3, 3) in radians, accurate near zero."""
     skew = rotation - rotation.transpose(-1, -2)
