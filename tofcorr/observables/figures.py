@@ -1,60 +1,30 @@
 """Figures of noise, missing pixels and amplitude: recording red, simulator blue."""
 
-import math
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.measure import LEAST_VARIANCE, DropoutMeasurement, NoiseMeasurement
 from tofcorr.observables.read import quotient
+from tofcorr.plausibility.page import (
+    BLUE,
+    FAINT,
+    GREY,
+    RED,
+    WIDTH,
+    line_across,
+    panels,
+    plain_look,
+    plain_numbers,
+)
 
-BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"
-"""The simulator or what is explained; the recording or the gap; what is neither."""
-WIDTH = 5.7
-"""Width of a figure, inches: 547 pixels, so that its words can be read on a narrow page too."""
-FAINT = 0.2
-"""Opacity of bands, no unit."""
 # Points of a curve, and pixels that one stands for at least; tiles along the longer side of a map:
 # single pixels would show noise alone. Chosen for a readable figure.
 _POINTS, _FEWEST, _TILES = 18, 30, 16
-# Numbers at a logarithmic axis, by the decades that it spans at least. Chosen: three to seven.
-_LABELS = ((1.3, (1.0, 3.0)), (0.7, (1.0, 2.0, 5.0)), (0.0, (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
-
-
-def panels(
-    height: float, rows: int = 1, columns: int = 1, *, same_rows: bool = False
-) -> tuple[Figure, list[Axes]]:
-    """Return a figure of this height in inches, and its empty panels, row by row.
-
-    Args:
-        height: Of the figure, inches.
-        rows: Of panels.
-        columns: Of panels.
-        same_rows: Whether the panels of a row share their vertical axis.
-    """
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    found = figure.subplots(rows, columns, squeeze=False, sharey=same_rows).ravel().tolist()
-    for axes in found:
-        _plain_look(axes)
-    return figure, found
-
-
-def _plain_look(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8)
-    for words in (axes.xaxis.label, axes.yaxis.label):
-        words.set_fontsize(9)
-
-
-def line_across(axes: Axes, *, at: float = 0.0, vertical: bool = False) -> None:
-    """Draw a thin line through the whole panel: where something is zero, or one."""
-    (axes.axvline if vertical else axes.axhline)(at, color="black", linewidth=1)
 
 
 def drawings(observables: Observables) -> dict[str, Callable[[], Figure]]:
@@ -103,7 +73,7 @@ def noise_figure(observables: Observables) -> Figure:
     found[-1].set_xlabel("amplitude, counts" if real.curve.needs_amplitude else "distance, m")
     found[0].legend(frameon=False)
     for axis in (found[0].yaxis, *(axes.xaxis for axes in found)):
-        _plain_numbers(axis)
+        plain_numbers(axis)
     return figure
 
 
@@ -146,14 +116,14 @@ def dropout_figure(observables: Observables) -> Figure:
     parts = figure.subfigures(1 + with_amplitude, 1, squeeze=False).ravel().tolist()
     if with_amplitude:
         axes = parts[0].subplots()
-        _plain_look(axes)
+        plain_look(axes)
         for name, dropouts, colour, _ in shown:
             _dropout_curve(axes, dropouts, colour, name)
         axes.set_ylabel("pixels without distance, %")
         axes.set_xlabel("amplitude, counts")
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False)
-        _plain_numbers(axes.xaxis)
+        plain_numbers(axes.xaxis)
     highest = max(100 * float(np.nanmax(each.map)) for _, each, *_ in shown) or 1.0
     maps = parts[-1].subplots(1, len(shown), squeeze=False)[0]
     for axes, (name, dropouts, _, share) in zip(maps, shown, strict=True):
@@ -192,7 +162,7 @@ def amplitude_figure(observables: Observables) -> Figure:
     upper.set_ylabel("recorded amplitude, counts")
     upper.legend(frameon=False)
     for axis in (upper.xaxis, upper.yaxis):
-        _plain_numbers(axis)
+        plain_numbers(axis)
     shape = observables.real_dropouts.map.shape
     tiles = 100 * np.expm1(_tile_means(both.real.pixel[lit], np.log(real / sim / ratio), shape))
     limit = max(float(np.nanmax(np.abs(tiles))), 1.0)
@@ -231,13 +201,3 @@ def _binned(at: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray
     count = np.bincount(place, minlength=_POINTS)
     mean = quotient(np.bincount(place, values[inside], minlength=_POINTS), count)
     return np.where(count >= _FEWEST, mean, np.nan)
-
-
-def _plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis in plain digits: by 1, 3, 10, ... or closer where it is short."""
-    low, high = axis.get_view_interval()
-    decades = math.log10(high / low)
-    labels = next(labels for least, labels in _LABELS if decades >= least)
-    axis.set_major_locator(LogLocator(subs=labels))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_locator(NullLocator())  # Every tick takes a millisecond to draw.

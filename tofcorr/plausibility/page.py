@@ -1,6 +1,7 @@
 """The page of an inspection: one HTML file that needs nothing else."""
 
 import io
+import math
 from importlib.resources import files
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -21,7 +23,12 @@ from tofcorr.plausibility.finding import Inspection
 from tofcorr.plausibility.look import Look
 from tofcorr.version import __version__
 
-_BLUE, _RED, _GREY = "#2166ac", "#b2182b", "#777777"
+BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"
+"""The simulator or what is explained; the recording or the gap; what is neither."""
+WIDTH = 5.7
+"""Width of a figure, inches: 547 pixels, so that its words can be read on a narrow page too."""
+FAINT = 0.2
+"""Opacity of bands, no unit."""
 
 
 def write_page(found: Inspection, path: Path) -> None:
@@ -61,6 +68,56 @@ def svg_of(figure: Figure) -> str:
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]
+
+
+# What all figures look like.
+
+# Numbers at a logarithmic axis, by the decades that it spans at least. Chosen: three to seven.
+_LABELS = ((1.3, (1.0, 3.0)), (0.7, (1.0, 2.0, 5.0)), (0.0, (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
+
+
+def panels(
+    height: float, rows: int = 1, columns: int = 1, *, same_rows: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of this height in inches, and its empty panels, row by row.
+
+    Args:
+        height: Of the figure, inches.
+        rows: Of panels.
+        columns: Of panels.
+        same_rows: Whether the panels of a row share their vertical axis.
+    """
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    found = figure.subplots(rows, columns, squeeze=False, sharey=same_rows).ravel().tolist()
+    for axes in found:
+        plain_look(axes)
+    return figure, found
+
+
+def plain_look(axes: Axes) -> None:
+    """Let a panel have two sides only, and small numbers and labels."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8)
+    for words in (axes.xaxis.label, axes.yaxis.label):
+        words.set_fontsize(9)
+
+
+def line_across(axes: Axes, *, at: float = 0.0, vertical: bool = False) -> None:
+    """Draw a thin line through the whole panel: where something is zero, or one."""
+    (axes.axvline if vertical else axes.axhline)(at, color="black", linewidth=1)
+
+
+def plain_numbers(axis: Axis) -> None:
+    """Label a logarithmic axis in plain digits: by 1, 3, 10, ... or closer where it is short."""
+    low, high = axis.get_view_interval()
+    decades = math.log10(high / low)
+    labels = next(labels for least, labels in _LABELS if decades >= least)
+    axis.set_major_locator(LogLocator(subs=labels))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())  # Every tick takes a millisecond to draw.
+
+
+# The figures of an inspection.
 
 
 def all_figures(found: Inspection) -> dict[str, Figure]:
@@ -103,13 +160,13 @@ def poses_from_above(look: Look, found: Inspection) -> Figure:
     reach = length * axis[:, [first, second]]
     # One unit of an arrow is one of the axes.
     scale = {"angles": "xy", "scale_units": "xy", "scale": 1}
-    axes.quiver(across, along, *reach.T, color=_GREY, width=1 / 250, **scale)
+    axes.quiver(across, along, *reach.T, color=GREY, width=1 / 250, **scale)
     axes.update_datalim(place[:, [first, second]] + reach)
-    axes.plot(across, along, "o", color=_BLUE, markersize=4)
+    axes.plot(across, along, "o", color=BLUE, markersize=4)
     odd = np.isin(look.sampled, list(found.outlying))
-    axes.plot(across[odd], along[odd], "o", color=_RED, markersize=7)
+    axes.plot(across[odd], along[odd], "o", color=RED, markersize=7)
     for k in np.flatnonzero(odd):
-        axes.annotate(str(look.sampled[k]), (across[k], along[k]), color=_RED)
+        axes.annotate(str(look.sampled[k]), (across[k], along[k]), color=RED)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel=f"{'xyz'[first]} of the world, m", ylabel=f"{'xyz'[second]} of the world, m")
     return figure
@@ -120,16 +177,14 @@ def residuals(look: Look, found: Inspection) -> Figure:
     before = judged(look.scene, look.scene.guess if look.scene.moves else np.eye(4), 0.0, 0.0)
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
-    axes.plot(look.frames, 1e3 * before.rms, "o", color=_GREY, markersize=4, label="as recorded")
-    axes.plot(look.frames, 1e3 * look.rms, "o", color=_BLUE, markersize=4, label="best alignment")
+    axes.plot(look.frames, 1e3 * before.rms, "o", color=GREY, markersize=4, label="as recorded")
+    axes.plot(look.frames, 1e3 * look.rms, "o", color=BLUE, markersize=4, label="best alignment")
     odd = np.isin(look.frames, list(found.outlying))
     if odd.any():
-        axes.plot(look.frames[odd], 1e3 * look.rms[odd], "o", color=_RED, label="disagree")
-    axes.axhline(1e3 * look.flatness, color=_BLUE, linewidth=1, linestyle=":", label="flatness")
+        axes.plot(look.frames[odd], 1e3 * look.rms[odd], "o", color=RED, label="disagree")
+    axes.axhline(1e3 * look.flatness, color=BLUE, linewidth=1, linestyle=":", label="flatness")
     axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
+    plain_numbers(axes.yaxis)
     axes.set(xlabel="frame", ylabel="distance to the plane, mm RMS")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(ncols=4, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))

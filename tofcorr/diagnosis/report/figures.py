@@ -25,8 +25,8 @@ from tofcorr.diagnosis.report.words import (
 )
 from tofcorr.diagnosis.sums.study import absorption_table
 from tofcorr.estimation.robust import student_quantile
-from tofcorr.observables.figures import BLUE, FAINT, GREY, RED, line_across, panels
 from tofcorr.observables.figures import drawings as observable_drawings
+from tofcorr.plausibility.page import BLUE, FAINT, GREY, RED, line_across, panels
 
 if TYPE_CHECKING:
     from tofcorr.diagnosis.report.result import DiagnosisResult
