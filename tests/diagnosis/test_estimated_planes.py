@@ -163,7 +163,7 @@ def test_the_simulator_rerun_on_the_walls_found_closes_the_gap(walls: Recording)
     assert result.closure is not None
     assert result.closure.without_effects > 2e-3
     assert result.closure.with_effects < 0.6e-3
-    assert "target_registration" in result.missing
+    assert "target_registration" in result.evidence.study.candidates.missing
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ def test_ratio_shares_and_causes_at_the_same_poses(differing: Observables) -> No
     noise, dropouts, amplitude = differing.to_dict().values()
     assert noise["same_poses"]
     assert noise["ratio"] == pytest.approx(2.0, rel=0.05)
-    missing = np.isnan(differing.seen.recording.depth).mean()
+    missing = np.isnan(differing.real_noise.observed.recording.depth).mean()
     assert dropouts["real_share"] == pytest.approx(missing, abs=1e-5)
     assert dropouts["sim_share"] == 0.0
     assert amplitude["ratio"] == pytest.approx(0.93, rel=0.005)

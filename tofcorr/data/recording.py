@@ -22,7 +22,6 @@ from tofcorr.geometry.se3 import RigidTransform
 from tofcorr.options import (
     Options,
     PositiveNumber,
-    dump_yaml,
     not_a_truth_value,
     read_mapping,
 )
@@ -61,15 +60,6 @@ def read_header(path: Path) -> Header:
             raise CalibrationDataError(f"{path}: '{key}' is missing; is this a recording?")
     _refuse_misspelt(values, path)
     return Header.from_mapping(values, str(path), CalibrationDataError)
-
-
-def header_text(header: Header) -> str:
-    """Return the header as the text of `recording.yaml`; optional keys only where they say more."""
-    values = header.to_mapping()
-    for key in ("planes", "frames"):
-        if getattr(header, key) == Header.model_fields[key].default:
-            del values[key]
-    return dump_yaml(values, last="depth_kind")
 
 
 def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:

@@ -18,7 +18,6 @@ from tofcorr.data.recording import (
     Header,
     PlaneOrigin,
     Recording,
-    header_text,
 )
 from tofcorr.data.table import (
     TABLE_FILE,
@@ -213,7 +212,11 @@ class RecordingWriter:
     def _finish(self) -> None:
         for stream in self._streams.values():
             stream.finish(self._num_frames)
-        folder, text = self._folder, header_text(self._header)
+        folder, header = self._folder, self._header.to_mapping()
+        for key in ("planes", "frames"):  # Only where they say more.
+            if getattr(self._header, key) == Header.model_fields[key].default:
+                del header[key]
+        text = dump_yaml(header, last="depth_kind")
         (folder / HEADER_FILE).write_text(text, encoding="utf-8")
         if self._rows_from is not None:
             shutil.copyfile(self._rows_from, folder / TABLE_FILE)

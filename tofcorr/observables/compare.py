@@ -24,7 +24,7 @@ from tofcorr.observables.pairs import (
     permutation_p,
     sign_flip_p,
 )
-from tofcorr.observables.read import Observed, observe
+from tofcorr.observables.read import observe
 
 Block = dict[str, Any]
 # Smallest deviation that is reported: of a ratio from one, and of a correlation; and of the shares
@@ -41,7 +41,6 @@ class Observables:
     """Noise, missing pixels and amplitude of a recording, and of a simulated one if there is one.
 
     Attributes:
-        seen: What was read of the recording.
         real_noise: Noise of the recording, by its best source.
         real_dropouts: Missing and saturated pixels of the recording.
         noises: Noise of both from one source, so that its errors cancel; None without a simulated
@@ -52,7 +51,6 @@ class Observables:
         both: The pixels compared; None without a simulated recording.
     """
 
-    seen: Observed
     real_noise: NoiseMeasurement
     real_dropouts: DropoutMeasurement
     noises: tuple[NoiseMeasurement, NoiseMeasurement] | None = None
@@ -94,7 +92,7 @@ def compare_observables(
     seen = observe(real)
     noise, dropouts = noise_of(seen), dropouts_of(seen)
     if sim is None:
-        return Observables(seen=seen, real_noise=noise, real_dropouts=dropouts)
+        return Observables(real_noise=noise, real_dropouts=dropouts)
     simulated = observe(sim)
     lost = dropouts, dropouts_of(simulated)
     both = matched(seen, simulated, (lost[0].amplitude, lost[1].amplitude))
@@ -106,7 +104,6 @@ def compare_observables(
     )
     random = np.random.default_rng(seed)
     return Observables(
-        seen=seen,
         real_noise=noise,
         real_dropouts=dropouts,
         noises=noises,

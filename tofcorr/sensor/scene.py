@@ -16,7 +16,13 @@ from tofcorr.errors import ConfigError, FrameError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.sensor_file import SensorFile
-from tofcorr.simulation.effects.base import AMPLITUDE, FREQUENCY, CatalogueEffect, EffectInputs
+from tofcorr.simulation.effects.base import (
+    AMPLITUDE,
+    FREQUENCY,
+    CatalogueEffect,
+    EffectInputs,
+    FrameEffect,
+)
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.hooks import FrameFacts
 
@@ -375,16 +381,13 @@ class ImageEffects(nn.Module):
             count: Number of frames, B.
             like: Any tensor of the device.
         """
-        one = like.new_ones(count, 1, 1, dtype=torch.float64)
-        frames = SceneFrames(
-            rays=one.new_tensor([[[0.0, 0.0, 1.0]]]),
-            distance=one,
-            amplitude=torch.zeros_like(one),
-            seen=one > 0,
-            conditions=known,
-            surface=lambda: (one, one.expand(count, 1, 3)),
-        )
-        return self.shift(Group.FRAME, frames).reshape(-1).expand(count)
+        total = like.new_zeros(count, dtype=torch.float64)
+        facts = _facts(known, count, total)
+        with total.device:
+            for each in self.usable(known)[0]:
+                if isinstance(each.effect, FrameEffect):
+                    total = total + each.effect.shifts(facts, each.coefficients.to(total))
+        return total
 
     def shift(self, group: Group, frames: SceneFrames) -> Tensor:
         """Return the change of the measured distance by one group, metres.

@@ -69,12 +69,10 @@ class DiagnosisResult:
         probability: That anything is missing.
         effects: The effects named, in the order added.
         cause_sets: For each of them those that the data cannot distinguish from it, itself first.
-        tested: Whether there were enough poses for a test; if not, effects are only ranked.
         gap: Before and after the effects.
         gap_steps: The gap after each named effect in turn, metres.
         remainder: Whether a gap of unknown cause remains, and what it looks like.
         outliers: Pixels that gap and effects do not describe.
-        missing: Untestable effects and their missing inputs.
         detectable: The smallest size of each effect that would have been found, metres; None: the
             effect is not identifiable.
         advice: What to record next, a sentence or two each.
@@ -100,12 +98,10 @@ class DiagnosisResult:
     probability: float
     effects: tuple[str, ...]
     cause_sets: tuple[tuple[str, ...], ...]
-    tested: bool
     gap: Gap
     gap_steps: tuple[tuple[str, Estimated], ...]
     remainder: OpenSet
     outliers: Outliers
-    missing: dict[str, list[str]]
     detectable: dict[str, float | None]
     advice: tuple[str, ...]
     closure: Closure | None
@@ -225,7 +221,7 @@ def content_of(result: DiagnosisResult) -> dict[str, Any]:
         "ranking": [_ranked(result.evidence.study, named, name) for name in named.ranking]
         + [
             {"effect": name, **untested, "available": False, "missing": missing}
-            for name, missing in result.missing.items()
+            for name, missing in result.evidence.study.candidates.missing.items()
         ],
         "where": _regions(result.stages[1], 60),  # More than anyone reads.
         "transfer_mm": transfer

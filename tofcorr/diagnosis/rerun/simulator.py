@@ -507,14 +507,15 @@ def _sections(
     """Return the sections of noise, missing pixels and light."""
     pattern = any(isinstance(effect, MapEffect) for effect in own)
     recording = study.observations.recording
-    if observables.seen.recording is not recording:  # Its planes were estimated with the rest.
+    if observables.real_noise.observed.recording is not recording:
+        # Its planes were estimated with the rest.
         observables = compare_observables(recording, None, seed=study.options.seed)
-    curve = observables.real_noise.curve
+    curve, observed = observables.real_noise.curve, observables.real_noise.observed
     return {
         # The fixed part may stand among the effects, pixel by pixel.
         "noise": curve.with_fixed_share(0.0) if pattern else curve,
-        "dropouts": dropout_section(observables.real_dropouts.model, observables.seen),
-        "light": light_section(observables.seen),
+        "dropouts": dropout_section(observables.real_dropouts.model, observed),
+        "light": light_section(observed),
     }
 
 
