@@ -7,7 +7,12 @@ import pytest
 
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Estimated
-from tofcorr.diagnosis.report.words import effect_line, moving_waves, write_verdict
+from tofcorr.diagnosis.report.words import (
+    effect_line,
+    moving_waves,
+    table_of_stages,
+    write_verdict,
+)
 
 STUDY: Any = SimpleNamespace(
     fit=SimpleNamespace(model=SimpleNamespace(groups=set())),
@@ -106,3 +111,18 @@ def test_waves_that_move_are_said_to_count_as_noise_in_part(striped: bool) -> No
     """A user would otherwise look for them in the gap."""
     study: Any = SimpleNamespace(fit=SimpleNamespace(shared=SimpleNamespace(striped=striped)))
     assert ("counts as noise" in moving_waves(study)) == striped
+
+
+def test_what_is_printed_begins_with_the_gap_at_each_stage() -> None:
+    whole, left = (Estimated(own, interval=(own / 2, 2 * own)) for own in (0.0123, 0.0009))
+    stages = [
+        SimpleNamespace(name=name, gap=gap)
+        for name, gap in (("as_given", whole), ("recalibrated", left))
+    ]
+    gap = SimpleNamespace(floor=0.0025, floor_from_repeats=True)
+    result: Any = SimpleNamespace(stages=stages, effects=(), gap=gap)
+    assert table_of_stages(result) == [
+        "as given          12 mm [6, 25]",
+        "recalibrated      0.9 mm [0.5, 1.8]",
+        "noise of a pixel  2.5 mm",
+    ]

@@ -33,6 +33,7 @@ from tofcorr.diagnosis.report.words import (
     share_words,
     sized,
     stages_shown,
+    table_of_stages,
 )
 from tofcorr.diagnosis.rerun.checks import Closure, DegradedStage, Transfer
 from tofcorr.diagnosis.rerun.simulator import Evidence, FittedValue, sensor_of
@@ -114,8 +115,9 @@ class DiagnosisResult:
     evidence: Evidence = field(repr=False)
 
     def __repr__(self) -> str:
-        """Return the verdict, the causes, the remarks and the warnings, a line each."""
-        lines = [self.verdict, *(f"- {cause}" for cause in self.causes), *self.remarks]
+        """Return stages, verdict, causes, remarks and warnings, a line each."""
+        causes = (f"- {cause}" for cause in self.causes)
+        lines = [*table_of_stages(self), self.verdict, *causes, *self.remarks]
         return "\n".join([*lines, *(f"Warning: {warning}" for warning in self.warnings)])
 
     @property

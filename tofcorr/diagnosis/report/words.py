@@ -84,6 +84,15 @@ def stages_shown(result: "DiagnosisResult", *, fitted: bool = False) -> list[Sta
     return [stage for stage in stages[fitted:] if stage.gap is not None]
 
 
+def table_of_stages(result: "DiagnosisResult") -> list[str]:
+    """Return the gap at each stage with its interval, and the noise beside it, a line each."""
+    rows = [(STAGE_WORDS[one.name], sized(one.gap)) for one in stages_shown(result) if one.gap]
+    bound = "" if result.gap.floor_from_repeats else " (an upper bound)"
+    rows.append(("noise of a pixel", f"{mm(result.gap.floor)} mm{bound}"))
+    width = max(len(words) for words, _ in rows)
+    return [f"{words:{width}}  {size}" for words, size in rows]
+
+
 def pose_errors(result: "DiagnosisResult") -> tuple[np.ndarray, np.ndarray]:
     """Return the held-out error of each pose before and after the effects, (U,) each, metres."""
     study, named = result.evidence.study, result.evidence.named
