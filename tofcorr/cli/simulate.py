@@ -14,9 +14,7 @@ if TYPE_CHECKING:
 _SIMULATOR = "simulation.options:SimulatorOptions"
 _DIAGNOSIS = "diagnosis.options:DiagnosisOptions"
 
-_SENSOR = (
-    "The camera: a shipped name such as kinect_v2, the report of a diagnosis, or its sensor.yaml."
-)
+_SENSOR = "A shipped camera such as kinect_v2, a diagnosis' report, or its sensor.yaml."
 _LIGHT = "What amplitude.npy of the ideal recording holds: the camera's units, or a share 0 to 1."
 _SIM = "YAML or shipped name of the built-in simulator, or a rendered recording; else: fitted."
 

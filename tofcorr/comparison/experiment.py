@@ -248,11 +248,8 @@ class ModelFitter:
                 found = walls_alone(self.measured, train, model)
         else:
             moments = self._geometry.images(train.tolist()).columns([])
-            options = FitOptions(
-                model=ErrorModelOptions(),
-                hand_eye=self._options.hand_eye,
-                solver=self._options.solver,
-            )
+            given, nothing = self._options, ErrorModelOptions()
+            options = FitOptions(model=nothing, hand_eye=given.hand_eye, solver=given.solver)
             best = hand_eye_alone(Problem(self.measured, train, options, self.domain), moments)
             if self._options.planes == "unknown":
                 found = recorded_walls(self._dataset, train)

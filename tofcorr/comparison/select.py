@@ -24,12 +24,6 @@ from tofcorr.plausibility.examine import vet
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import number_or_none
 
-_HEADINGS = {
-    "image": "Images held out",
-    "distance": "Bands of distance held out",
-    "target": "Targets held out",
-}
-
 
 @dataclass(frozen=True, repr=False)
 class SelectionResult:
@@ -95,7 +89,7 @@ class SelectionResult:
         metric = {"mean_abs": "mean absolute", "rms": "RMS"}[self.options.metric]
         return [
             Table(
-                f"{_HEADINGS[by]}: {metric} error, mm",
+                f"{by.capitalize()}s held out: {metric} error, mm",
                 ["model", "unknowns", "error", "behind the best", ""],
                 [
                     self._row(ranking, name)

@@ -26,9 +26,7 @@ from tofcorr.plausibility.finding import CAMERA, LARGEST_GAP
 from tofcorr.progress import through
 
 # Why the equations of a check may have no solution, and what to do.
-_NO_SOLUTION = (
-    "poses, planes or depth are off, or frames hardly differ; use the plane of each image."
-)
+_NO_SOLUTION = "poses, planes or depth are off, or frames hardly differ; use --wall per_image."
 
 
 def check(

@@ -76,6 +76,7 @@ def _known(given: Mapping[str, tuple[float, float, float]]) -> Mapping:
 
 _Range = Annotated[Interval, AfterValidator(_ordered)]
 _Three = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
+_Conditions = Annotated[Mapping[str, _Three], AfterValidator(_known)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,9 +102,7 @@ class Domain:
     amplitude: _Range | None = None
     normalised_amplitude: _Range | None = None
     modulation_frequency: PositiveNumber | None = None
-    conditions: Annotated[Mapping[str, _Three], AfterValidator(_known)] = field(
-        default_factory=dict
-    )
+    conditions: _Conditions = field(default_factory=dict)
 
     def mean_conditions(self) -> list[float]:
         """Return the mean conditions in the order of `CONDITIONS`; 0 where unknown."""

@@ -1,6 +1,6 @@
 """The whole error model: one constant and its terms."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -41,6 +41,15 @@ class ErrorModelOptions(Options):
     def with_columns(self) -> "ErrorModelOptions":
         """Return the terms that the moments estimate: all but a map of the pixels."""
         return ErrorModelOptions(terms=tuple(term for term in self.terms if term.has_columns))
+
+    def with_found(self, option: str, values: Iterable[object]) -> "ErrorModelOptions":
+        """Return the terms with values found in the data where this option says `auto`, in turn."""
+        found = iter(values)
+        terms = [
+            one.model_copy(update={option: next(found)}) if one.is_open(option) else one
+            for one in self.terms
+        ]
+        return self.model_copy(update={"terms": tuple(terms)})
 
     def same_coefficients(self, other: "ErrorModelOptions") -> bool:
         """Whether both models have the same terms, apart from what a fit finds in the data."""
@@ -91,9 +100,8 @@ class ErrorModel(DescribedModule):
             nn.ModuleList([term for term in built if isinstance(term, base)])
             for base in (SignalTerm, PixelTerm, ConditionTerm)
         )
-        self.fixed_pattern: PixelMap | None = next(
-            (term for term in built if isinstance(term, PixelMap)), None
-        )
+        maps = [term for term in built if isinstance(term, PixelMap)]
+        self.fixed_pattern: PixelMap | None = maps[0] if maps else None
         self.residual: ResidualNetwork | None = None
         self.height: int = domain.height
         self.width: int = domain.width

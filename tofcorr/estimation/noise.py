@@ -28,7 +28,7 @@ from pydantic import Field
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.robust import sigma_from_mad
+from tofcorr.estimation.robust import robust_scale
 from tofcorr.options import NonNegativeNumber, Number, Options, PositiveNumber, Share
 
 ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
@@ -193,10 +193,7 @@ def fit_noise(
         raise CalibrationDataError(f"The noise cannot be estimated: {few}.")
     bins = brightness_bins(amplitude.numpy(), _FEWEST_PER_BIN)
     centre = np.array([float(amplitude[part].median()) for part in bins])
-    spread = [
-        sigma_from_mad(float((differences[part] - differences[part].median()).abs().median()))
-        for part in bins
-    ]
+    spread = [robust_scale(differences[part] - differences[part].median()) for part in bins]
     variance = np.square(spread) / 2
     if not variance.min() > 0:
         raise CalibrationDataError("The noise is unknown: most pixels repeat. Copies of one frame?")

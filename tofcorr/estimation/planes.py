@@ -161,9 +161,7 @@ def estimate_walls(
         most_steps: Steps after which it ends in any case.
     """
     zero = torch.zeros(start.size + walls.size, dtype=torch.float64)
-    together = _WithWalls(
-        start.tool_from_camera, start.coefficients, start.hand_eye_is_free, walls=walls, total=zero
-    )
+    together = _WithWalls(**vars(start), walls=walls, total=zero)
     options = SolverOptions(max_iterations=most_steps)
     end = minimise(_WallObjective(moments, len(zero), prior), together, options).parameters
     assert isinstance(end, _WithWalls)

@@ -22,6 +22,7 @@ other, and only together do they put corrected points on the planes.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import repeat
 
 import numpy as np
 import torch
@@ -218,13 +219,7 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
     if any(term.is_open("time_constants_s") for term in options.terms):
         around = minimise(MomentObjective(moments), problem.start(moments), solver).parameters
         found = time_constant(moments, around, conditions[:, CONDITIONS.index("timestamp")])
-        terms = [
-            one.model_copy(update={"time_constants_s": (found,)})
-            if one.is_open("time_constants_s")
-            else one
-            for one in options.terms
-        ]
-        options = options.model_copy(update={"terms": tuple(terms)})
+        options = options.with_found("time_constants_s", repeat((found,)))
     model = ErrorModel(options, problem.domain)
     frame_terms: list[Term] = list(model.condition_terms)  # type: ignore[arg-type]
     if frame_terms:
@@ -236,15 +231,9 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
     held_out = [(poses % 6 == k).nonzero()[:, 0].tolist() for k in range(6)]
     penalties = with_strengths(penalties_of(model), moments, start, held_out)
     strengths = {one.name: float(one.strength) for one in penalties}
-    chosen = iter([strengths[term.symbols[0]] for term, _ in model.penalised()])
-    terms = [
-        one.model_copy(update={"strength": next(chosen)})
-        if "strength" in one.found_in_data
-        else one
-        for one in options.terms
-    ]
+    chosen = [strengths[t.symbols[0]] for t, _ in model.penalised() if t.strength == "auto"]
     core = Core(
-        options=options.model_copy(update={"terms": tuple(terms)}),
+        options=options.with_found("strength", chosen),
         moments=moments,
         start=start,
         smoothness=(prior := smoothness(penalties, total_weight(moments), start)),

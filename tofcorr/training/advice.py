@@ -28,7 +28,12 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.support import ENOUGH_REFLECTIVITY, sample_reflectivity, worst_sigma
+from tofcorr.training.support import (
+    ENOUGH_REFLECTIVITY,
+    sample_reflectivity,
+    worst_axes,
+    worst_sigma,
+)
 
 # Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
 # Set by hand for printed boards in the near infrared.
@@ -508,8 +513,6 @@ def _domain(camera: CameraIntrinsics, workspace: Workspace) -> Domain:
 def _expected(covariance: Tensor) -> tuple[float, float]:
     """Return the standard errors of the worst axes, mm and degrees, from that of all unknowns."""
     # As in `observability`: half of the wide prior's variance.
-    shift, turn = (
-        sigma if sigma**2 < PRIOR_SIGMA**2 / 2 else math.inf
-        for sigma in (worst_sigma(covariance[axes, axes]) for axes in (slice(3), slice(3, 6)))
-    )
+    known = (one if 2 * one**2 < PRIOR_SIGMA**2 else math.inf for one in worst_axes(covariance))
+    shift, turn = known
     return 1e3 * shift, math.degrees(turn)

@@ -120,6 +120,5 @@ def calibrate(
 def without_correction(domain: Domain, tool_from_camera: Tensor) -> CalibrationModel:
     """Return a hand-eye transform without any depth correction."""
     nothing = ErrorModel(ErrorModelOptions(), domain)
-    return calibrated(
-        nothing, Parameters(tool_from_camera, nothing.coefficient_vector(), hand_eye_is_free=False)
-    )
+    zero = nothing.coefficient_vector()
+    return calibrated(nothing, Parameters(tool_from_camera, zero, hand_eye_is_free=False))

@@ -12,7 +12,7 @@ from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.sample import MaskOptions
 from tofcorr.plausibility.finding import FAR_OFF, Inspection, in_words
 from tofcorr.training.calibration import TrainingOptions
-from tofcorr.training.support import Support, shortcomings, worst_sigma
+from tofcorr.training.support import Support, shortcomings, worst_axes
 
 Training = TypeVar("Training", bound=TrainingOptions)
 Verdict = Literal["good", "usable", "do not use"]
@@ -200,8 +200,7 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
         count = f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad)"
         yield of_pose if of_hand_eye else "good", f"{count}: {words}."
     if free:
-        covariance = fit.hand_eye_covariance
-        shift, turn = (worst_sigma(covariance[axes, axes]) for axes in (slice(3), slice(3, 6)))
+        shift, turn = worst_axes(fit.hand_eye_covariance)
         if max(shift, turn) > _WEAK:
             size = f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only"
             yield "usable", f"The hand-eye is known to {size}: record more tilts and distances."
