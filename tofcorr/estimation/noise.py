@@ -155,14 +155,10 @@ class DistanceNoise(NamedTuple):
     source: Source
 
     def variance(self, amplitude: Float[Tensor, "*pixels"]) -> Float[Tensor, "*pixels"]:
-        """Return the variance at amplitudes (...), square metres; infinite at zero amplitude."""
-        inverse = 1 / amplitude.clamp(min=0)
-        variance = torch.full_like(amplitude, self.floor)
-        if self.shot:
-            variance = variance + self.shot * inverse
-        if self.readout:
-            variance = variance + self.readout * inverse.square()
-        return variance
+        """Return the variance at amplitudes (...), square metres; beyond measure at none."""
+        # The least amplitude, for zero times infinity would be NaN.
+        inverse = 1 / amplitude.clamp(min=torch.finfo(amplitude.dtype).tiny)
+        return self.floor + inverse * (self.shot + self.readout * inverse)
 
     @property
     def coefficients(self) -> tuple[float, float, float]:
