@@ -69,7 +69,10 @@ def _refused_by(model: Path) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, torch.jit.Error) as error:
-        raise CalibrationDataError(f"{model}: {_last_line(error)}") from None
+        # TorchScript puts the message behind its traceback, after such as builtins.ValueError.
+        last = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
+        said = re.sub(r"^[A-Za-z_][\w.]*: ", "", last)
+        raise CalibrationDataError(f"{model}: {said}") from None
 
 
 def _refuse_another_camera(
@@ -91,12 +94,6 @@ def _refuse_another_camera(
         click.echo(f"Warning: {other}; does the same camera have the same lens?", err=True)
     if metadata.needs_amplitude:
         recording.require("amplitude", f"the corrector {model}")
-
-
-def _last_line(error: Exception) -> str:
-    """Return the message that TorchScript puts behind its traceback."""
-    last = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
-    return re.sub(r"^[A-Za-z_][\w.]*: ", "", last)  # Such as builtins.ValueError.
 
 
 @click.command()

@@ -110,10 +110,8 @@ def files_of_views(
         lacking = next(what for what in found if what not in files)
         refused[view] = f"{next(iter(files.values())).name} has no {lacking} image beside it"
     if not views:
-        (one, files), (other, beside) = list(found.items())[:2]
-        first, second = (next(iter(paths.values())).name for paths in (files, beside))
-        said = f"no {one} image has an {other} image of the same {{view}} (or *)"
-        raise CalibrationDataError(f"{folder}: {said}: '{first}', '{second}'.")
+        first = next(iter(refused.values()))
+        raise CalibrationDataError(f"{folder}: no view has images of each kind: {first}.")
     return views, refused
 
 

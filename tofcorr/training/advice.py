@@ -132,7 +132,7 @@ def draw_views(
     steepest, roll_deg, nearest, farthest = limits
     normal, offset = plane
     distance = along_axis(cameras, plane)
-    poses, chosen, described = [], [], []
+    found = []
     for _ in range(20 * size):
         k = int(generator.integers(len(distance)))
         tilt = steepest * generator.uniform()
@@ -141,13 +141,12 @@ def draw_views(
         azimuth = generator.uniform(0, 2 * math.pi)
         pose = _moved_camera(cameras[k], normal[k], distance[k], (tilt, azimuth, roll, away))
         if usable(pose, k):
-            poses.append(pose)
-            chosen.append(k)
-            described.append([away, tilt, roll])
-        if len(poses) == size:
+            found.append((pose, k, (away, tilt, roll)))
+        if len(found) == size:
             break
-    if not poses:
+    if not found:
         return None
+    poses, chosen, described = map(list, zip(*found, strict=True))
     target = [list(brightness)[k % len(brightness)] for k in range(len(poses))]
     return PosePool(
         world_from_tool=torch.stack(poses) @ se3.inverse(tool_from_camera),
