@@ -1,6 +1,7 @@
 """The correction as an `nn.Module`: error terms, residual network and hand-eye as parameters."""
 
 import copy
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -277,6 +278,10 @@ class DepthCorrection(FrameCorrection):
         if path.is_dir():
             return cls._from_run(path)
         refuse_damaged(path, "a calibration or a module that tofcorr wrote")
+        with zipfile.ZipFile(path) as archive:
+            is_scripted = any("/code/" in name for name in archive.namelist())
+        if is_scripted:
+            raise CalibrationDataError(f"{path}: holds nothing to fit: use torch.jit.load.")
         values = read_values(path, FORMAT)
         if values is None:
             return cls._from_calibration(load_calibration(path), None)
