@@ -128,7 +128,6 @@ def test_figures_are_returned_and_an_unknown_covariate_is_refused(trained: Train
         assert isinstance(trained.result.plot_profile(name), Figure)
     (errors,) = trained.result.plot_residuals().axes
     assert "red too far" in errors.get_title("left")
-    assert len(trained.result.plot_points(2).axes) == 3
     with pytest.raises(CalibrationDataError, match=r"'heat'.*distance, row, column, amplitude"):
         trained.result.plot_profile("heat")
 

@@ -4,9 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
-from tofcorr.geometry.rays import tangents
 from tofcorr.pixels.passes import frame_errors
 from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
 from tofcorr.training.calibration import Calibration
@@ -186,39 +184,4 @@ def residual_figure(calibration: Calibration) -> "Figure":
     axes.imshow(picture)
     axes.set_axis_off()
     axes.set_title(words, fontsize="small", loc="left")
-    return figure
-
-
-def points_figure(calibration: Calibration, frame: int) -> "Figure":
-    """Draw a frame's points on its plane at each stage, with the distance to it stretched.
-
-    Args:
-        calibration: The fitted model.
-        frame: Global number of the frame.
-    """
-    from matplotlib.figure import Figure
-
-    data, clouds = calibration.data, {}
-    (batch,) = data.batches(np.array([frame]))
-    used = torch.from_numpy(thinned(batch.valid[0].flatten().nonzero()[:, 0].numpy(), 4000))
-    rays, along = data.ray_directions().flatten(0, 1)[used], batch.radial_distance.flatten()[used]
-    for name, model in calibration.stages.items():
-        error, cosine = errors_along_ray(data, model, batch)
-        seen = (rays @ model.hand_eye().detach()[:3, :3].T) * along[:, None]
-        within = seen @ tangents(batch.normal_tool[0]).T
-        # Two coordinates in the plane, metres, and the distance to it, millimetres, (M, 3).
-        clouds[name] = torch.cat([within, (error * cosine).flatten()[used, None]], dim=1).numpy()
-    figure = Figure(figsize=(5 * len(clouds), 5), layout="constrained")
-    figure.suptitle(f"Frame {frame}, {data.targets[frame]}: points and plane, height stretched")
-    low, high = ends_of(np.concatenate([cloud[:, 2] for cloud in clouds.values()]))
-    for k, (stage, cloud) in enumerate(clouds.items()):
-        axes = figure.add_subplot(1, len(clouds), k + 1, projection="3d")
-        label, colour = _STAGES[stage]
-        x, y = np.meshgrid(*(np.array([one.min(), one.max()]) for one in cloud[:, :2].T))
-        axes.plot_surface(x, y, np.zeros_like(x), color=("0.5", 0.3))  # type: ignore[attr-defined]
-        shown = cloud[(cloud[:, 2] >= low) & (cloud[:, 2] <= high)]
-        axes.scatter(*shown.T, color=colour, s=2)
-        axes.set(title=label, xlabel="[m]", ylabel="[m]", zlabel="in front of the plane [mm]")
-        axes.set_zlim(min(low, 0.0), max(high, 0.0))
-        axes.view_init(elev=10)
     return figure

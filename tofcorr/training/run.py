@@ -35,7 +35,6 @@ from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import stages
 from tofcorr.training.calibration import Calibration, TrainingOptions, calibrate
 from tofcorr.training.figures import (
-    points_figure,
     profile_figure,
     residual_figure,
 )
@@ -175,14 +174,6 @@ class TrainingResult:
         The frames range from the best corrected to the worst.
         """
         return residual_figure(self.calibration)
-
-    def plot_points(self, frame: int) -> "Figure":
-        """Draw the points of one frame on its plane at each stage, their distance stretched.
-
-        Args:
-            frame: Global number of the frame, over all recordings.
-        """
-        return points_figure(self.calibration, frame)
 
     def __repr__(self) -> str:
         """Return errors, hand-eye translation, advice and warnings, as the command prints them."""
