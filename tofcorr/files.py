@@ -15,7 +15,7 @@ import tempfile
 import uuid
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from hashlib import sha256
@@ -63,6 +63,15 @@ def staged_file(path: Path | str, kind: type[TofcorrError] = ExportError) -> Ite
     with writing_to(path, kind), _temporary(part, lambda: part.touch(exist_ok=False)):
         yield part
         part.replace(target)
+
+
+def write_json(
+    path: Path, values: Mapping[str, Any], kind: type[TofcorrError] = CalibrationDataError
+) -> None:
+    """Write plain values as JSON, whole or not at all; an older file is replaced."""
+    with staged_file(path, kind) as part:
+        text = json.dumps(dict(values), indent=1, allow_nan=False) + "\n"
+        part.write_text(text, encoding="utf-8")
 
 
 @contextmanager

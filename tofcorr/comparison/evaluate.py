@@ -1,6 +1,5 @@
 """`tofcorr.evaluate`: models side by side on held-out images."""
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from tofcorr.comparison.options import (
     masks_of,
 )
 from tofcorr.comparison.statistics import Estimate, Table
-from tofcorr.files import staged_folder
+from tofcorr.files import staged_folder, write_json
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.plausibility.examine import vet
@@ -47,19 +46,16 @@ class EvaluationResult:
 
     def __repr__(self) -> str:
         """Return what is doubtful, tables, notes and warnings."""
-        warnings = [f"Warning: {text}" for text in self.warnings]
-        return "\n\n".join([*self._page([table.text() for table in self.tables()]), *warnings])
+        return "\n\n".join(self._page([table.text() for table in self.tables()]))
 
     def markdown(self) -> str:
-        """Return tables, notes and warnings as a page of Markdown."""
+        """Return the same as a page of Markdown."""
         page = self._page([table.markdown() for table in self.tables()])
-        warnings = "\n".join(f"- {text}" for text in self.warnings)
-        page += ["Warnings:", warnings] if warnings else []
         return "\n\n".join(["# Evaluation", *page]) + "\n"
 
     def _page(self, tables: Sequence[str]) -> list[str]:
-        notes = " ".join(comparability_notes(self.options))
-        return [*self.headlines, *tables, *([notes] if notes else [])]
+        notes = filter(None, [" ".join(comparability_notes(self.options))])
+        return [*self.headlines, *tables, *notes, *(f"Warning: {text}" for text in self.warnings)]
 
     @property
     def warnings(self) -> list[str]:
@@ -159,13 +155,10 @@ class EvaluationResult:
 
     def write(self, folder: Path) -> None:
         """Write `evaluation.json`, `evaluation.md`, `comparison.png`, `config.yaml` and `tb/`."""
-        numbers = json.dumps(self.to_mapping(), indent=1, allow_nan=False)
-        for name, text in (
-            ("evaluation.json", f"{numbers}\n"),
-            ("evaluation.md", self.markdown()),
-            ("config.yaml", dump_yaml(self.options.to_mapping())),
-        ):
-            (folder / name).write_text(text, encoding="utf-8")
+        write_json(folder / "evaluation.json", self.to_mapping())
+        (folder / "evaluation.md").write_text(self.markdown(), encoding="utf-8")
+        options = dump_yaml(self.options.to_mapping())
+        (folder / "config.yaml").write_text(options, encoding="utf-8")
         image = save_figure(self.plot_comparison(), folder / "comparison.png")
         with event_writer(folder / "tb") as writer:
             writer.add_image("comparison/held_out_error", image, dataformats="HWC")

@@ -1,6 +1,5 @@
 """`tofcorr.select`: the model that predicts best on held-out images, distances and targets."""
 
-import json
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from tofcorr.comparison.statistics import Ranking, Table, rank
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
-from tofcorr.files import staged_folder
+from tofcorr.files import staged_folder, write_json
 from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
@@ -210,8 +209,7 @@ def select(
         result = SelectionResult(rankings, found, options, inspection.headline)
         if folder is not None:
             (folder / "selection.md").write_text(result.markdown(), encoding="utf-8")
-            numbers = json.dumps(result.to_mapping(), indent=1, allow_nan=False)
-            (folder / "selection.json").write_text(f"{numbers}\n", encoding="utf-8")
+            write_json(folder / "selection.json", result.to_mapping())
     return result
 
 

@@ -1,6 +1,5 @@
 """`tofcorr.check`: whether a calibration still holds, from a few frames of any wall."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from tofcorr.drift.offset import FEWEST_PIXELS, Offset, OffsetSums, Wall
 from tofcorr.drift.result import DriftResult, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import solvable
-from tofcorr.files import file_to_replace, staged_file
+from tofcorr.files import file_to_replace, write_json
 from tofcorr.fit.reference import (
     REFERENCE_FILE,
     Reference,
@@ -78,9 +77,7 @@ def check(
         raise CalibrationDataError(f"{dataset.first.path}: {said}: {advice} (Python: force=True).")
     result = replace(result, headline=headline or result.headline)
     if out is not None:
-        text = json.dumps(result.to_mapping(), indent=1, allow_nan=False) + "\n"
-        with staged_file(Path(out), CalibrationDataError) as part:
-            part.write_text(text, encoding="utf-8")
+        write_json(Path(out), result.to_mapping())
     return result
 
 

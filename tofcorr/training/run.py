@@ -1,6 +1,5 @@
 """`tofcorr.train`: calibrate recordings of one camera; and its run folder, for later commands."""
 
-import json
 import logging
 import signal
 import threading
@@ -23,7 +22,7 @@ from tofcorr.correction.state import (
 from tofcorr.errors import ConfigError, ExportError
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Solution
-from tofcorr.files import refuse_existing, staged_file, staged_folder
+from tofcorr.files import refuse_existing, staged_folder, write_json
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import REFERENCE_FILE, estimate_reference, save_reference
 from tofcorr.options import dump_yaml, resolve_options
@@ -147,9 +146,7 @@ class TrainingResult:
 
     def write_report(self, folder: Path) -> None:
         """Write report.json, whole or not at all; an older one is replaced."""
-        text = json.dumps(dict(self.report), indent=1, allow_nan=False) + "\n"
-        with staged_file(folder / "report.json") as part:
-            part.write_text(text, encoding="utf-8")
+        write_json(folder / "report.json", self.report, ExportError)
 
     def show_in(self, folder: Path) -> None:
         """Write TensorBoard's files of a run folder."""
