@@ -261,8 +261,6 @@ def _eight_bit(values: np.ndarray, high_percentile: float) -> np.ndarray:
 
 
 def _enlarged(image: np.ndarray, scale: int) -> np.ndarray:
-    if scale == 1:
-        return image
     return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
 
 
