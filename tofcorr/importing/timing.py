@@ -280,12 +280,7 @@ def _best(lags: np.ndarray, correlation: np.ndarray, as_good: float = 0.1) -> tu
 
 
 def refine_lag(
-    track: PoseTrack,
-    times: np.ndarray,
-    points: np.ndarray,
-    walls: np.ndarray,
-    first: Lag,
-    window: float = 0.15,
+    track: PoseTrack, times: np.ndarray, points: np.ndarray, walls: np.ndarray, first: Lag
 ) -> Lag:
     """Refine a lag on planes seen while the tool moved.
 
@@ -295,8 +290,6 @@ def refine_lag(
         points: Points of each plane in the tool frame, shape (M, P, 3), metres.
         walls: Normal and d of each plane's wall in the world, shape (M, 4).
         first: The first estimate.
-        window: Seconds around it that are searched: its error, seen in simulated stop-and-go
-            motion at 5 to 30 images a second, is below 0.03 s.
 
     Returns:
         The refined lag; `first` where fewer planes were seen in motion than parts are left out.
@@ -312,7 +305,8 @@ def refine_lag(
         return np.log1p((100 * off) ** 2).mean(axis=1)
 
     def best(used: np.ndarray) -> float:
-        bounds = (first.seconds - window, first.seconds + window)
+        # Its error, seen in simulated stop-and-go motion at 5 to 30 images a second, is below 0.03 s.
+        bounds = (first.seconds - 30 * _STEP, first.seconds + 30 * _STEP)
         found: Any = minimize_scalar(
             lambda lag: float(np.nanmean(losses(lag)[used])), bounds=bounds, method="bounded",
             options={"xatol": _STEP / 50},
