@@ -305,7 +305,7 @@ def refine_lag(
         return np.log1p((100 * off) ** 2).mean(axis=1)
 
     def best(used: np.ndarray) -> float:
-        # Its error, seen in simulated stop-and-go motion at 5 to 30 images a second, is below 0.03 s.
+        # Its error in simulated stop-and-go motion, at 5 to 30 images a second, is below 0.03 s.
         bounds = (first.seconds - 30 * _STEP, first.seconds + 30 * _STEP)
         found: Any = minimize_scalar(
             lambda lag: float(np.nanmean(losses(lag)[used])), bounds=bounds, method="bounded",
