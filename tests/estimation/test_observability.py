@@ -61,7 +61,7 @@ def _warned(dataset: Dataset, result: Fit) -> str:
     best = result.solution.parameters.tool_from_camera
     support = recording_support(dataset, np.arange(dataset.num_frames), best)
     inspection = tofcorr.inspect(dataset.first)
-    return "\n".join(judge(result, NO_ERRORS, support, inspection, robot_moves=dataset.moves)[2])
+    return "\n".join(judge(result, NO_ERRORS, support, inspection)[2])
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_only_a_correction_that_clearly_does_harm_is_advised_against(
     errors = {"after": after, "hand_eye_only": {"test": {"rms": 1.0}}}
     fit, wall = fits("good"), walls["good"]
     support = recording_support(wall, np.arange(3), fit.solution.parameters.tool_from_camera)
-    found = judge(fit, errors, support, tofcorr.inspect(wall.first), robot_moves=True)
+    found = judge(fit, errors, support, tofcorr.inspect(wall.first))
     assert said in found[2][0]
     assert (found[0] == "do not use") == (left > 1.1)
 

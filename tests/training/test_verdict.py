@@ -54,7 +54,7 @@ def judged(trained: Trained, fit: Fit) -> tuple[str, str]:
     train, hand_eye = trained.result.calibration.train, fit.solution.parameters.tool_from_camera
     support, found = recording_support(trained.data, train, hand_eye), trained.report()
     inspection = tofcorr.inspect(trained.recording)
-    return judge(fit, found["error_mm"], support, inspection, robot_moves=True)[:2]
+    return judge(fit, found["error_mm"], support, inspection)[:2]
 
 
 @pytest.mark.parametrize(

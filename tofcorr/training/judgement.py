@@ -79,12 +79,7 @@ def left_out_mapping(frames: Iterable[int], inspection: Inspection) -> list[dict
 
 
 def judge(
-    fit: Fit,
-    errors: Mapping[str, Any],
-    support: Support,
-    inspection: Inspection,
-    *,
-    robot_moves: bool,
+    fit: Fit, errors: Mapping[str, Any], support: Support, inspection: Inspection
 ) -> tuple[Verdict, str, list[str]]:
     """Return the verdict, its reason, and what a user must know before trusting the result.
 
@@ -96,7 +91,6 @@ def judge(
         errors: The `error_mm` of the report.
         support: What the fitted frames cover.
         inspection: What was odd about the recordings; its noise of a pixel is the floor.
-        robot_moves: Whether a robot moved the camera.
     """
     free = fit.solution.parameters.hand_eye_is_free
     with_intensity = fit.model.error.needs_amplitude()
@@ -110,7 +104,7 @@ def judge(
         said.append(("good", f"Only {images} images were fitted: standard errors are rough."))
     if fit.residual:
         said.append(("good", fit.residual))
-    if not robot_moves:
+    if support.roll_deg is None:
         said.append(("good", "No robot moves: the hand-eye transform is held at the identity."))
     odd: list[tuple[Verdict, str]] = [
         (DO_NOT_USE, one.sentence)

@@ -129,7 +129,7 @@ def training_report(
     hand_eye = solution.parameters.tool_from_camera
     support = recording_support(data, calibration.train, hand_eye)
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
-    verdict, reason, found = judge(fit, errors, support, inspection, robot_moves=data.moves)
+    verdict, reason, found = judge(fit, errors, support, inspection)
     rms = np.sqrt(after.squared / np.maximum(after.count, 1))
     advice, pool = None, None
     if options.advice:
