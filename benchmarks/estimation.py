@@ -28,6 +28,7 @@ from tofcorr.fit.problem import build_model
 from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, covered_domain
+from tofcorr.pixels.passes import image_moments
 from tofcorr.training.calibration import TrainingOptions
 
 NUM_FOLDS = 6
@@ -165,7 +166,7 @@ def read_and_sum(path: Path, num_frames: int) -> tuple[float, float, float]:
     baseline, start = _status("VmRSS"), time.perf_counter()
     data = Dataset((Recording.open(path),))
     design = built(data, "ea", num_frames)[1]
-    pixels = float(data.moments(design, np.arange(num_frames)).count.sum())
+    pixels = float(image_moments(data, design, range(num_frames)).count.sum())
     return time.perf_counter() - start, pixels, (_status("VmHWM") - baseline) / 1024
 
 
