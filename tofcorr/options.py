@@ -188,15 +188,6 @@ _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _NOT_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
 
 
-def read_yaml(path: Path) -> Any:  # noqa: ANN401 - YAML may hold anything
-    """Read one YAML file.
-
-    Raises:
-        ConfigError: The file is missing, unreadable, too large or not YAML.
-    """
-    return parse_yaml(read_text(path), str(path))
-
-
 def read_mapping(path: Path, kind: type[TofcorrError] = ConfigError) -> Mapping[str, Any]:
     """Read the keys and values of one YAML file.
 

@@ -291,9 +291,7 @@ def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
     return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(poses, num_folds)]
 
 
-def covered_domain(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, outside_share: float = 0.001
-) -> Domain:
+def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Domain:
     """Return image size, and the central 99.8 % of distances and amplitudes of usable pixels.
 
     A regular sample of 200 000 pixels, at least 50 a frame, is looked at.
@@ -301,8 +299,6 @@ def covered_domain(
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames.
-        outside_share: Share of the values left out at either end of a range: a few stray pixels
-            must not widen the range in which a correction is valid.
 
     Raises:
         CalibrationDataError: No pixel of these frames is usable.
@@ -329,7 +325,6 @@ def covered_domain(
         amplitude if dataset.has_amplitude else None,
         first.modulation_frequency,
         dataset.conditions(frames),
-        outside_share=outside_share,
     )
 
 
@@ -339,11 +334,10 @@ def domain_from(
     amplitude: Float[Tensor, "M"] | None,
     modulation_frequency: float | None,
     conditions: Float[Tensor, "N C"],
-    *,
-    outside_share: float,
-    method: Literal["linear", "nearest"] = "linear",
 ) -> Domain:
-    """Return the ranges that some pixels cover.
+    """Return the ranges that some pixels cover, without 0.1 % of the values at either end.
+
+    A few stray pixels must not widen the range in which a correction is valid.
 
     Args:
         camera: Gives the image size.
@@ -351,15 +345,12 @@ def domain_from(
         amplitude: Of the same pixels, shape (M,); None if not recorded.
         modulation_frequency: Of the light, Hz; None if unknown.
         conditions: Of the frames, in the order of `CONDITIONS`, shape (N, C); NaN: unknown.
-        outside_share: Share of the values that may lie below a range, and above it.
-        method: How to interpolate between the two values nearest to a quantile.
     """
 
     def interval(values: Tensor | None) -> Interval | None:
         if values is None:
             return None
-        quantiles = (outside_share, 1 - outside_share)
-        return Interval(*np.quantile(values.numpy(), quantiles, method=method).tolist())
+        return Interval(*np.quantile(values.numpy(), (0.001, 0.999)).tolist())
 
     known = zip(CONDITIONS, conditions.unbind(1), strict=True)
     near_and_far = interval(radial_distance)

@@ -49,7 +49,7 @@ from tofcorr.diagnosis.sums.observations import (
     with_walls_moved,
 )
 from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, whole_images
-from tofcorr.error_terms.base import Domain, Term
+from tofcorr.error_terms.base import Term
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.regularisation import penalties_of
@@ -177,7 +177,14 @@ class BaseModel:
     ) -> None:
         self.observations, self.options = observations, options
         self.hand_eye_free = hand_eye_free
-        self.domain = domain_of(observations)
+        recording = observations.recording
+        self.domain = domain_from(
+            recording.camera,
+            observations.measured,
+            observations.amplitude,
+            recording.modulation_frequency,
+            observations.conditions,
+        )
         self.error_model = ErrorModel(options, self.domain)
 
     def on(self, observations: Observations) -> "BaseModel":
@@ -260,26 +267,6 @@ class BaseModel:
             parts.append(wall_columns(observations, tool_from_camera))
         # Rows (K, M) are filled several times faster than columns.
         return distance, torch.cat([part.T for part in (*parts, self.error_columns(distance))]).T
-
-
-def domain_of(observations: Observations, outside_share: float = 0.0005) -> Domain:
-    """Return the ranges of the recording's variables.
-
-    Args:
-        observations: The pixels.
-        outside_share: Share of the values below and above a range, so that single gross errors do
-            not stretch it. Chosen; training takes 0.001.
-    """
-    recording = observations.recording
-    return domain_from(
-        recording.camera,
-        observations.measured,
-        observations.amplitude,
-        recording.modulation_frequency,
-        observations.conditions,
-        outside_share=outside_share,
-        method="nearest",
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
