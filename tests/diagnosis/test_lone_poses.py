@@ -13,6 +13,7 @@ from diagnosed_recordings import recorded
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.next.advice import make_candidates
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.words import lone_poses
 
@@ -82,3 +83,7 @@ def test_a_last_pose_without_a_pixel_is_one_without_a_say(time_missing: Recordin
     assert study.sums.num_units == study.folds.shape[1]
     assert float(study.sums.count[-1]) == 0.0
     assert name_effects(study).names == ("integration_time",)
+    # What was asked next of its distance ended in a traceback.
+    candidates = make_candidates(study, ["integration_time"])
+    assert candidates is not None
+    assert max(candidates[1]) == len(depth) - 2

@@ -44,8 +44,8 @@ def make_candidates(study: Study, names: Collection[str]) -> Candidates | None:
         None for a recording that states nothing which could be varied: neither poses of a moving
         tool, nor a clock, nor other conditions.
     """
-    frames, facts = study.observations.num_frames, study.observations.facts
-    sources = torch.linspace(0, frames - 1, min(12, frames)).round().long().unique()
+    facts, frames = study.observations.facts, study.observations.frame.unique()
+    sources = frames[torch.linspace(0, len(frames) - 1, min(12, len(frames))).round().long()]
     known = {name: own[sources] for name, own in vars(facts).items() if own is not None}
     changes = [*_other_conditions(study, known), *_other_poses(study, sources)]
     if not changes:
