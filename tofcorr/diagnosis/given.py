@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
@@ -183,6 +182,8 @@ _TOLERANCE = 1e-3
 _SAME_POSE = 0.01
 # Relative difference of two equal values of a condition. Chosen: the rounding of a text file.
 _SAME_CONDITION = 1e-5
+# By differences: the product of all places has no digits left for those that are near.
+_EXACT = "donot_use_mm_for_euclid_dist"
 
 
 def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
@@ -195,7 +196,10 @@ def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
         real: The recording.
         simulated: The rendered frames, in any order.
     """
-    away = np.max([cdist(*pair) for pair in zip(_places(real), _places(simulated), strict=True)], 0)
+    pairs = zip(_places(real), _places(simulated), strict=True)
+    places = [(torch.from_numpy(own), torch.from_numpy(other)) for own, other in pairs]
+    apart = [torch.cdist(own, other, compute_mode=_EXACT) for own, other in places]
+    away = torch.stack(apart).amax(0).numpy()
     found = away <= np.minimum(away.min(1, keepdims=True) + _SAME_POSE, 1.0)
     alike = [real.frames.target[:, None] == simulated.frames.target]
     for name in CONDITIONS:

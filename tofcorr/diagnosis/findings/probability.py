@@ -35,7 +35,8 @@ pixels that the base model does not absorb; of four sizes the one that predicts 
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -98,12 +99,10 @@ class Evidence:
         self._given: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
 
     def without(self, of_map: str) -> Study:
-        """Return the study with a map's values subtracted from the residual."""
+        """Return the study with a map's values subtracted, and poses as uncertain as before."""
         if of_map not in self._studies:
-            study = self._study
-            self._studies[of_map] = with_residual(
-                study, study.system.residual - self.maps[of_map].values
-            )
+            residual = self._study.system.residual - self.maps[of_map].values
+            self._studies[of_map] = with_residual(self._study, residual, None)
         return self._studies[of_map]
 
     def added(self, sizes: Mapping[str, float]) -> dict[str, float]:
@@ -168,10 +167,7 @@ class Evidence:
             of_map: Whose values are subtracted from the residual; empty: no map's.
         """
         if of_map not in self._given:
-            sums = self._study.sums
-            if of_map:
-                other, known = self.without(of_map).sums, (sums.dispersion, sums.pose_sd)
-                sums = replace(other, dispersion=known[0], pose_sd=known[1])
+            sums = (self.without(of_map) if of_map else self._study).sums
             score, base = sums.gls.score, sums.layout.base
             right = torch.cat([score.sum(0)[None], score.sum(0) - score])[..., None]
             inner = _solved(self._factor, right[:, :base])
@@ -325,9 +321,13 @@ class Models:
         prices = self.price * torch.tensor([len(model) for model in self.models])
         return torch.softmax(torch.minimum(density + missed, best.values) - prices[:, None], 0)
 
+    @cached_property
+    def _totals(self) -> dict[frozenset[str], float]:
+        return dict(zip(map(frozenset, self.models), self.total.tolist(), strict=True))
+
     def _missed(self, best: Model, names: Sequence[str]) -> Tensor:
         """Return what the form of each effect may miss of the best model at z = 1, (N, K)."""
-        total = dict(zip(map(frozenset, self.models), self.total.tolist(), strict=True))
+        total = self._totals
         missed = torch.zeros(len(total), len(names), dtype=torch.float64)
         for row, model in zip(missed, total, strict=True):
             further = [one for one in set(best) - model if model | {one} in total]

@@ -281,7 +281,7 @@ def with_poses_reestimated(study: Study, names: Sequence[str]) -> Study:
 def with_residual(
     study: Study,
     residual: Tensor,
-    names: Sequence[str] = (),
+    names: Sequence[str] | None = (),
     changed: Mapping[str, Tensor] | None = None,
 ) -> Study:
     """Return the study of another residual, and of other columns; unchanged products are kept.
@@ -289,7 +289,8 @@ def with_residual(
     Args:
         study: Before.
         residual: The new one, shape (M,), metres.
-        names: Effects of the model whose residual the uncertainty of the poses is estimated from.
+        names: Effects of the model whose residual the uncertainty of the poses is estimated from;
+            None: it is kept.
         changed: The columns of effects that differ, shape (M, E) each; None: all are the same.
     """
     system, changed, before = study.system, changed or {}, study.sums
@@ -305,7 +306,8 @@ def with_residual(
     for sums, own in zip((weighted, plain), products.chunk(2, dim=-1), strict=True):
         sums[:, :, places] = own
         sums[:, places, :] = own.mT
-    sums = replace(before, weighted=weighted, plain=plain).with_pose_uncertainty(names)
+    sums = replace(before, weighted=weighted, plain=plain)
+    sums = sums if names is None else sums.with_pose_uncertainty(names)
     return replace(study, system=replace(system, columns=columns, residual=residual, sums=sums))
 
 
