@@ -182,8 +182,6 @@ _TOLERANCE = 1e-3
 _SAME_POSE = 0.01
 # Relative difference of two equal values of a condition. Chosen: the rounding of a text file.
 _SAME_CONDITION = 1e-5
-# By differences: the product of all places has no digits left for those that are near.
-_EXACT = "donot_use_mm_for_euclid_dist"
 
 
 def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
@@ -198,7 +196,9 @@ def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
     """
     pairs = zip(_places(real), _places(simulated), strict=True)
     places = [(torch.from_numpy(own), torch.from_numpy(other)) for own, other in pairs]
-    apart = [torch.cdist(own, other, compute_mode=_EXACT) for own, other in places]
+    # By differences: the product of all places has no digits left for those that are near.
+    exact = "donot_use_mm_for_euclid_dist"
+    apart = [torch.cdist(own, other, compute_mode=exact) for own, other in places]
     away = torch.stack(apart).amax(0).numpy()
     found = away <= np.minimum(away.min(1, keepdims=True) + _SAME_POSE, 1.0)
     alike = [real.frames.target[:, None] == simulated.frames.target]

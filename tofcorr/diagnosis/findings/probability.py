@@ -36,7 +36,6 @@ pixels that the base model does not absorb; of four sizes the one that predicts 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -321,13 +320,9 @@ class Models:
         prices = self.price * torch.tensor([len(model) for model in self.models])
         return torch.softmax(torch.minimum(density + missed, best.values) - prices[:, None], 0)
 
-    @cached_property
-    def _totals(self) -> dict[frozenset[str], float]:
-        return dict(zip(map(frozenset, self.models), self.total.tolist(), strict=True))
-
     def _missed(self, best: Model, names: Sequence[str]) -> Tensor:
         """Return what the form of each effect may miss of the best model at z = 1, (N, K)."""
-        total = self._totals
+        total = dict(zip(map(frozenset, self.models), self.total.tolist(), strict=True))
         missed = torch.zeros(len(total), len(names), dtype=torch.float64)
         for row, model in zip(missed, total, strict=True):
             further = [one for one in set(best) - model if model | {one} in total]
