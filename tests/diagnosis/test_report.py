@@ -15,6 +15,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult, write_report
+from tofcorr.diagnosis.report.words import table_of_stages
 from tofcorr.observables.figures import drawings
 from tofcorr.options import load_options
 from tofcorr.simulation.options import SimulatorOptions
@@ -115,12 +116,13 @@ def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_pat
     assert slope == pytest.approx(0.006, rel=0.2)
 
 
-def test_the_result_prints_verdict_causes_remarks_and_warnings(
+def test_the_result_prints_stages_verdict_causes_remarks_and_warnings(
     time_diagnosis: DiagnosisResult,
 ) -> None:
     warned = replace(time_diagnosis, warnings=("The lens was dirty.",))
     causes = [f"- {cause}" for cause in time_diagnosis.causes]
-    lines = [time_diagnosis.verdict, *causes, *time_diagnosis.remarks]
+    lines = [*table_of_stages(time_diagnosis), time_diagnosis.verdict, *causes]
+    lines += time_diagnosis.remarks
     assert repr(time_diagnosis) == "\n".join(lines)
     assert repr(warned) == "\n".join([*lines, "Warning: The lens was dirty."])
 

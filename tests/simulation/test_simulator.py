@@ -126,15 +126,14 @@ def test_effects_act_in_every_stage_in_order() -> None:
 
 
 def test_measurement_is_differentiable_in_what_effects_change() -> None:
-    options, effect = small(shots=[{"target": "white", "poses": 1}]), Effect()
+    options = small(shots=[{"target": "white", "poses": 1}])
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)
 
-    def act(state: FrameState) -> None:
-        state.delay = state.delay + by * state.radial_distance
+    class Later(Effect):
+        def on_delay(self, state: FrameState) -> None:
+            state.delay = state.delay + by * state.radial_distance
 
-    effect.on_delay = act
     (plain,) = expected_frames(options)
-    pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (effect,))
-    state = pipeline.run(plain)
+    state = SensorPipeline(plain.camera, options.sensor, options.scene, (Later(),)).run(plain)
     (gradient,) = torch.autograd.grad(state.measured_distance.sum(), by)
     torch.testing.assert_close(gradient, state.radial_distance.sum())
