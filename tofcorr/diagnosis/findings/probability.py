@@ -36,6 +36,7 @@ pixels that the base model does not absorb; of four sizes the one that predicts 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -311,21 +312,19 @@ class Models:
             generator: Of the form errors, drawn for each row by itself.
         """
         density = self.densities @ weights.T
-        best, names = density.max(0), sorted({name for model in self.models for name in model})
-        square = torch.randn(len(names), len(weights), generator=generator).double().square()
-        missed = torch.zeros_like(density)
-        for number in best.indices.unique().tolist():
-            own = best.indices == number
-            missed[:, own] = self._missed(self.models[number], names) @ square[:, own]
+        drawn = torch.randn(self._missed.shape[1], len(weights), generator=generator).double()
+        explained = torch.minimum(density + self._missed @ drawn.square(), density.max(0).values)
         prices = self.price * torch.tensor([len(model) for model in self.models])
-        return torch.softmax(torch.minimum(density + missed, best.values) - prices[:, None], 0)
+        return torch.softmax(explained - prices[:, None], 0)
 
-    def _missed(self, best: Model, names: Sequence[str]) -> Tensor:
-        """Return what the form of each effect may miss of the best model at z = 1, (N, K)."""
+    @cached_property
+    def _missed(self) -> Tensor:
+        """What the form of each effect may miss of the best model at z = 1, shape (N, K)."""
+        names = sorted({name for model in self.models for name in model})
         total = dict(zip(map(frozenset, self.models), self.total.tolist(), strict=True))
-        missed = torch.zeros(len(total), len(names), dtype=torch.float64)
+        best, missed = max(total, key=total.__getitem__), torch.zeros(len(total), len(names))
         for row, model in zip(missed, total, strict=True):
-            further = [one for one in set(best) - model if model | {one} in total]
+            further = [one for one in best - model if model | {one} in total]
             added = {one: total[model | {one}] - total[model] for one in further}
             for name in model & CATALOGUE.keys():
                 rest, alike = model - {name}, 1.0
@@ -334,7 +333,7 @@ class Models:
                     alike = min(alike, max(1 - beside / alone, 0.0)) if alone > 0 else alike
                 gain = max(total[model] - total.get(rest, total[model]), 0.0)
                 row[names.index(name)] = CATALOGUE[name].form_error ** 2 * alike * gain
-        return missed
+        return missed.double()
 
 
 class Search:
