@@ -214,10 +214,11 @@ class PoseSums:
     @cached_property
     def gls(self) -> Sums:
         """Generalised least squares: weighted by likelihood, with the uncertainty of the poses."""
-        whole, pose = self.weighted / self.dispersion, slice(self.num_columns, -1)
-        cross = whole[:, pose]
+        share, pose = 1 / self.dispersion, slice(self.num_columns, -1)
+        cross = share * self.weighted[:, pose]
         solved = torch.linalg.solve(cross[:, :, pose] + torch.diag(self.pose_sd**-2), cross)
-        return self._equations(torch.baddbmm(whole, cross.mT, solved, alpha=-1), 1.0)
+        left = torch.baddbmm(self.weighted, cross.mT, solved, beta=share, alpha=-1)
+        return self._equations(left, 1.0)
 
     def _equations(self, products: Tensor, scale: float) -> Sums:
         count = self.num_columns
