@@ -179,8 +179,7 @@ def _with_names(found: NamedEffects, evidence: Evidence) -> NamedEffects:
 def _beside(study: Study, model: Model, evidence: Evidence) -> Study:
     """Return the study with a model's effects linearised, and poses as certain as beside them."""
     columns = [name for name in model if name in study.sums.layout.effects]
-    without = next((evidence.without(name) for name in model if name in evidence.maps), study)
-    sums = with_poses_reestimated(without, columns).sums
+    sums = with_poses_reestimated(evidence.without_map_of(model), columns).sums
     known = replace(study.sums, dispersion=sums.dispersion, pose_sd=sums.pose_sd)
     return relinearised(replace(study, system=replace(study.system, sums=known)), columns)
 

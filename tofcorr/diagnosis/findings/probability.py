@@ -22,7 +22,7 @@ Four things keep its sum from being trusted as it stands, and each is a term of 
   normal z (a model discrepancy; Kennedy and O'Hagan 2001). So a model with gain g_k of effect k may
   explain up to e^2 z^2 s_k g_k more of what there is: at most as much as the best model n does.
   The form of k explains only what resembles it: s_k is the share that k takes away of what an
-  effect l adds, the least of those l that n has and m has not.
+  effect l adds, the least of those l that the best model of all poses has and m has not.
 - Few effects are there. Each has the prior odds o.
 
 .. math:: p(m) = \Big\langle \operatorname{softmax}_m \Big[ |m| \log o
@@ -95,11 +95,16 @@ class Evidence:
         self.gram = some[:, base:, base:] - self._base.mT @ self._base
         residual = study.system.residual_of(beside, gls=True)
         self.maps = {n: FittedMap(study, e, residual) for n, e in study.candidates.maps.items()}
-        self._studies: dict[str, Study] = {}
+        self._studies = {"": study}
         self._given: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
 
-    def without(self, of_map: str) -> Study:
-        """Return the study with a map's values subtracted, and poses as uncertain as before."""
+    def map_of(self, model: Iterable[str]) -> str:
+        """Return the map of a model; empty where it has none."""
+        return next((name for name in model if name in self.maps), "")
+
+    def without_map_of(self, model: Iterable[str]) -> Study:
+        """Return the study with a model's map subtracted, and poses as uncertain as before."""
+        of_map = self.map_of(model)
         if of_map not in self._studies:
             residual = self._study.system.residual - self.maps[of_map].values
             self._studies[of_map] = with_residual(self._study, residual, None)
@@ -111,11 +116,10 @@ class Evidence:
         The root mean square over all pixels, fitted by likelihood beside the others.
 
         Args:
-            sizes: As in `density`.
+            sizes: As in `Beside`.
         """
         study, layout = self._study, self._study.sums.layout
-        of_map = next((name for name in sizes if name in self.maps), "")
-        fitted = (self.without(of_map) if of_map else study).sums.gls
+        fitted = self.without_map_of(sizes).sums.gls
         names = self.with_columns(sizes)
         members, normal = layout.of(names), self._normal(sizes)
         theta = torch.linalg.solve(normal, fitted.score[:, members].sum(0))
@@ -125,7 +129,7 @@ class Evidence:
             own = torch.arange(*layout.effects[name])
             left = left_over(plain, base, own, layout.prior_of(base))
             found[name] = max(float(theta[low:high] @ left @ theta[low:high]) / pixels, 0.0) ** 0.5
-        if of_map:
+        if of_map := self.map_of(sizes):
             share = study.fit.share
             square = (share * self.maps[of_map].values ** 2).sum() / share.sum()
             found[of_map] = float(square) ** 0.5
@@ -154,7 +158,7 @@ class Evidence:
 
     def left_out_squares(self, model: Sequence[str]) -> Tensor:
         """Return the ordinary squares of each pose, predicted by all others, shape (U,), m^2."""
-        study = next((self.without(name) for name in model if name in self.maps), self._study)
+        study = self.without_map_of(model)
         return study.left_out_squares([name for name in model if name not in self.maps])
 
     def response(self, of_map: str) -> tuple[Tensor, Tensor, Tensor]:
@@ -167,7 +171,7 @@ class Evidence:
             of_map: Whose values are subtracted from the residual; empty: no map's.
         """
         if of_map not in self._given:
-            sums = (self.without(of_map) if of_map else self._study).sums
+            sums = self.without_map_of([of_map]).sums
             score, base = sums.gls.score, sums.layout.base
             right = torch.cat([score.sum(0)[None], score.sum(0) - score])[..., None]
             inner = _solved(self._factor, right[:, :base])
@@ -181,7 +185,7 @@ class Evidence:
         It is that of nine in ten of the effects that are not in the model.
 
         Args:
-            sizes: As in `density`.
+            sizes: As in `Beside`.
         """
         sums, layout = self._study.sums.gls, self._study.sums.layout
         names = self.with_columns(sizes)
@@ -211,9 +215,8 @@ class Beside:
     """
 
     def __init__(self, evidence: Evidence, sizes: Mapping[str, float]) -> None:
-        self.sizes, self._evidence = sizes, evidence
-        of_map = next((name for name in sizes if name in evidence.maps), "")
-        self._log_evidence, self._score, self._square = evidence.response(of_map)
+        self._evidence, given = evidence, evidence.response(evidence.map_of(sizes))
+        self._log_evidence, self._score, self._square = given
         own = [evidence.columns[name] for name in evidence.with_columns(sizes)]
         # The columns of no effect, for a model without one.
         own, gram = own or [slice(0)], evidence.gram
@@ -287,17 +290,19 @@ class Models:
         """Log predictive density of all poses, shape (N,)."""
         return self.densities.sum(1)
 
+    @property
+    def _prices(self) -> Tensor:
+        return self.price * torch.tensor([len(model) for model in self.models])
+
     def best(self) -> tuple[Model, Mapping[str, float]]:
         """Return the model of the highest posterior, before poses and forms are drawn."""
-        prices = self.price * torch.tensor([len(model) for model in self.models])
-        at = int((self.total - prices).argmax())
+        at = int((self.total - self._prices).argmax())
         return self.models[at], self.sizes[at]
 
     def sizes_of(self, effects: Model) -> Mapping[str, float]:
         """Return the prior sizes of the best model with exactly these effects and any probes."""
         own = [set(model) - self.probes == set(effects) for model in self.models]
-        prices = self.price * torch.tensor([len(model) for model in self.models])
-        level = torch.where(torch.tensor(own), self.total - prices, -torch.inf)
+        level = torch.where(torch.tensor(own), self.total - self._prices, -torch.inf)
         return self.sizes[int(level.argmax())]
 
     def gain_of(self, name: str) -> float:
@@ -314,8 +319,7 @@ class Models:
         density = self.densities @ weights.T
         drawn = torch.randn(self._missed.shape[1], len(weights), generator=generator).double()
         explained = torch.minimum(density + self._missed @ drawn.square(), density.max(0).values)
-        prices = self.price * torch.tensor([len(model) for model in self.models])
-        return torch.softmax(explained - prices[:, None], 0)
+        return torch.softmax(explained - self._prices[:, None], 0)
 
     @cached_property
     def _missed(self) -> Tensor:
