@@ -27,12 +27,11 @@ from benchmarks.renewed.recording import read, write_recording
 from benchmarks.renewed.signal_chain import Form
 from benchmarks.sealed.command import OUT, SEED, counts_by_name, kept_rows
 from benchmarks.sealed.oracle import ask
-from benchmarks.sealed.scores import LEAST_MM, by_design, known, share, table
+from benchmarks.sealed.scores import by_design, known, share, table
 from tofcorr.simulation.effects import CATALOGUE
 
 Row = Mapping[str, Any]
 KINDS = ("nothing", "effect", "outside", "pair")
-SINGLE = ("effect", "outside")
 IMAGES = {(32, 24): 0.6, (48, 36): 0.4}
 FRAMES = {
     "nothing": {15: 0.06, 20: 0.06, 30: 0.22, 45: 0.3, 60: 0.36},
@@ -124,12 +123,10 @@ BINS = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)  # ends of what is stated alike
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Return all tables as Markdown: levels by what was drawn, effects, pairs, coverage."""
-    of = {kind: [row for row in rows if row["kind"] == kind] for kind in KINDS}
-    parts = [_levels], [_found], [_pairs], [_reliability, _coverage]
-    asked = of["nothing"], [row for kind in SINGLE for row in of[kind]], of["pair"], rows
-    made = [make(some) for makes, some in zip(parts, asked, strict=True) for make in makes if some]
-    return "\n\n".join(made)
+    """Return all tables as Markdown: levels by what was drawn, effects, coverage."""
+    nothing = [row for row in rows if row["kind"] == "nothing"]
+    made = _levels(nothing) if nothing else "", _found(rows), _reliability(rows), _coverage(rows)
+    return "\n\n".join(filter(None, made))
 
 
 def _levels(rows: Sequence[Row]) -> str:
@@ -161,40 +158,23 @@ def _reliability(rows: Sequence[Row]) -> str:
 
 
 def _found(rows: Sequence[Row]) -> str:
+    """Of the effects of each kind that an oracle finds: what is said of them."""
     lines = []
-    for kind in SINGLE:
+    for kind in KINDS[1:]:
         some = [row for row in rows if row["kind"] == kind and row["must_find"]]
-        unknown = [row["unknown"] for row in some]
-        held = [any(row["effect"] in known(members) for members in row["sets"]) for row in some]
-        either = [a or b for a, b in zip(held, unknown, strict=True)]
-        judged = (held, either, unknown, list(map(SAID["detected"], some)))
-        lines += [(kind, len(some), *map(share, judged))] if some else []
-    head = ("findable effects", "n", "in a set", "in a set or unknown", "unknown", "detected")
-    return table(head, lines)
-
-
-def _pairs(rows: Sequence[Row]) -> str:
-    """Recordings with two effects: are both named, and what do their sets hold?"""
-    counts, sizes = np.zeros(3, dtype=int), []
-    held: list[bool] = []
-    single: list[bool] = []
-    for row in rows:
-        named, true = known(row["names"]), set(row["sizes_mm"])
-        asked = {name for name in row["must_find"] if row["sizes_mm"][name] >= LEAST_MM}
-        sets = [known(members) for members in row["sets"]]
-        counts += [len(named & true), len(named - true), len(asked - named)]
-        sizes += map(len, sets)
-        held += [any(effect in members for members in sets) for effect in asked]
-        single.append(any(len(members) == 1 and not members & true for members in sets))
-    right, wrong, missed = counts.tolist()
-    figures = [
-        ("effects named: right, wrong, missed", f"{right}, {wrong}, {missed}"),
-        ("F1 of the names", f"{2 * right / max(2 * right + wrong + missed, 1):.3f}"),
-        ("effects to be found that are in a set", f"{share(held)}, n = {len(held)}"),
-        ("a single wrong name", f"{share(single)}, n = {len(single)}"),
-        ("size of a set", f"{sum(sizes) / max(len(sizes), 1):.2f}"),
-    ]
-    return table((f"{len(rows)} pairs of effects", ""), figures)
+        asked = [(row, name) for row in some for name in row["must_find"]]
+        held = [any(name in known(own) for own in row["sets"]) for row, name in asked]
+        either = [inside or row["unknown"] for inside, (row, _) in zip(held, asked, strict=True)]
+        wrong = [
+            any(len(own) == 1 and not known(own) & set(row["sizes_mm"]) for own in row["sets"])
+            for row in some
+        ]
+        judged = held, either, wrong, [row["unknown"] for row in some], map(SAID["detected"], some)
+        sizes = [len(own) for row in some for own in row["sets"]]
+        size = f"{np.mean(sizes):.2f}" if sizes else ""
+        lines += [(kind, len(some), *map(share, judged), size)] if some else []
+    said = "in a set", "in a set or unknown", "a single wrong name", "unknown", "detected"
+    return table(("findable effects", "n", *said, "size of a set"), lines)
 
 
 def _coverage(rows: Sequence[Row]) -> str:

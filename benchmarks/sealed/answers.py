@@ -211,3 +211,40 @@ def oracle_of(out: Path, name: str, answer: Mapping[str, Any]) -> Oracle:
     oracle = ask(read(out / "recordings" / name), fields, load(out, name, "expected"))
     file.write_text(json.dumps(asdict(oracle)))
     return oracle
+
+
+def contradictions(report: Mapping[str, Any]) -> list[str]:
+    """Which laws the content of a `diagnosis.json` breaks, in words."""
+    names, sets, anything = report["effects"], report["cause_sets"], report["probability"]
+    of_set, unknown = report["set_probabilities"], report["unknown"]
+    judged = {row["effect"]: row["probability"] for row in report["ranking"] if row["available"]}
+    members = [[judged[name] for name in own] for own in sets]
+    gap, rounding = report["gap_mm"], 2e-4
+    laws = {
+        "detected is named or unknown": report["detected"] == (bool(names) or unknown),
+        "each effect named leads its set": names == [own[0] for own in sets],
+        "something is probably missing where an effect is named": not names or anything > 0.5,
+        "each set is more probable than not": min(of_set, default=1) > 0.5,
+        "a set is as probable as its members allow": all(
+            max(own) - rounding <= one <= min(sum(own), anything) + rounding
+            for one, own in zip(of_set, members, strict=True)
+        ),
+        "no effect is more probable than that any is there": anything + rounding
+        >= max([*judged.values(), report["unknown_probability"]]),
+        "the shares of a set are those of its members, and sum to 1 at most": all(
+            [*shares] == own and sum(shares.values()) <= 1 + rounding
+            for shares, own in zip(report["cause_sets_shares"], sets, strict=True)
+        ),
+        "the ranking falls": (falling := [*judged.values()]) == sorted(falling, reverse=True)
+        or max(np.diff(falling)) <= 0.01,
+        "intervals hold their figures": all(
+            low <= gap[name] <= high
+            for name in ("before", "after")
+            for low, high in [gap[f"{name}_ci"]]
+        ),
+        "no gap closes where nothing is named": bool(names) or gap["after"] == gap["before"],
+        "the verdict says what is named": all(name in report["verdict"] for name in names),
+        "a verdict says that nothing explains what is unknown": not unknown
+        or "explains" in report["verdict"],
+    }
+    return [law for law, holds in laws.items() if not holds]

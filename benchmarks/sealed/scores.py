@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.stats import binomtest, mannwhitneyu, norm
 
-from benchmarks.sealed.answers import Outcome
+from benchmarks.sealed.answers import Outcome, contradictions
 
 Case = TypeVar("Case")
 Values = Sequence[float]
@@ -218,6 +218,11 @@ def figures(title: str, cases: Sequence[Outcome], targets: Targets | None = None
         "named though nothing is there": map(named, nulls),
         "called unknown though nothing is there": map(unknown, nulls),
         "detected though nothing is there": map(detected, nulls),
+        "a report that contradicts itself": [
+            bool(contradictions(one.said.report))
+            for one in cases
+            if "set_probabilities" in one.said.report
+        ],
     }
     wanted, sizes = targets or {}, [float(len(one.said.sets[0])) for one in find if one.said.sets]
     scores = [share_score(title, k, some, wanted.get(k, ANY)) for k, some in judged.items()]

@@ -372,7 +372,10 @@ def judge(one: Outcome, found: Figures | None = None) -> Held:
             **_blocks_right(report, truth),
         }
     # The first number of the verdict is what people read.
-    first, shared = re.search(r"(\d+\.\d+) mm", report.get("verdict") or ""), {*one.case["shared"]}
+    first, shared = (
+        re.search(r"(\d+(?:\.\d+)?) mm", report.get("verdict") or ""),
+        {*one.case["shared"]},
+    )
     in_set, read_first = any(members & one.truths for members in sets), first and float(first[1])
     sizes: Held = {
         "gap as given within 5 %": _near(given, truth["as_given_mm"]),
