@@ -215,7 +215,7 @@ def largest_plane(
         triples = torch.randint(max(len(distance), 1), (300, 3), generator=generator)
         triples = triples[: 0 if len(distance) < 3 else 300]
     matrix = rays[triples]
-    sound = torch.linalg.det(matrix).abs() > 1e-6
+    sound = torch.linalg.det(matrix).abs() > torch.finfo(torch.float32).eps
     if not bool(sound.any()):
         return None
     # As many pixels tell planes apart: the share of one on 5 % of them is then known to a tenth.

@@ -13,16 +13,15 @@ import torch
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import Recording
-from tofcorr.estimation.robust import sigma_from_mad
+from tofcorr.estimation.robust import deviation, largest_plane, sigma_from_mad
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import (
-    TINY,
     Alignment,
     Scene,
     align,
     align_with_free_walls,
 )
-from tofcorr.plausibility.finding import CAMERA, LARGE_CONSTANT
+from tofcorr.plausibility.finding import CAMERA, FAR_OFF, LARGE_CONSTANT
 from tofcorr.plausibility.linear import (
     Estimate,
     LinearResiduals,
@@ -109,17 +108,20 @@ def _scene_of(look: "Look", stored: np.ndarray, pixel: np.ndarray) -> Scene:
     # pixels determine a plane, six can judge it.
     known = _spread(_moments(rays, distance, valid), slice(4, 7))[1][:, 1] > CAMERA**2
     known &= valid.sum(1) >= 6
-    normal, height = _best_triples(rays, distance, valid)
-    on_plane, moments, variances = valid, np.zeros(0), np.zeros(0)
-    for _ in range(2):
-        off = np.abs(distance - height[:, None] / _cosine(rays, normal[:, None])[:, 0])
-        near = np.maximum(4 * sigma_from_mad(_median(off)), CAMERA)[:, None]
-        on_plane = np.where(known[:, None], off <= near, valid)
-        moments = _moments(rays, distance, on_plane)
-        mean, variances, directions = _spread(moments, slice(0, 3))
-        normal = directions[..., 0]
-        height = (normal * mean).sum(-1)
-    off_by = distance - height[:, None] / _cosine(rays, normal[:, None])[:, 0]
+    on_plane = valid.copy()
+    for k in np.flatnonzero(known):
+        own = torch.from_numpy(rays[k, valid[k]]), torch.from_numpy(distance[k, valid[k]])
+        plane = largest_plane(*own, FAR_OFF, torch.Generator().manual_seed(0))
+        if plane is not None:
+            off = deviation(*own, plane).abs()
+            near = max(4 * sigma_from_mad(float(off.median())), CAMERA)
+            on_plane[k, valid[k]] = (off <= near).numpy()
+    moments = _moments(rays, distance, on_plane)
+    mean, variances, directions = _spread(moments, slice(0, 3))
+    normal = directions[..., 0]
+    height = (normal * mean).sum(-1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # Of frames without a plane.
+        off_by = distance - height[:, None] / np.einsum("fpa,fa->fp", rays, normal)
     return Scene(
         poses=look.poses,
         normal=look.column("normal_world"),
@@ -136,38 +138,6 @@ def _scene_of(look: "Look", stored: np.ndarray, pixel: np.ndarray) -> Scene:
         flatness=np.sqrt(np.maximum(variances[:, 0], 0.0)),
         moments=moments,
     )
-
-
-def _best_triples(
-    rays: np.ndarray, distance: np.ndarray, valid: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the plane through three pixels, of 40 tried the one that most pixels agree with.
-
-    With 40 % garbage, one of 40 triples is free of it with a probability of 1 - (1 - 0.6^3)^40 =
-    0.99994.
-    """
-    frames, points = np.arange(len(rays)), rays * np.where(valid, distance, 0.0)[..., None]
-    places = np.random.default_rng(0).uniform(size=(len(rays), 40, 3))
-    order = np.argsort(~valid, axis=1, kind="stable")
-    rank = (places * np.maximum(valid.sum(1), 1)[:, None, None]).astype(int)
-    corners = points[frames[:, None, None], order[frames[:, None, None], rank]]
-    normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), TINY)
-    height = (normal * corners[:, :, 0]).sum(-1)
-    off = np.abs(height[..., None] / _cosine(rays, normal) - distance[:, None])
-    best = _median(off).argmin(1)
-    return normal[frames, best], height[frames, best]
-
-
-def _cosine(rays: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the cosine of rays (F, P, 3) with normals (F, T, 3), none of it zero: (F, T, P)."""
-    cosine = normal @ rays.mT
-    return np.where(np.abs(cosine) < 1e-6, 1e-6, cosine)
-
-
-def _median(values: np.ndarray) -> np.ndarray:
-    """Return the lower median of the last axis without NaN; infinity where there is no value."""
-    return torch.from_numpy(values).nanmedian(dim=-1).values.nan_to_num(torch.inf).numpy()
 
 
 def _moments(rays: np.ndarray, distance: np.ndarray, used: np.ndarray) -> np.ndarray:
