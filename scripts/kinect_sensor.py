@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 
 from tofcorr.data.recording import Recording
-from tofcorr.observables.measure import dropouts_of, noise_of
-from tofcorr.observables.read import observe
+from tofcorr.observables.measure import DropoutMeasurement, NoiseMeasurement
+from tofcorr.observables.read import Observed
 from tofcorr.sensor.model import section_of
 from tofcorr.sensor.sensor_file import (
     ErrorSection,
@@ -57,8 +57,8 @@ def main(recording_path: Path, out: Path) -> None:
     recording = Recording.open(recording_path, check_contents=False)
     result = train(recording, CONFIG)
     print(f"training: {result.report['error_mm']} ({time.process_time() - started:.0f} s)")
-    observed = observe(recording)
-    noise, missing = noise_of(observed), dropouts_of(observed)
+    observed = Observed(recording)
+    noise, missing = NoiseMeasurement(observed), DropoutMeasurement(observed)
     print(f"noise: {noise.curve} from {noise.source}")
     print(f"missing: {missing.model} ({missing.share:.4f} of the pixels)")
     state = calibration_state(result.data, result.options, result.fit)

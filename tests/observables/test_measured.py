@@ -14,13 +14,12 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
 from tofcorr.estimation.noise import NoiseModel, filter_width, neighbour_correlation
 from tofcorr.observables.measure import (
+    DropoutMeasurement,
     DropoutModel,
     NoiseMeasurement,
-    dropouts_of,
     level_of_repeats,
-    noise_of,
 )
-from tofcorr.observables.read import observe, pose_groups
+from tofcorr.observables.read import Observed, pose_groups
 
 AMPLITUDES = np.array([300.0, 1000.0, 2000.0])
 
@@ -29,7 +28,7 @@ def drawn_and_measured(
     folder: Path, camera: Camera, seed: int, **how: int
 ) -> tuple[Truth, NoiseMeasurement]:
     truth = record(folder, camera, seed, **how)
-    return truth, noise_of(observe(truth.recording))
+    return truth, NoiseMeasurement(Observed(truth.recording))
 
 
 @pytest.mark.parametrize("repeats", [1, 4])
@@ -108,7 +107,7 @@ def test_missing_pixels_give_share_threshold_and_base_share(
 ) -> None:
     """Of a camera that loses few pixels, too: bins of equal count were 13 % off there."""
     truth = record(tmp_path / "wall", Camera(threshold=threshold, base_share=base), 3)
-    dropouts = dropouts_of(observe(truth.recording))
+    dropouts = DropoutMeasurement(Observed(truth.recording))
     assert dropouts.share == pytest.approx(truth.missing_share, abs=1e-6)
     assert dropouts.model.amplitude_at_half == pytest.approx(threshold, rel=0.03)
     assert dropouts.model.base_share == pytest.approx(base, abs=0.003)
@@ -168,7 +167,7 @@ def test_the_amplitude_of_a_missing_pixel_that_states_none_follows_from_its_neig
         depth=depth,
         amplitude=stated,
     )
-    found = dropouts_of(observe(Recording.open(tmp_path / "stated")))
+    found = DropoutMeasurement(Observed(Recording.open(tmp_path / "stated")))
     assert not found.amplitude_recorded
     table = found.observed.table
     # A pose with hardly a distance shows no wall, and so no angle.
@@ -184,7 +183,7 @@ def test_the_amplitude_of_a_missing_pixel_that_states_none_follows_from_its_neig
 def test_many_pixels_that_share_the_largest_amplitude_are_saturated(tmp_path: Path) -> None:
     truth = record(tmp_path / "wall", Camera(saturation=1200.0), 4)
     assert truth.recording.saturation_amplitude is None
-    found = dropouts_of(observe(truth.recording))
+    found = DropoutMeasurement(Observed(truth.recording))
     assert found.model.saturation_amplitude == 1200.0
     assert found.saturated_share == pytest.approx(truth.missing_share)
     assert found.saturated_missing == pytest.approx(truth.missing_share)

@@ -43,8 +43,8 @@ SAME_BRIGHTNESS = 0.25
 different errors. Chosen."""
 SECOND_DIFFERENCE = 1.5
 """Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4."""
-# Most bins of brightness, of equal count: eight for each of the three numbers fitted. Chosen.
-_BINS = 24
+BINS = 24
+"""Most bins of brightness, of equal count: eight for each of the three numbers fitted. Chosen."""
 # Fewest differences in a bin: the standard deviation of 20 is known to about 16 % (1 / sqrt(2 n)),
 # from their median absolute deviation to about 26 %. Set by hand.
 _FEWEST_PER_BIN = 20
@@ -223,7 +223,7 @@ def brightness_bins(brightness: np.ndarray, fewest: int) -> list[np.ndarray]:
         fewest: Pixels of a bin at least, if there are so many; there are 24 bins at most.
     """
     order = np.argsort(brightness, kind="stable")
-    return np.array_split(order, int(np.clip(len(order) // fewest, 1, _BINS)))
+    return np.array_split(order, int(np.clip(len(order) // fewest, 1, BINS)))
 
 
 def neighbour_differences(

@@ -10,30 +10,25 @@ from typing import Any
 import numpy as np
 
 from tofcorr.data.recording import Recording
+from tofcorr.estimation.noise import Source
 from tofcorr.observables.measure import (
     DropoutMeasurement,
     NoiseMeasurement,
-    dropouts_of,
-    noise_of,
     noise_source,
 )
 from tofcorr.observables.pairs import (
     Matched,
     Random,
-    matched,
     permutation_p,
     sign_flip_p,
 )
-from tofcorr.observables.read import observe
+from tofcorr.observables.read import Observed, log_of
 
 Block = dict[str, Any]
 # Smallest deviation that is reported: of a ratio from one, and of a correlation; and of the shares
 # of missing pixels. Chosen: what trains a network on simulated depth does not notice less; one
 # pixel in 500 is what the check of simulated pairs measures the share to.
 _MATERIAL, _MATERIAL_SHARE = 0.05, 0.002
-# A simulator with less noise counts as free of it, metres. Chosen: rounding of float32 depth up to
-# 10 m is 0.5 um.
-_NO_NOISE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,18 +84,18 @@ def compare_observables(
     Raises:
         CalibrationDataError: One of them has no image with 100 usable pixels, or breaks the format.
     """
-    seen = observe(real)
-    noise, dropouts = noise_of(seen), dropouts_of(seen)
+    seen = Observed(real)
+    noise, dropouts = NoiseMeasurement(seen), DropoutMeasurement(seen)
     if sim is None:
         return Observables(real_noise=noise, real_dropouts=dropouts)
-    simulated = observe(sim)
-    lost = dropouts, dropouts_of(simulated)
-    both = matched(seen, simulated, (lost[0].amplitude, lost[1].amplitude))
-    alike = both if both.paired else matched(seen, simulated, None)
-    source = noise.source if noise_source(simulated) == noise.source else "neighbours"
+    simulated = Observed(sim)
+    lost = dropouts, DropoutMeasurement(simulated)
+    both = Matched(seen, simulated, (lost[0].amplitude, lost[1].amplitude))
+    alike = both if both.paired else Matched(seen, simulated, None)
+    source: Source = noise.source if noise_source(simulated) == noise.source else "neighbours"
     noises = (
-        noise if source == noise.source else noise_of(seen, source),
-        noise_of(simulated, source),
+        noise if source == noise.source else NoiseMeasurement(seen, source),
+        NoiseMeasurement(simulated, source),
     )
     random = np.random.default_rng(seed)
     return Observables(
@@ -140,7 +135,8 @@ def _compare_noise(
     means = [max(mean, 0.0) ** 0.5 for mean in np.nan_to_num(sums.means()).tolist()]
     ratio = squares = None
     p_values: list[float | None] = [None, None]
-    if means[1] > _NO_NOISE:
+    # Float32 depth is rounded by less.
+    if means[1] > np.finfo(np.float32).eps * np.nanmax(sim.observed.table.distance):
         ratio, squares = means[0] / means[1], sums.ratio_interval()
         p_value = sums.ratio_p(random)
         p_values = [
@@ -285,9 +281,9 @@ def _compare_amplitude(
     Returns:
         The block `amplitude`; None where one of the recordings has none at the pixels compared.
     """
-    logs = [_log(real.amplitude[both.rows]), _log(sim.amplitude[both.columns])]
+    logs = [log_of(real.amplitude[both.rows]), log_of(sim.amplitude[both.columns])]
     if not both.paired:
-        logs = [logs[0] - _log(both.real.signal), logs[1] - _log(both.sim.signal)]
+        logs = [logs[0] - log_of(both.real.signal), logs[1] - log_of(both.sim.signal)]
     sums = both.sums(logs[0], logs[1])
     if not all(map(len, sums.total)):
         return None
@@ -306,7 +302,3 @@ def _compare_amplitude(
 def _significant(value: float) -> float:
     """Return five significant digits: units of amplitude differ widely."""
     return float(f"{value:.5g}")
-
-
-def _log(values: np.ndarray) -> np.ndarray:
-    return np.log(np.where(values > 0, values, np.nan))

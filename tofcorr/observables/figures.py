@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.measure import LEAST_VARIANCE, DropoutMeasurement, NoiseMeasurement
-from tofcorr.observables.read import quotient
+from tofcorr.observables.pairs import Interval, Pair
+from tofcorr.observables.read import log_of, quotient
 from tofcorr.plausibility.page import (
     BLUE,
     FAINT,
@@ -21,10 +22,7 @@ from tofcorr.plausibility.page import (
     plain_look,
     plain_numbers,
 )
-
-# Points of a curve, and pixels that one stands for at least; tiles along the longer side of a map:
-# single pixels would show noise alone. Chosen for a readable figure.
-_POINTS, _FEWEST, _TILES = 18, 30, 16
+from tofcorr.training.figures import ends_of, profile
 
 
 def drawings(observables: Observables) -> dict[str, Callable[[], Figure]]:
@@ -48,20 +46,19 @@ def noise_figure(observables: Observables) -> Figure:
     ratio = compared["ratio"]  # A simulator without noise has none.
     figure, found = panels(4 if ratio is None else 5, 1 if ratio is None else 2)
     at = _brightness(real)
-    seen = at[np.isfinite(at) & (at > 0)]
-    edges = _edges(seen, 1 / 500) if len(seen) else np.geomspace(0.5, 2.0, _POINTS + 1)
-    sigma = _noise_points(found[0], at, real.variance, edges, (RED, "recording"))
-    _noise_curve(found[0], real, edges, 1.0, RED)
+    ends = _log_ends(at)
+    middle, sigma = _noise_points(found[0], at, real.variance, ends, (RED, "recording"))
+    _noise_curve(found[0], real, ends, 1.0, RED)
     if sim is not None and both is not None:
         place, variance, scale = _brightness(sim), sim.variance, 1.0
         if both.paired:
             place, variance = at[both.rows], sim.variance[both.columns]
             scale = 1.0 / (observables.amplitude or {"ratio": 1.0})["ratio"]
-        simulated = _noise_points(found[0], place, variance, edges, (BLUE, "simulator"))
+        _, simulated = _noise_points(found[0], place, variance, ends, (BLUE, "simulator"))
         if sim.curve.needs_amplitude == real.curve.needs_amplitude:
-            _noise_curve(found[0], sim, edges, scale, BLUE)
+            _noise_curve(found[0], sim, ends, scale, BLUE)
         if ratio is not None:
-            found[1].semilogx(_centres(edges), sigma / simulated, "o", color=GREY)
+            found[1].semilogx(middle, sigma / simulated, "o", color=GREY)
             line_across(found[1], at=1.0)
             found[1].axhline(ratio, color=RED, linewidth=1)
             if compared["ratio_ci"] is not None:
@@ -78,20 +75,24 @@ def noise_figure(observables: Observables) -> Figure:
 
 
 def _noise_points(
-    axes: Axes, at: np.ndarray, variance: np.ndarray, edges: np.ndarray, look: tuple[str, str]
-) -> np.ndarray:
-    """Draw the noise in bins; return it in mm, NaN in bins of too few pixels or without noise."""
-    mean = _binned(at, variance, edges)
+    axes: Axes, at: np.ndarray, variance: np.ndarray, ends: Interval, look: tuple[str, str]
+) -> Pair:
+    """Draw the noise in bins.
+
+    Returns:
+        Middles of the bins, and the noise in them, mm; NaN with too few pixels or without noise.
+    """
+    middle, mean, _ = profile(log_of(at), variance, ends)
     sigma = 1e3 * np.sqrt(np.where(mean > LEAST_VARIANCE, mean, np.nan))
-    axes.loglog(_centres(edges), sigma, "o", color=look[0], markersize=5, label=look[1])
-    return sigma
+    axes.loglog(np.exp(middle), sigma, "o", color=look[0], markersize=5, label=look[1])
+    return np.exp(middle), sigma
 
 
 def _noise_curve(
-    axes: Axes, noise: NoiseMeasurement, edges: np.ndarray, scale: float, colour: str
+    axes: Axes, noise: NoiseMeasurement, ends: Interval, scale: float, colour: str
 ) -> None:
     """Draw the fitted curve, its amplitude being `scale` times that of the axis."""
-    line = np.geomspace(edges[0], edges[-1], 100)
+    line = np.exp(np.linspace(*ends, 100))
     sigma = noise.curve.temporal_sigma(line, scale * line)
     if float(sigma.max()) ** 2 > LEAST_VARIANCE:
         axes.plot(line, 1e3 * sigma, color=colour)
@@ -136,13 +137,13 @@ def dropout_figure(observables: Observables) -> Figure:
 
 
 def _dropout_curve(axes: Axes, dropouts: DropoutMeasurement, colour: str, name: str) -> None:
-    table, lit = dropouts.observed.table, np.nan_to_num(dropouts.amplitude) > 0
-    if not lit.any():
+    table, at = dropouts.observed.table, dropouts.amplitude
+    if not np.nan_to_num(at).any():
         return
-    edges = _edges(dropouts.amplitude[lit], 1 / 2000)
-    share = 100 * _binned(dropouts.amplitude, table.missing / table.frames, edges)
-    axes.semilogx(_centres(edges), share, "o", color=colour, markersize=4, label=name)
-    line = np.geomspace(edges[0], edges[-1], 200)
+    ends = _log_ends(at)
+    middle, share, _ = profile(log_of(at), 100 * table.missing / table.frames, ends)
+    axes.semilogx(np.exp(middle), share, "o", color=colour, markersize=4, label=name)
+    line = np.exp(np.linspace(*ends, 200))
     axes.plot(line, 100 * dropouts.model.probability(line), color=colour)
 
 
@@ -175,7 +176,8 @@ def amplitude_figure(observables: Observables) -> Figure:
 
 def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return the mean of values in tiles of the image."""
-    side = max(1, max(shape) // _TILES)
+    # Single pixels would show noise alone: sixteen tiles along the longer side.
+    side = max(1, max(shape) // 16)
     rows, columns = (-(-length // side) for length in shape)
     place = pixel // shape[1] // side * columns + pixel % shape[1] // side
     count = np.bincount(place, minlength=rows * columns)
@@ -183,21 +185,8 @@ def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -
     return quotient(total, count).reshape(rows, columns)
 
 
-def _edges(brightness: np.ndarray, beyond: float) -> np.ndarray:
-    """Return the edges of bins that all but a share of the pixels at either end lie in."""
-    low, high = np.quantile(brightness, (beyond, 1 - beyond))
-    return np.geomspace(low, high if high > low else 2 * low, _POINTS + 1)
-
-
-def _centres(edges: np.ndarray) -> np.ndarray:
-    """Return the geometric centres of bins."""
-    return np.sqrt(edges[1:] * edges[:-1])
-
-
-def _binned(at: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return the mean of the known values in each bin; NaN in one of too few pixels."""
-    inside = np.isfinite(values) & (at >= edges[0]) & (at < edges[-1])
-    place = np.searchsorted(edges, at[inside], side="right") - 1
-    count = np.bincount(place, minlength=_POINTS)
-    mean = quotient(np.bincount(place, values[inside], minlength=_POINTS), count)
-    return np.where(count >= _FEWEST, mean, np.nan)
+def _log_ends(values: np.ndarray) -> Interval:
+    """Return the range of the logarithms of some values, without stray ones."""
+    logs = log_of(values)
+    low, high = ends_of(logs[np.isfinite(logs)]) if np.isfinite(logs).any() else (0.0, 0.0)
+    return low, high if high > low else low + 1

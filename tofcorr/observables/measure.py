@@ -3,8 +3,6 @@
 Noise comes from frames taken without moving, or from differences of pixels in one image.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tofcorr.estimation.noise import (
@@ -21,28 +19,25 @@ from tofcorr.estimation.noise import (
     mean_correlation,
     neighbour_correlation,
 )
-from tofcorr.estimation.robust import student_quantile
-from tofcorr.observables.read import LAGS, Observed, quotient
+from tofcorr.estimation.robust import LEVEL, student_quantile
+from tofcorr.observables.read import FEWEST_PIXELS, LAGS, Observed, log_of, quotient
 from tofcorr.options import Options, PositiveNumber, Share
 
-LEAST_VARIANCE = 1e-14
-"""Square metres, (0.1 um)^2: less counts as free of noise. Chosen: float32 depth of 1 m is rounded
-to 0.06 um."""
+LEAST_VARIANCE = float(np.square(np.finfo(np.float32).eps))
+"""Square metres: less counts as free of noise, as float32 depth of 1 m is rounded by no more."""
 
-# Noise comes from repeats if at least this share of the poses, or this many, was repeated: a level
-# from fewer says little of the others. Chosen.
-_REPEATED_SHARE, _REPEATED_POSES = 0.5, 8
-# Fewest pixels of a bin of brightness: with 100 pixels a variance is known to 14 %.
-_FEWEST_PER_BIN = 100
 # Standard errors that the correlation of frames must exceed to be counted, and the largest
 # considered (no unit): the variance of a frame is corrected by the inverse of what is left. Chosen:
 # one camera in 700 without a filter gets one.
 _LEAST_ERRORS, _MOST_CORRELATED = 3.0, 0.95
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class NoiseMeasurement:
     """The noise of a recording. Standard deviations are root mean squares over pixels, metres.
+
+    Args:
+        observed: What was read.
+        source: Where the temporal noise comes from; None: from repeats, if there are enough.
 
     Attributes:
         curve: Noise as a function of brightness.
@@ -65,80 +60,56 @@ class NoiseMeasurement:
         observed: What it was measured from.
     """
 
-    curve: NoiseModel
-    source: Source
-    temporal_m: float
-    temporal_interval: tuple[float, float]
-    pattern_m: float
-    scene_m: float | None
-    correlation: np.ndarray
-    frame_correlation: float
-    pose_frame_correlation: np.ndarray
-    variance: np.ndarray
-    pose_correlation: np.ndarray
-    left_out: np.ndarray
-    observed: Observed
+    def __init__(self, observed: Observed, source: Source | None = None) -> None:
+        self.observed = observed
+        self.source: Source = source or noise_source(observed)
+        table = observed.table
+        found, error = frame_correlation(np.concatenate(observed.between_frames, axis=1))
+        self.frame_correlation = (
+            min(found, _MOST_CORRELATED) if found > _LEAST_ERRORS * error else 0.0
+        )
+        by_pose = [frame_correlation(pose)[0] for pose in observed.between_frames]
+        self.pose_frame_correlation = np.array(by_pose)
+        counts = observed.repeats.tolist()
+        shown = np.array([1.0 - mean_correlation(self.frame_correlation, one) for one in counts])
+        repeats = table.of_repeats / shown[table.pose]
+        if self.source == "repeats":
+            products, squares, _ = observed.temporal.sum(0)
+            self.correlation, self.variance = quotient(products, squares), repeats
+            of_poses = quotient(observed.temporal[:, 0], observed.temporal[:, 1])
+            self.pose_correlation = of_poses[..., 0].mean(-1)
+            self.left_out = np.zeros(len(observed.repeats))
+        else:
+            found = _noise_of_neighbours(observed)
+            variance, self.correlation, self.pose_correlation, self.left_out = found
+            variance = variance * level_of_repeats(_brightness(table), repeats, variance)
+            self.variance = np.where(np.isfinite(repeats), repeats, variance)
+        temporal, interval = _level_of_poses(table.pose, self.variance)
+        curve = _curve_of(table, self.variance, filter_width(self.correlation.mean(0).tolist()))
+        if self.source == "neighbours":
+            # Single pixels between edges have no difference; the curve covers them too. It has a
+            # least noise where differences, less those of the pattern, leave none.
+            at = table.amplitude if curve.needs_amplitude else table.distance
+            lit = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
+            squares = curve.sigma(table.distance[lit], table.amplitude[lit]) ** 2
+            everywhere = float(squares.mean()) if lit.any() else 0.0
+            more = (everywhere / temporal) ** 0.5 if temporal > 0 else 1.0
+            temporal, interval = everywhere, (interval[0] * more, interval[1] * more)
+        pattern, scene = _fixed(observed)
+        share = pattern / (pattern + temporal) if pattern > 0 and temporal > 0 else 0.0
+        self.curve = curve.with_fixed_share(share)
+        self.temporal_m, self.temporal_interval = temporal**0.5, interval
+        self.pattern_m, self.scene_m = pattern**0.5, None if scene is None else scene**0.5
 
 
 def noise_source(observed: Observed) -> Source:
-    """Return where the noise of a recording can come from."""
-    repeated = (observed.repeats > 1).sum()
-    enough = repeated >= min(_REPEATED_POSES, _REPEATED_SHARE * len(observed.repeats))
-    return "repeats" if enough else "neighbours"
+    """Return where the noise of a recording can come from.
 
-
-def noise_of(observed: Observed, source: Source | None = None) -> NoiseMeasurement:
-    """Measure the noise of a recording that was read.
-
-    Args:
-        observed: What was read.
-        source: Where the temporal noise comes from; None: from repeats, if there are enough.
+    It comes from repeats if half of the poses, or eight, were repeated: a level from fewer says
+    little of the others.
     """
-    source = source or noise_source(observed)
-    table = observed.table
-    found, error = frame_correlation(np.concatenate(observed.between_frames, axis=1))
-    of_frames = min(found, _MOST_CORRELATED) if found > _LEAST_ERRORS * error else 0.0
-    shown = np.array(
-        [1.0 - mean_correlation(of_frames, count) for count in observed.repeats.tolist()]
-    )
-    repeats = table.of_repeats / shown[table.pose]
-    if source == "repeats":
-        products, squares, _ = observed.temporal.sum(0)
-        correlation, variance = quotient(products, squares), repeats
-        by_pose = quotient(observed.temporal[:, 0], observed.temporal[:, 1])[..., 0].mean(-1)
-        left_out = np.zeros(len(observed.repeats))
-    else:
-        variance, correlation, by_pose, left_out = _noise_of_neighbours(observed)
-        variance = variance * level_of_repeats(_brightness(table), repeats, variance)
-        variance = np.where(np.isfinite(repeats), repeats, variance)
-    temporal, interval = _level_of_poses(table.pose, variance)
-    curve = _curve_of(table, variance, filter_width(correlation.mean(0).tolist()))
-    if source == "neighbours":
-        # Single pixels between edges have no difference; the curve covers them too. It has a least
-        # noise where differences, less those of the pattern, leave none.
-        at = table.amplitude if curve.needs_amplitude else table.distance
-        lit = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
-        squares = curve.sigma(table.distance[lit], table.amplitude[lit]) ** 2
-        everywhere = float(squares.mean()) if lit.any() else 0.0
-        more = (everywhere / temporal) ** 0.5 if temporal > 0 else 1.0
-        temporal, interval = everywhere, (interval[0] * more, interval[1] * more)
-    pattern, scene = _fixed(observed)
-    share = pattern / (pattern + temporal) if pattern > 0 and temporal > 0 else 0.0
-    return NoiseMeasurement(
-        curve=curve.with_fixed_share(share),
-        source=source,
-        temporal_m=temporal**0.5,
-        temporal_interval=interval,
-        pattern_m=pattern**0.5,
-        scene_m=None if scene is None else scene**0.5,
-        correlation=correlation,
-        frame_correlation=of_frames,
-        pose_frame_correlation=np.array([frame_correlation(k)[0] for k in observed.between_frames]),
-        variance=variance,
-        pose_correlation=by_pose,
-        left_out=left_out,
-        observed=observed,
-    )
+    repeated = (observed.repeats > 1).sum()
+    return "repeats" if repeated >= min(8, len(observed.repeats) / 2) else "neighbours"
 
 
 def _noise_of_neighbours(
@@ -223,9 +194,9 @@ def level_of_repeats(
     lit = np.nan_to_num(brightness) > 0
     both = np.flatnonzero(np.isfinite(repeats) & np.isfinite(neighbours) & lit)
     # Three frames of a pose leave two degrees of freedom: five bins' pixels are known to 5 %.
-    bins = brightness_bins(brightness[both], 5 * _FEWEST_PER_BIN)
+    bins = brightness_bins(brightness[both], 5 * FEWEST_PIXELS)
     parts = [both[part] for part in bins if neighbours[both[part]].sum() > 0]
-    if len(both) < _FEWEST_PER_BIN or not parts:
+    if len(both) < FEWEST_PIXELS or not parts:
         return np.ones_like(neighbours)
     levels = [float(repeats[part].sum() / neighbours[part].sum()) for part in parts]
     at = [float(np.median(np.log(brightness[part]))) for part in parts]
@@ -245,7 +216,7 @@ def _level_of_poses(pose: np.ndarray, variance: np.ndarray) -> tuple[float, tupl
     if poses < 2:
         return mean, (0.0, float("inf"))
     error = np.sqrt(((sums - mean * counts) ** 2).sum() * poses / (poses - 1)) / counts.sum()
-    reach = student_quantile(0.975, poses - 1) * float(error)
+    reach = student_quantile(1 - LEVEL / 2, poses - 1) * float(error)
     return mean, (max(mean - reach, 0.0) ** 0.5, (mean + reach) ** 0.5)
 
 
@@ -279,7 +250,7 @@ def _curve_of(table: np.recarray, variance: np.ndarray, correlation_px: float) -
     brightness, variance = brightness[use], variance[use]
     coefficients, least = np.zeros(3), 1.0
     if len(variance):
-        parts = brightness_bins(brightness, _FEWEST_PER_BIN)
+        parts = brightness_bins(brightness, FEWEST_PIXELS)
         columns = np.array([[np.mean(brightness[p] ** -k) for k in range(3)] for p in parts])
         means = np.array([max(float(variance[p].mean()), LEAST_VARIANCE) for p in parts])
         coefficients = fit_law(columns, means)
@@ -344,7 +315,7 @@ class DropoutModel(Options):
         if self.amplitude_at_half is not None:
             # No power of the share of the threshold overflows: e^-80 is nothing, e^80 a float32.
             brightest = np.exp(80 * self.width)
-            relative = (amplitude / self.amplitude_at_half).clip(min=1e-6, max=brightest)
+            relative = (amplitude / self.amplitude_at_half).clip(min=0.0, max=brightest)
             share = share + (1.0 - self.base_share) / (1.0 + relative ** (1.0 / self.width))
         if self.saturated_share is not None:
             saturated = self.saturated(amplitude)
@@ -357,9 +328,13 @@ class DropoutModel(Options):
         return amplitude >= (np.inf if level is None else level)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class DropoutMeasurement:
     """Missing and saturated pixels of a recording, among those on the target.
+
+    Without a mask, every pixel counts as on the target.
+
+    Args:
+        observed: What was read.
 
     Attributes:
         model: The probability that a pixel is missing.
@@ -376,50 +351,25 @@ class DropoutMeasurement:
         observed: What it was measured from.
     """
 
-    model: DropoutModel
-    share: float
-    saturated_share: float
-    saturated_missing: float
-    map: np.ndarray
-    border_share: float
-    centre_share: float
-    amplitude: np.ndarray
-    amplitude_recorded: bool
-    observed: Observed
-
-
-def dropouts_of(observed: Observed) -> DropoutMeasurement:
-    """Measure the missing and saturated pixels of a recording that was read.
-
-    Without a mask, every pixel counts as on the target.
-    """
-    amplitude, recorded = _amplitude_everywhere(observed)
-    saturation, stated = _saturation(observed, amplitude)
-    table, pixels = observed.table, max(observed.map_frames.sum(), 1)
-    model = _likeliest(observed, amplitude, saturation)
-    beyond = model.saturated(amplitude)
-    saturated = observed.saturated / pixels
-    if not stated:
-        saturated = table.frames[beyond].sum() / max(table.frames.sum(), 1)
-    height, width = observed.map_frames.shape
-    border = np.ones((height, width), dtype=bool)  # The outer eighth on each side.
-    border[height // 8 : height - height // 8, width // 8 : width - width // 8] = False
-    border_share, centre_share = (
-        float(observed.map_missing[where].sum() / max(observed.map_frames[where].sum(), 1))
-        for where in (border, ~border)
-    )
-    return DropoutMeasurement(
-        model=model,
-        share=float(observed.map_missing.sum() / pixels),
-        saturated_share=float(saturated),
-        saturated_missing=float(table.missing[beyond].sum() / max(table.frames.sum(), 1)),
-        map=quotient(observed.map_missing, observed.map_frames),
-        border_share=border_share,
-        centre_share=centre_share,
-        amplitude=amplitude,
-        amplitude_recorded=recorded,
-        observed=observed,
-    )
+    def __init__(self, observed: Observed) -> None:
+        self.observed, table = observed, observed.table
+        self.amplitude, self.amplitude_recorded = _amplitude_everywhere(observed)
+        saturation, stated = _saturation(observed, self.amplitude)
+        self.model = _likeliest(observed, self.amplitude, saturation)
+        beyond, frames = self.model.saturated(self.amplitude), max(table.frames.sum(), 1)
+        pixels = max(observed.map_frames.sum(), 1)
+        self.saturated_share = float(
+            observed.saturated / pixels if stated else table.frames[beyond].sum() / frames
+        )
+        self.saturated_missing = float(table.missing[beyond].sum() / frames)
+        missing, seen = observed.map_missing, observed.map_frames
+        self.map, self.share = quotient(missing, seen), float(missing.sum() / pixels)
+        height, width = seen.shape
+        border = np.ones((height, width), dtype=bool)
+        border[height // 8 : height - height // 8, width // 8 : width - width // 8] = False
+        self.border_share, self.centre_share = (
+            float(missing[where].sum() / max(seen[where].sum(), 1)) for where in (border, ~border)
+        )
 
 
 def _saturation(observed: Observed, amplitude: np.ndarray) -> tuple[float | None, bool]:
@@ -468,15 +418,11 @@ def _likeliest(observed: Observed, amplitude: np.ndarray, saturation: float | No
         return float(-(lost * np.log(sure) + (count - lost) * np.log1p(-sure)).sum())
 
     base = missing.sum() / frames.sum()
-    tried = [
-        minimize(
-            lambda x: unlikely(model(x).probability(np.exp(centre))),
-            np.array([logit(np.clip(base / 2, 1e-6, 1.0)), start, np.log(0.1)]),
-            method="Nelder-Mead",
-        )
-        for start in np.quantile(centre, (0.02, 0.1, 0.3))
-    ]
-    best = min(tried, key=lambda found: found.fun)
+    # Half of what is missing, at the median amplitude of the missing pixels.
+    start = [logit(base / 2), np.median(np.repeat(at, missing)), np.log(plain.width)]
+    best = minimize(
+        lambda x: unlikely(model(x).probability(np.exp(centre))), start, method="Nelder-Mead"
+    )
     # Half the 95 % quantile of chi-square with two degrees of freedom, for each pose with any.
     if unlikely(base) - best.fun < 3 * max(observed.losing_poses, 1):
         return plain
@@ -514,7 +460,7 @@ def _light_law(observed: Observed) -> np.ndarray:
     columns = [radius**power for power in (0, 2, 4)]
     columns += [(table.target == number) * 1.0 for number in np.unique(table.target)[1:]]
     design = np.stack(columns, axis=1)
-    signal = np.log(np.where(table.signal > 0, table.signal, np.nan))
+    signal = log_of(table.signal)
     known = np.isfinite(signal) & np.isfinite(table.amplitude) & (table.amplitude > 0)
     if known.sum() < design.shape[1]:
         return np.full(len(table), np.nan)

@@ -8,23 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofcorr.estimation.robust import student_quantile
-from tofcorr.observables.read import Observed, pose_groups, quotient
+from tofcorr.estimation.noise import BINS
+from tofcorr.estimation.robust import LEVEL, student_quantile
+from tofcorr.observables.read import FEWEST_PIXELS, Observed, pose_groups, quotient
 
 Interval = tuple[float, float]
 Random = np.random.Generator
 Pair = tuple[np.ndarray, np.ndarray]
 """One array of the recording, one of the simulated one."""
 
-# Poses and planes agree if no entry differs by more than this, metres or no unit; so do entries of
-# K, pixels. Chosen: 0.1 mm and 0.1 mrad are what files in text keep, and less than robots repeat.
-_SAME_POSE, _SAME_K = 1e-4, 1e-3
+# Poses and planes agree if no entry differs by more than this, metres or no unit. Chosen: 0.1 mm
+# and 0.1 mrad are what files in text keep, and less than robots repeat.
+_SAME_POSE = 1e-4
 # Recordings are compared pose by pose if at least this share of the real poses has a partner, and
 # pixel by pixel then; otherwise as two samples. Chosen: the rest would be lost.
 _LEAST_SHARED = 0.8
-# Groups of brightness, of equal count in both recordings together, and the fewest pixels of one in
-# either. Chosen: noise changes by less than a tenth within one; fewer say too little of its mean.
-_GROUPS, _FEWEST = 20, 50
 # Flips or permutations for a p-value: they resolve 1/1000. As many as are usual.
 _DRAWS = 999
 LEAST_P = 1 / (_DRAWS + 1)
@@ -50,7 +48,7 @@ def reach(parts: Iterable[Pair]) -> float:
         freedom = (shares**2).sum() ** 2 / max((shares**4).sum(), np.finfo(float).tiny) - 1.0
         variance, below = variance + part, below + part**2 / max(freedom, 1.0)
     freedom = variance**2 / below if below > 0 else np.inf
-    return student_quantile(0.975, freedom) * variance**0.5
+    return student_quantile(1 - LEVEL / 2, freedom) * variance**0.5
 
 
 def sign_flip_p(differences: np.ndarray, random: Random) -> float | None:
@@ -89,7 +87,7 @@ def permutation_p(real: np.ndarray, sim: np.ndarray, random: Random) -> float | 
 
 def _share_beyond(drawn: np.ndarray, observed: float) -> float:
     # The observed order is one of the possible ones. Equal values differ by rounding.
-    beyond = np.abs(drawn) >= abs(observed) * (1 - 1e-9)
+    beyond = np.abs(drawn) >= abs(observed) * (1 - np.finfo(float).eps ** 0.5)
     return float((1 + beyond.sum()) / (len(drawn) + 1))
 
 
@@ -198,9 +196,14 @@ class PoseSums:
         return sign_flip_p(real - sim, random) if self.paired else permutation_p(real, sim, random)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Matched:
     """What is compared: the same pixels of the same poses, or pixels of like brightness.
+
+    Args:
+        real: The recording.
+        sim: The simulated one.
+        amplitudes: Amplitude of each row of both tables, also of missing pixels, counts. None:
+            pixels of other poses are matched by cos / d^2, as amplitudes themselves must be.
 
     Attributes:
         real: Pixels of the recording.
@@ -212,13 +215,20 @@ class Matched:
         poses: Simulated poses by the real ones that they equal; None: other poses.
     """
 
-    real: np.recarray
-    sim: np.recarray
-    rows: np.ndarray
-    columns: np.ndarray
-    groups: Pair
-    size: int
-    poses: dict[int, int] | None
+    def __init__(self, real: Observed, sim: Observed, amplitudes: Pair | None) -> None:
+        tables = (real.table, sim.table)
+        self.poses = _shared_poses(real, sim)
+        if self.poses is not None:
+            self.rows, self.columns = _shared_pixels(*tables, self.poses)
+            alike = np.zeros(len(self.rows), dtype=np.int64)
+            self.groups, self.size = (alike, alike), 1
+        else:
+            self.rows, self.columns = (np.arange(len(table)) for table in tables)
+            names = [sorted(set(each.recording.frames.target.tolist())) for each in (real, sim)]
+            brightness = _relative_brightness(tables, amplitudes)
+            self.groups, self.size = _strata(tables, names, brightness)
+        self.real = tables[0][self.rows].view(np.recarray)
+        self.sim = tables[1][self.columns].view(np.recarray)
 
     @property
     def paired(self) -> bool:
@@ -266,36 +276,6 @@ class Matched:
         return PoseSums(total=total, count=count, left_out=changed, paired=self.paired)
 
 
-def matched(real: Observed, sim: Observed, amplitudes: Pair | None) -> Matched:
-    """Match the pixels of two recordings.
-
-    Args:
-        real: The recording.
-        sim: The simulated one.
-        amplitudes: Amplitude of each row of both tables, also of missing pixels, counts. None:
-            pixels of other poses are matched by cos / d^2, as amplitudes themselves must be.
-    """
-    tables = (real.table, sim.table)
-    poses = _shared_poses(real, sim)
-    if poses is not None:
-        rows, columns = _shared_pixels(*tables, poses)
-        alike = np.zeros(len(rows), dtype=np.int64)
-        groups, size = (alike, alike), 1
-    else:
-        rows, columns = (np.arange(len(table)) for table in tables)
-        names = [sorted(set(each.recording.frames.target.tolist())) for each in (real, sim)]
-        groups, size = _strata(tables, names, _relative_brightness(tables, amplitudes))
-    return Matched(
-        real=tables[0][rows].view(np.recarray),
-        sim=tables[1][columns].view(np.recarray),
-        rows=rows,
-        columns=columns,
-        groups=groups,
-        size=size,
-        poses=poses,
-    )
-
-
 def _shared_poses(real: Observed, sim: Observed) -> dict[int, int] | None:
     """Return the numbers of the simulated poses that equal real ones, by those of the real.
 
@@ -303,9 +283,8 @@ def _shared_poses(real: Observed, sim: Observed) -> dict[int, int] | None:
         None if the cameras differ or fewer than four fifths of the real poses were simulated.
     """
     cameras = [each.recording.camera for each in (real, sim)]
-    lenses = np.array([camera.matrix for camera in cameras])
     same_size = real.map_frames.shape == sim.map_frames.shape
-    if not same_size or np.abs(np.diff(lenses, axis=0)).max() > _SAME_K:
+    if not same_size or not np.allclose(cameras[0].matrix, cameras[1].matrix):
         return None
     places = []  # Pose and plane of the first frame of each pose, (P, 20).
     for recording in (real.recording, sim.recording):
@@ -369,20 +348,20 @@ def _strata(
 
     Returns:
         Group numbers, shapes (M,), -1 for pixels without brightness, of a target that only one
-        recording has, or of a group with fewer than 50 pixels in either; and how many there are.
+        recording has, or of a group with fewer than 100 pixels in either; and how many there are.
     """
     number = {name: k for k, name in enumerate(sorted(set(names[0]) & set(names[1])))}
-    size = _GROUPS * max(len(number), 1)
+    size = BINS * max(len(number), 1)
     groups, counts = [], []
     known = np.concatenate([values[np.isfinite(values)] for values in brightness])
-    edges = np.quantile(known, np.linspace(0, 1, _GROUPS + 1)[1:-1]) if len(known) else []
+    edges = np.quantile(known, np.linspace(0, 1, BINS + 1)[1:-1]) if len(known) else []
     for table, own, values in zip(tables, names, brightness, strict=True):
         place = np.searchsorted(edges, values)
         if number:
             of_target = np.array([number.get(name, -1) for name in own])[table.target]
-            place = np.where(of_target >= 0, of_target * _GROUPS + place, -1)
+            place = np.where(of_target >= 0, of_target * BINS + place, -1)
         groups.append(np.where(np.isfinite(values), place, -1))
         counts.append(np.bincount(groups[-1][groups[-1] >= 0], minlength=size))
-    enough = np.append((counts[0] >= _FEWEST) & (counts[1] >= _FEWEST), False)
+    enough = np.append((counts[0] >= FEWEST_PIXELS) & (counts[1] >= FEWEST_PIXELS), False)
     first, second = (np.where(enough[group], group, -1) for group in groups)
     return (first, second), size

@@ -1,8 +1,5 @@
 """Reads a recording once and keeps what noise, missing pixels and amplitude are measured from."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -19,8 +16,9 @@ LAGS, AXES = (1, 2), (1, 0)
 """Distances of the neighbours whose correlation is estimated, pixels: two tell how fast it falls,
 and with it the width of a filter. Axes of an image (H, W): along a row, and along a column."""
 
-# Images with fewer valid pixels get no surface: ten coefficients would follow their noise. Chosen.
-_LEAST_PIXELS = 100
+FEWEST_PIXELS = 100
+"""Valid pixels that an image needs for a surface, of ten coefficients, and a bin of brightness for
+a variance: it is then known to 14 %."""
 # Deviations beyond this many robust standard deviations of pixels of their brightness are no noise:
 # normal noise of an image never reaches it, mixed pixels at edges do.
 _CLIP = 6.0
@@ -41,9 +39,14 @@ def pose_groups(recording: Recording) -> list[np.ndarray]:
     return [np.array(frames) for frames in groups.values()]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Observed:
     """What was read of one recording.
+
+    Args:
+        recording: Any recording, real or simulated.
+
+    Raises:
+        CalibrationDataError: No image has 100 usable pixels, or a frame breaks the format.
 
     Attributes:
         recording: Where it comes from.
@@ -80,71 +83,47 @@ class Observed:
         saturated: How many pixels of all frames are saturated.
     """
 
-    recording: Recording
-    table: np.recarray
-    repeats: np.ndarray
-    temporal: np.ndarray
-    within: np.ndarray
-    pattern: float
-    shared: np.ndarray
-    between_frames: list[np.ndarray]
-    repeated: np.ndarray
-    map_missing: np.ndarray
-    map_frames: np.ndarray
-    losing_poses: int
-    saturated: int
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        names = sorted(set(recording.frames.target.tolist()))
+        shape = (recording.camera.height, recording.camera.width)
+        # What poses share: of residuals; of second differences and of those at each lag, by axis.
+        whole, *patterns = (_BetweenPoses(shape) for _ in range(1 + len(AXES) * (1 + len(LAGS))))
+        shared = {key: patterns.pop(0) for key in product(AXES, (0, *LAGS))}
+        self.map_missing, self.map_frames = np.zeros((2, *shape))
+        tables, sums, repeated, counts = ([] for _ in range(4))
+        self.between_frames: list[np.ndarray] = []
+        fit = _SurfaceFit(recording.camera)
+        for number, frames in enumerate(pose_groups(recording)):
+            images = _PoseImages(recording, frames[:_MOST_REPEATS], fit)
+            residual = images.residual
+            whole.add(known_mean(residual), images.weight, images.place)
+            sums.append(_of_neighbours(images, shared))
+            repeated.append(_repeated_variance(residual))
+            self.between_frames.append(_frame_differences(residual))
+            target = str(recording.frames.target[frames[0]])
+            tables.append(_rows(images, number, names.index(target), shape))
+            self.map_missing[images.place] += images.missing.sum(0)
+            self.map_frames[images.place] += images.on_target.sum(0)
+            counts.append([len(residual), images.missing.any(), images.saturated.sum()])
+        self.table = np.concatenate(tables).view(np.recarray)
+        if not np.isfinite(self.table.distance).any():
+            raise CalibrationDataError(f"{recording.path}: no image has 100 usable target pixels.")
+        self.repeats, losing, saturated = np.array(counts).T
+        self.losing_poses, self.saturated = int(losing.sum()), int(saturated.sum())
+        self.temporal, self.within = np.stack(sums, axis=1)
+        self.pattern = whole.variance()
+        self.shared = np.reshape([each.variance() for each in shared.values()], (len(AXES), -1))
+        self.repeated = np.array(repeated)
 
 
-def observe(recording: Recording) -> Observed:
-    """Read a recording.
-
-    Args:
-        recording: Any recording, real or simulated.
-
-    Raises:
-        CalibrationDataError: No image has 100 usable pixels, or a frame breaks the format.
-    """
-    names = sorted(set(recording.frames.target.tolist()))
-    shape = (recording.camera.height, recording.camera.width)
-    # What poses share: of residuals; of second differences and of those at each lag, by axis.
-    whole, *patterns = (_BetweenPoses(shape) for _ in range(1 + len(AXES) * (1 + len(LAGS))))
-    shared = {key: patterns.pop(0) for key in product(AXES, (0, *LAGS))}
-    maps = np.zeros((2, *shape))
-    tables, sums, repeated, between, counts = ([] for _ in range(5))
-    for number, images in enumerate(_iterate_poses(recording)):
-        residual = images.residual
-        whole.add(known_mean(residual), images.weight, images.place)
-        sums.append(_of_neighbours(images, shared))
-        repeated.append(_repeated_variance(residual))
-        between.append(_frame_differences(residual))
-        tables.append(_rows(images, number, names.index(images.target), shape))
-        maps[:, *images.place] += images.missing.sum(0), images.on_target.sum(0)
-        counts.append([len(residual), images.missing.any(), images.saturated.sum()])
-    table = np.concatenate(tables).view(np.recarray)
-    if not np.isfinite(table.distance).any():
-        raise CalibrationDataError(f"{recording.path}: no image has 100 usable target pixels.")
-    repeats, losing, saturated = np.array(counts).T
-    temporal, within = np.stack(sums, axis=1)
-    return Observed(
-        recording=recording,
-        table=table,
-        repeats=repeats,
-        temporal=temporal,
-        within=within,
-        pattern=whole.variance(),
-        shared=np.reshape([each.variance() for each in shared.values()], (len(AXES), -1)),
-        between_frames=between,
-        repeated=np.array(repeated),
-        map_missing=maps[0],
-        map_frames=maps[1],
-        losing_poses=int(losing.sum()),
-        saturated=int(saturated.sum()),
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _PoseImages:
     """The R frames of one pose, cut to the rectangle of h x w pixels that holds the target.
+
+    Args:
+        recording: The recording.
+        frames: Numbers of the frames, shape (R,).
+        fit: Fits surfaces to images of its camera.
 
     Attributes:
         residual: Measured distance less the smooth surface of the mean image, and less the offset
@@ -156,32 +135,11 @@ class _PoseImages:
         saturated: Pixels on the target at or above the stated saturation, shape (R, h, w), bool.
         distance: To the plane of the images, shape (h, w), metres; NaN where unknown.
         cosine: Of the angle of incidence on that plane, shape (h, w); NaN where unknown.
-        target: Name of the target.
+        second: Second differences by axis, as of `second_differences`.
         place: Rows and columns of the rectangle.
     """
 
-    residual: np.ndarray
-    weight: np.ndarray
-    amplitude: np.ndarray | None
-    on_target: np.ndarray
-    missing: np.ndarray
-    saturated: np.ndarray
-    distance: np.ndarray
-    cosine: np.ndarray
-    target: str
-    place: tuple[slice, slice]
-
-    @cached_property
-    def second(self) -> dict[int, np.ndarray]:
-        """Second differences by axis, as of `second_differences`."""
-        return {axis: second_differences(self.residual, self.amplitude, axis) for axis in AXES}
-
-
-def _iterate_poses(recording: Recording) -> Iterator[_PoseImages]:
-    """Yield the images of every pose, in the order of the first frames."""
-    fit = _SurfaceFit(recording.camera)
-    for group in pose_groups(recording):
-        frames = group[:_MOST_REPEATS]
+    def __init__(self, recording: Recording, frames: np.ndarray, fit: "_SurfaceFit") -> None:
         batches = list(iterate_frames(recording, frames))
         valid = torch.cat([batch.valid for batch in batches]).numpy()
         mask = recording.read("mask", frames)
@@ -191,36 +149,27 @@ def _iterate_poses(recording: Recording) -> Iterator[_PoseImages]:
             slice(int(seen[0]), int(seen[-1]) + 1) if len(seen) else slice(0, size)
             for seen, size in zip(sides, valid.shape[1:], strict=True)
         )
-        cut = (slice(None), rows, columns)
-        on_target, amplitude = on_target[cut], None
+        self.place, cut = (rows, columns), (slice(None), rows, columns)
+        self.on_target, self.amplitude = on_target[cut], None
         distance = torch.cat([batch.radial_distance[cut] for batch in batches]).numpy()
-        saturated = np.zeros_like(on_target)
+        self.saturated = np.zeros_like(self.on_target)
         if recording.amplitude is not None:
             strengths = [b.amplitude[cut] for b in batches if b.amplitude is not None]
-            amplitude = torch.cat(strengths).numpy()
+            self.amplitude = torch.cat(strengths).numpy()
             if recording.saturation_amplitude is not None:
-                saturated = on_target & (amplitude >= recording.saturation_amplitude)
+                full = self.amplitude >= recording.saturation_amplitude
+                self.saturated = self.on_target & full
+        self.missing = self.on_target & ~(np.isfinite(distance) & (np.nan_to_num(distance) > 0))
         usable = np.where(valid[cut], distance, np.nan)
         mean = known_mean(usable)
-        of_mean, plane_distance, cosine = fit(mean, (rows, columns))
+        of_mean, self.distance, self.cosine = fit(mean, self.place)
         around = usable - mean
         if len(usable) > 1:  # Each frame's own offset.
             known = [one[np.isfinite(one)] for one in around]
             offsets = [np.median(one) if len(one) else 0.0 for one in known]
             around = around - np.array(offsets)[:, None, None]
-        residual, weight = _clipped(around + of_mean, amplitude)
-        yield _PoseImages(
-            residual=residual,
-            weight=weight,
-            amplitude=amplitude,
-            on_target=on_target,
-            missing=on_target & ~(np.isfinite(distance) & (np.nan_to_num(distance) > 0)),
-            saturated=saturated,
-            distance=plane_distance,
-            cosine=cosine,
-            target=str(recording.frames.target[frames[0]]),
-            place=(rows, columns),
-        )
+        self.residual, self.weight = _clipped(around + of_mean, self.amplitude)
+        self.second = {k: second_differences(self.residual, self.amplitude, k) for k in AXES}
 
 
 class _SurfaceFit:
@@ -237,7 +186,7 @@ class _SurfaceFit:
         self._rays = ray_directions(camera).numpy()
         self._z = self._rays[..., 2]
         x, y = (self._rays[..., axis] / self._z for axis in (0, 1))
-        self._scale = max(float(np.abs(x).max()), float(np.abs(y).max()), 1e-6)
+        self._scale = max(float(np.abs(x).max()), float(np.abs(y).max())) or 1.0
         x, y = x / self._scale, y / self._scale
         # A plane first, then what smooth errors add to it.
         powers = [(total - k, k) for total in range(4) for k in range(total + 1)]
@@ -259,7 +208,7 @@ class _SurfaceFit:
             valid. Shape (h, w) each.
         """
         valid, unknown = np.isfinite(distance), np.full(distance.shape, np.nan)
-        if int(valid.sum()) < _LEAST_PIXELS:
+        if int(valid.sum()) < FEWEST_PIXELS:
             return unknown, unknown, unknown
         z, basis = self._z[place], np.ascontiguousarray(self._basis[:, *place])
         measured = np.where(valid, distance, 1.0)
@@ -277,7 +226,7 @@ class _SurfaceFit:
             around = np.abs(left - np.median(left[use]))
             limit = _CLIP * sigma_from_mad(float(np.median(around[use])))
             kept = valid & (around <= limit) if limit > 0 else use
-            if kept.sum() < _LEAST_PIXELS or np.array_equal(kept, use):
+            if kept.sum() < FEWEST_PIXELS or np.array_equal(kept, use):
                 break
             use = kept
         plane = fitted(basis[:3])  # 1/z = plane . (1, x, y)
@@ -307,8 +256,9 @@ def _clipped(residual: np.ndarray, amplitude: np.ndarray | None) -> tuple[np.nda
         spread[part] = sigma_from_mad(float(np.median(around))) or np.inf
     clipped, weight = np.full((2, residual.size), np.nan)
     clipped[known] = np.clip(values, -_CLIP * spread, _CLIP * spread)
-    # A group that repeats exactly has the rounding of float32 depth, 0.1 um.
-    weight[known] = 1.0 / np.where(np.isfinite(spread), spread, 1e-7) ** 2
+    # A group that repeats exactly has the rounding of float32 depth of 1 m.
+    rounding = np.finfo(np.float32).eps
+    weight[known] = 1.0 / np.where(np.isfinite(spread), spread, rounding) ** 2
     weight = known_mean(weight.reshape(residual.shape))
     return clipped.reshape(residual.shape), np.nan_to_num(weight)
 
@@ -322,6 +272,11 @@ def known_mean(images: np.ndarray) -> np.ndarray:
 def quotient(over: np.ndarray, under: np.ndarray) -> np.ndarray:
     """Return one array divided by another; NaN where that is not positive."""
     return np.divide(over, under, out=np.full(np.shape(under), np.nan), where=under > 0)
+
+
+def log_of(values: np.ndarray) -> np.ndarray:
+    """Return the logarithms of values; NaN where they are unknown or not positive."""
+    return np.log(np.where(values > 0, values, np.nan))
 
 
 def _repeated_variance(residual: np.ndarray) -> float:

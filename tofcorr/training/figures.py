@@ -30,7 +30,7 @@ def profile(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return middles of bins of a covariate, and mean and standard deviation of the error in them.
 
-    There are 30 bins; those of fewer than 30 pixels are left out: their mean is mostly noise.
+    There are 30 bins. In those of fewer than 30 pixels both are NaN: they would be mostly noise.
 
     Args:
         x: The covariate, shape (M,).
@@ -45,10 +45,10 @@ def profile(
         np.bincount(number[inside], weights, bins)
         for weights in (None, error[inside], error[inside] ** 2)
     )
-    enough = count >= 30
-    mean = total[enough] / count[enough]
-    spread = np.sqrt(np.maximum(square[enough] / count[enough] - mean**2, 0))
-    return ((edges[1:] + edges[:-1]) / 2)[enough], mean, spread
+    count = np.where(count >= 30, count, np.nan)
+    mean = total / count
+    spread = np.sqrt(np.maximum(square / count - mean**2, 0))
+    return (edges[1:] + edges[:-1]) / 2, mean, spread
 
 
 def ends_of(x: np.ndarray) -> tuple[float, float]:

@@ -126,7 +126,8 @@ def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
             shown["after_held_out"] = x[tested], sample.errors_mm["after"][tested]
         for stage, (at, error) in shown.items():
             middle, mean, _ = profile(at, error, ends)
-            for place, value in zip(middle, mean, strict=True):
+            known = np.isfinite(mean)
+            for place, value in zip(middle[known], mean[known], strict=True):
                 step = round(place * 10**power)
                 writer.add_scalar(f"error_mm_against/{name}/{stage}", value, step)
     for stage, errors in sample.errors_mm.items():
