@@ -5,7 +5,7 @@ import torch
 from comparison.evaluated import options
 from synthetic_scene import EA, Scene, make_scene, write_scene
 
-from tofcorr.comparison.experiment import Experiment, held_out_experiment
+from tofcorr.comparison.experiment import Experiment
 from tofcorr.pixels.dataset import Dataset
 
 
@@ -24,4 +24,4 @@ def dataset(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="session")
 def evaluation(dataset: Dataset) -> Experiment:
     asked = options(repeats={"number": 3, "test_fraction": 0.25})
-    return held_out_experiment("wall", dataset, asked)
+    return Experiment("wall", dataset, asked)

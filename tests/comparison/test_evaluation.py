@@ -9,7 +9,7 @@ import torch
 from comparison.evaluated import options
 from synthetic_scene import Scene, write_scene
 
-from tofcorr.comparison.experiment import Experiment, held_out_experiment
+from tofcorr.comparison.experiment import Experiment
 from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.base import Domain
@@ -69,7 +69,7 @@ def test_errors_along_the_ray_and_in_z_are_those_of_the_true_distance(
     """With the true hand-eye, measured minus true is known without any plane."""
     recording = dataset.first
     known = replace(recording, tool_from_camera=scene.truth.tool_from_camera.numpy())
-    found = held_out_experiment("wall", Dataset((known,)), options(folds=0))
+    found = Experiment("wall", Dataset((known,)), options(folds=0))
     test = found.splits["half"]["half"]
     true = ray_plane_distance(scene.rays, *planes_in_camera(scene))
     error = (torch.from_numpy(np.array(recording.depth)).double() - true)[test]
@@ -122,7 +122,7 @@ def test_without_a_robot_hand_eye_only_is_before(scene: Scene, tmp_path: Path) -
     normal, offset = (one.numpy() for one in planes_in_camera(scene))
     poses = np.repeat(np.eye(4)[None], 32, axis=0)
     still = replace(recording.frames, world_from_tool=poses, normal_world=normal, offset=offset)
-    found = held_out_experiment("wall", Dataset((replace(recording, frames=still),)), options())
+    found = Experiment("wall", Dataset((replace(recording, frames=still),)), options())
     assert not found.hand_eye_estimated
     values = found.values["folds"]["mean_abs_mm"]
     np.testing.assert_allclose(values[BEFORE], values[HAND_EYE_ONLY], rtol=1e-12)
@@ -133,7 +133,7 @@ def test_too_few_poses_are_refused_and_fits_that_do_not_converge_told(
     dataset: Dataset,
 ) -> None:
     with pytest.raises(CalibrationDataError, match="16 poses cannot be divided into 17 folds"):
-        held_out_experiment("wall", dataset, options(folds=17))
-    found = held_out_experiment("wall", dataset, options(folds=0, solver={"max_iterations": 1}))
+        Experiment("wall", dataset, options(folds=17))
+    found = Experiment("wall", dataset, options(folds=0, solver={"max_iterations": 1}))
     assert len(found.warnings) == 3
     assert "Not converged" in found.warnings[0]

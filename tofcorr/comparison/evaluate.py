@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, ScalarFormatter
 
-from tofcorr.comparison.experiment import METRICS, Experiment, held_out_experiment
+from tofcorr.comparison.experiment import METRICS, Experiment
 from tofcorr.comparison.options import (
     BEFORE,
     HAND_EYE_ONLY,
@@ -274,7 +274,7 @@ def evaluate(
         headlines = tuple(one.headline for one in inspections if one.headline)
         names = set_names([recording.path for recording in sets])
         evaluations = tuple(
-            held_out_experiment(name, one, options, inspection)
+            Experiment(name, one, options, inspection)
             for name, one, inspection in zip(names, data, inspections, strict=True)
         )
         result = EvaluationResult(evaluations, options, headlines)

@@ -8,9 +8,8 @@ which say which pixels the comparison is about.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from tofcorr.comparison.options import (
     BEFORE,
     ComparedModel,
     ComparisonOptions,
-    Splits,
     masks_of,
 )
 from tofcorr.comparison.statistics import Estimate, estimate
@@ -63,9 +61,22 @@ METRICS: dict[str, Callable[[dict[str, FrameErrors]], float]] = {
 }
 
 
-@dataclass(frozen=True)
 class Experiment:
     """Models on one set of images, each measured on frames that it was not fitted to.
+
+    Every model is measured on the same pixels: those of the recordings' masks that the options'
+    own masks leave.
+
+    Args:
+        name: The set's name.
+        dataset: The recordings.
+        options: The models, and what is held out.
+        inspection: What was odd about the recordings. Frames that disagree with all others are
+            left out, as a training leaves them out, and garbage is met as there; None: neither.
+
+    Raises:
+        CalibrationDataError: A model needs what a recording lacks, no pixel is usable, or there are
+            too few poses for the splits.
 
     Attributes:
         name: The set's name.
@@ -81,16 +92,38 @@ class Experiment:
         warnings: What limits the numbers, one sentence each.
     """
 
-    name: str
-    dataset: Dataset
-    options: ComparisonOptions
-    splits: Splits
-    skipped: dict[str, str]
-    models: list[dict[str, FittedModel]]
-    errors: dict[str, list[dict[str, dict[str, FrameErrors]]]]
-    fitter: "ModelFitter"
-    left_out: list[dict[str, Any]]
-    warnings: list[str]
+    def __init__(
+        self,
+        name: str,
+        dataset: Dataset,
+        options: ComparisonOptions,
+        inspection: Inspection | None = None,
+    ) -> None:
+        self.name, self.dataset = name, dataset
+        self.options = options.for_recordings(dataset.recordings).against_garbage(inspection)
+        # The masks alone say which pixels the splits look at.
+        usable = usable_pixels(dataset, self.options, robust=False)
+        splits, self.skipped = self.options.splits(usable)
+        frames, left_out, self.left_out = np.arange(dataset.num_frames), (), []
+        if inspection is not None:
+            drawn = [np.setdiff1d(frames, test) for own in splits.values() for test in own.values()]
+            left_out = frames_left_out(inspection, drawn)
+            self.left_out = left_out_mapping(left_out, inspection)
+            splits = {kind: without_frames(own, left_out) for kind, own in splits.items()}
+        self.splits = splits
+        self.fitter = fitter = ModelFitter(dataset, self.options, left_out)
+        self.models: list[dict[str, FittedModel]] = []
+        tests = [test for own in splits.values() for test in own.values()]
+        for test in through(tests, f"comparing {name}".strip()):
+            train = np.setdiff1d(frames, [*left_out, *test])
+            bare = {one: fitter.bare(one, train, test) for one in self.options.baselines}
+            fitted = {one.name: fitter.fit(one, train, test) for one in self.options.models}
+            self.models.append(bare | fitted)
+        in_a_row = [one for columns in self.models for one in columns.values()]
+        found = iter(held_out_errors(fitter.measured, in_a_row, self.options.device))
+        by_split = iter([{column: next(found) for column in columns} for columns in self.models])
+        self.errors = {kind: [next(by_split) for _ in own] for kind, own in splits.items()}
+        self.warnings = [*left_out_words(left_out), *fitter.warnings]
 
     @property
     def hand_eye_estimated(self) -> bool:
@@ -133,56 +166,6 @@ class Experiment:
         values = self.values[protocol][metric]
         difference = values[column] - (0.0 if less is None else values[less])
         return estimate(difference, self.options.overlap(protocol))
-
-
-def held_out_experiment(
-    name: str, dataset: Dataset, options: ComparisonOptions, inspection: Inspection | None = None
-) -> Experiment:
-    """Fit all models to the training frames of every split, and measure the frames held out.
-
-    Every model is measured on the same pixels: those of the recordings' masks that the options'
-    own masks leave.
-
-    Args:
-        name: The set's name.
-        dataset: The recordings.
-        options: The models, and what is held out.
-        inspection: What was odd about the recordings. Frames that disagree with all others are
-            left out, as a training leaves them out, and garbage is met as there; None: neither.
-
-    Raises:
-        CalibrationDataError: A model needs what a recording lacks, no pixel is usable, or there are
-            too few poses for the splits.
-    """
-    options = options.for_recordings(dataset.recordings).against_garbage(inspection)
-    # The masks alone say which pixels the splits look at.
-    splits, skipped = options.splits(usable_pixels(dataset, options, robust=False))
-    frames, left_out = np.arange(dataset.num_frames), ()
-    if inspection is not None:
-        drawn = [np.setdiff1d(frames, test) for own in splits.values() for test in own.values()]
-        left_out = frames_left_out(inspection, drawn)
-        splits = {kind: without_frames(own, left_out) for kind, own in splits.items()}
-    fitter = ModelFitter(dataset, options, left_out)
-    models, tests = [], [test for own in splits.values() for test in own.values()]
-    for test in through(tests, f"comparing {name}".strip()):
-        train = np.setdiff1d(frames, [*left_out, *test])
-        bare = {column: fitter.bare(column, train, test) for column in options.baselines}
-        models.append(bare | {one.name: fitter.fit(one, train, test) for one in options.models})
-    in_a_row = [one for columns in models for one in columns.values()]
-    found = iter(held_out_errors(fitter.measured, in_a_row, options.device))
-    by_split = iter([{column: next(found) for column in columns} for columns in models])
-    return Experiment(
-        name=name,
-        dataset=dataset,
-        options=options,
-        splits=splits,
-        skipped=skipped,
-        models=models,
-        errors={kind: [next(by_split) for _ in own] for kind, own in splits.items()},
-        fitter=fitter,
-        left_out=[] if inspection is None else left_out_mapping(left_out, inspection),
-        warnings=[*left_out_words(left_out), *fitter.warnings],
-    )
 
 
 class ModelFitter:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcorr.comparison.experiment import Experiment, held_out_experiment
+from tofcorr.comparison.experiment import Experiment
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
 from tofcorr.comparison.statistics import Ranking, Table, rank
 from tofcorr.error_terms.base import Domain
@@ -193,7 +193,7 @@ def select(
         dataset = Dataset(opened(recordings))
         planes = resolved_planes(options.planes, dataset.recordings)
         inspection = vet(dataset, planes, force=force)
-        found = held_out_experiment("", dataset, options, inspection)
+        found = Experiment("", dataset, options, inspection)
         complexity = {
             model.name: _complexity(found.options.training(model), found.fitter.domain, dataset)
             for model in found.options.models

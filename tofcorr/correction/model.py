@@ -16,7 +16,7 @@ from tofcorr.error_terms.condition_terms import Condition, in_si_units, with_mea
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import FrameError
 from tofcorr.geometry import se3
-from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
+from tofcorr.geometry.camera import DISTORTION_LENGTHS, CameraIntrinsics, DepthKind
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.geometry.se3 import product, projected, transformed
 
@@ -138,9 +138,6 @@ def _rigid(transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> Tensor
 AGREEMENT = 1e-6
 """How far runtime and exports may be from this correction in float64, metres: float32 resolves
 1e-7 m at one metre."""
-# OpenCV's longest list of distortion coefficients; shorter ones are filled with zeros, so that
-# the buffer has one shape for every camera.
-_MOST_COEFFICIENTS = 14
 
 
 def refuse_other_than_tensor(name: str, frame: object) -> None:
@@ -174,7 +171,8 @@ class CameraGeometry(nn.Module):
 
     def __init__(self, camera: CameraIntrinsics, depth_kind: DepthKind) -> None:
         super().__init__()
-        distortion = torch.zeros(_MOST_COEFFICIENTS, dtype=torch.float64)
+        # As long as OpenCV's longest list, so that the buffer has one shape for every camera.
+        distortion = torch.zeros(max(DISTORTION_LENGTHS), dtype=torch.float64)
         distortion[: len(camera.distortion)] = torch.tensor(camera.distortion)
         size = (camera.height, camera.width)
         self.register_buffer("matrix", camera.matrix_tensor())

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
-from tofcorr.drift.offset import FEWEST_PIXELS, Offset, OffsetSums, Wall
+from tofcorr.drift.offset import Offset, OffsetSums, Wall
 from tofcorr.drift.result import DriftResult, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import solvable
@@ -21,7 +21,7 @@ from tofcorr.fit.reference import (
 )
 from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.plausibility.examine import vet
-from tofcorr.plausibility.finding import CAMERA, LARGEST_GAP
+from tofcorr.plausibility.finding import CAMERA, FEWEST_PIXELS, LARGEST_GAP
 from tofcorr.progress import through
 
 # Why the equations of a check may have no solution, and what to do.

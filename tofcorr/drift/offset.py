@@ -32,13 +32,10 @@ from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import image_planes, off_the_wall, some_pixels
 from tofcorr.pixels.sample import pixels_of_image
+from tofcorr.plausibility.finding import FEWEST_PIXELS
 
 Wall = Literal["per_image", "one", "recorded"]
 """What is known of the wall: nothing; that all images show one wall; its recorded plane."""
-
-FEWEST_PIXELS = 50
-"""Usable pixels below which an image is not used. Its wall alone has three unknowns; fifty pixels
-determine them with room to spare. Set by hand, of no influence on whole images."""
 
 
 class ImageDrift(NamedTuple):

@@ -21,6 +21,9 @@ SpreadT = TypeVar("SpreadT", float, np.floating, np.ndarray, Tensor)
 # 1977).
 _HUBER = 1.345
 _CAUCHY = 2.385
+# Share of the values at either end of a range that may be stray. Chosen: a few pixels must not
+# widen the range in which a correction is valid.
+_STRAY = 1 / 1000
 # 1 / Phi^-1(3/4): half of a normal distribution lies within 0.6745 standard deviations.
 _SIGMA_PER_MAD = 1.482602218505602
 
@@ -82,6 +85,12 @@ def sigma_from_mad(median_absolute_deviation: SpreadT) -> SpreadT:
         2.9652
     """
     return _SIGMA_PER_MAD * median_absolute_deviation
+
+
+def without_strays(values: np.ndarray) -> tuple[float, float]:
+    """Return the range of values without a thousandth at either end, which may be stray pixels."""
+    low, high = np.quantile(values, (_STRAY, 1 - _STRAY)).tolist()
+    return low, high
 
 
 def robust_weights(standardised: Float[Tensor, "*S"], loss: RobustLoss) -> Float[Tensor, "*S"]:

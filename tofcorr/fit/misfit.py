@@ -30,10 +30,7 @@ from tofcorr.fit.problem import Fit, Shift
 from tofcorr.geometry.rays import moved_rays, phase_from_radial_distance, plane_in_frame, tangents
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import draw_pixels, thinned
-
-# Least shift of the hand-eye transform that is reported, metres or radians: no error of a usual
-# camera moves it by less. Chosen.
-_LEAST = 1e-3
+from tofcorr.plausibility.finding import WORTH_A_WORD
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +241,7 @@ def find_misfit(seen: MisfitPixels, fit: Fit) -> Shift | None:
             for one in group
             if (p_value := min(1.0, tried * (one.p_value or 0.0))) < LEVEL
             and bool((one.twist.abs() > half).any())
-            and max(one.size) > _LEAST
+            and max(one.size) > WORTH_A_WORD
         ]
         if counting:
             return min(counting, key=lambda one: one.p_value or 0.0)

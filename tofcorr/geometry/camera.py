@@ -17,8 +17,8 @@ Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[fl
 _MOST_PIXELS = 2**23
 """Most pixels of an image, 4096 x 2048. Five times the largest time-of-flight sensor. The sensor of
 such a camera is read within 12 s of CPU time and 2.3 GB; both grow with the pixels."""
-# The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor.
-_DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+"""The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor."""
 _FOCAL_LENGTHS = (1e-3, 1e9)
 """Shortest and longest focal length, pixels. Chosen: beyond both, the rays of all pixels are
 equal or at right angles, to rounding errors."""
@@ -39,7 +39,7 @@ def _pinhole_matrix(rows: Matrix3) -> Matrix3:
 
 
 def _opencv_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    if len(coefficients) not in _DISTORTION_LENGTHS:
+    if len(coefficients) not in DISTORTION_LENGTHS:
         raise ValueError(
             f"expected 0, 4, 5, 8, 12 or 14 coefficients in OpenCV's order, got {len(coefficients)}"
         )

@@ -252,9 +252,6 @@ SPEED_OF_LIGHT = 299_792_458.0
 # How far an error may be from a whole number of unambiguous ranges, metres. Chosen: twice what
 # errors of cameras reach; a seventh of all errors would be so near by chance at 100 MHz.
 _WRAPPED_WITHIN = 0.1
-# Share of large errors that must be wrapped so that wrapping is what they have in common. Chosen:
-# edges are some of them.
-_MOSTLY = 0.5
 
 
 def radial_distance_from_z_depth(z_depth: Tensor, ray_directions: Tensor) -> Tensor:
@@ -319,7 +316,8 @@ def range_of_wrapped(errors: np.ndarray, modulation_frequency: float | None) -> 
     """
     if modulation_frequency is None or not errors.size:
         return None
-    mostly = wrapped(errors, modulation_frequency).mean() > _MOSTLY
+    # Not all: edges are some of them.
+    mostly = wrapped(errors, modulation_frequency).mean() > 0.5
     return unambiguous_range(modulation_frequency) if mostly else None
 
 

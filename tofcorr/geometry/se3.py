@@ -6,7 +6,6 @@ well; a point a metre away moves by a millimetre, or by a centimetre. Sums of pr
 they are.
 """
 
-import math
 from typing import Annotated
 
 import numpy as np
@@ -20,16 +19,6 @@ from tofcorr.options import Number
 UNIT_LENGTH_TOLERANCE = 1e-3
 """Largest difference from 1 of the length of a quaternion, a normal or a column of a rotation (no
 unit): rounding to three digits. Part of the recording format, version 1."""
-
-# Angle in radians below which the exponential takes the series, and the number of its terms: the
-# first term left out is 2e-18 of the first one.
-_SMALL_ANGLE = 0.3
-_TERMS = 7
-# Factors of (-theta^2)^k in the series of the second and the third term, shape (terms, 2).
-_SERIES = torch.tensor(
-    [[1 / math.factorial(2 * k + first) for first in (2, 3)] for k in range(_TERMS)],
-    dtype=torch.float64,
-)
 
 
 def product(left: Tensor, right: Tensor) -> Tensor:
@@ -53,12 +42,7 @@ def by_frame(values: Tensor, matrices: Tensor, frame: Tensor) -> Tensor:
 
 
 def exp(twist: Tensor) -> Tensor:
-    r"""Return the rigid transform of a twist.
-
-    .. math:: e^X = 1 + X + \frac{1 - \cos\theta}{\theta^2} X^2
-        + \frac{\theta - \sin\theta}{\theta^3} X^3
-
-    for the matrix X of the twist and its angle theta (Lynch and Park 2017, section 3.3).
+    """Return the rigid transform of a twist: the exponential of its matrix.
 
     Args:
         twist: Translational part first, metres and radians, shape (..., 6).
@@ -67,16 +51,8 @@ def exp(twist: Tensor) -> Tensor:
         Transforms, shape (..., 4, 4).
     """
     matrix = (twist[..., None, None] * GENERATORS.to(twist)).sum(-3)
-    square = twist[..., 3:].square().sum(-1)[..., None, None]
-    small = square < _SMALL_ANGLE**2
-    # Both branches are differentiated, so the one not taken must be finite.
-    safe = torch.where(small, 1.0, square)
-    angle = safe.sqrt()
-    series = product((-square) ** torch.arange(_TERMS).to(twist), _SERIES.to(twist))
-    second = torch.where(small, series[..., :1], (1 - torch.cos(angle)) / safe)
-    third = torch.where(small, series[..., 1:], (angle - torch.sin(angle)) / (safe * angle))
-    power = product(matrix, matrix)
-    return torch.eye(4).to(twist) + (matrix + second * power + third * product(power, matrix))
+    # In float64, whose products no program asks for in fewer digits.
+    return torch.linalg.matrix_exp(matrix.double()).to(twist)
 
 
 def _generators() -> Tensor:

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tofcorr.estimation.robust import without_strays
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.measure import LEAST_VARIANCE, DropoutMeasurement, NoiseMeasurement
 from tofcorr.observables.pairs import Interval, Pair
@@ -22,7 +23,7 @@ from tofcorr.plausibility.page import (
     plain_look,
     plain_numbers,
 )
-from tofcorr.training.figures import ends_of, profile
+from tofcorr.training.figures import profile
 
 
 def drawings(observables: Observables) -> dict[str, Callable[[], Figure]]:
@@ -188,5 +189,5 @@ def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -
 def _log_ends(values: np.ndarray) -> Interval:
     """Return the range of the logarithms of some values, without stray ones."""
     logs = log_of(values)
-    low, high = ends_of(logs[np.isfinite(logs)]) if np.isfinite(logs).any() else (0.0, 0.0)
+    low, high = without_strays(logs[np.isfinite(logs)]) if np.isfinite(logs).any() else (0.0, 0.0)
     return low, high if high > low else low + 1

@@ -19,7 +19,7 @@ from tofcorr.estimation.noise import (
     mean_correlation,
     neighbour_correlation,
 )
-from tofcorr.estimation.robust import LEVEL, student_quantile
+from tofcorr.estimation.robust import LEVEL, student_quantile, without_strays
 from tofcorr.observables.read import FEWEST_PIXELS, LAGS, Observed, log_of, quotient
 from tofcorr.options import Options, PositiveNumber, Share
 
@@ -254,7 +254,7 @@ def _curve_of(table: np.recarray, variance: np.ndarray, correlation_px: float) -
         columns = np.array([[np.mean(brightness[p] ** -k) for k in range(3)] for p in parts])
         means = np.array([max(float(variance[p].mean()), LEAST_VARIANCE) for p in parts])
         coefficients = fit_law(columns, means)
-        least = float(np.quantile(brightness, 1 / 1000))  # Darker pixels are extrapolated.
+        least = without_strays(brightness)[0]  # Darker pixels are extrapolated.
     floor, shot, read = np.sqrt(coefficients).tolist()
     return NoiseModel(
         floor_m=floor,

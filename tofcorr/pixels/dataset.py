@@ -30,6 +30,7 @@ from tofcorr.data.recording import (
 )
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.robust import without_strays
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import Options
@@ -337,8 +338,6 @@ def domain_from(
 ) -> Domain:
     """Return the ranges that some pixels cover, without 0.1 % of the values at either end.
 
-    A few stray pixels must not widen the range in which a correction is valid.
-
     Args:
         camera: Gives the image size.
         radial_distance: Of the pixels, shape (M,), metres.
@@ -346,23 +345,19 @@ def domain_from(
         modulation_frequency: Of the light, Hz; None if unknown.
         conditions: Of the frames, in the order of `CONDITIONS`, shape (N, C); NaN: unknown.
     """
-
-    def interval(values: Tensor | None) -> Interval | None:
-        if values is None:
-            return None
-        return Interval(*np.quantile(values.numpy(), (0.001, 0.999)).tolist())
-
-    known = zip(CONDITIONS, conditions.unbind(1), strict=True)
-    near_and_far = interval(radial_distance)
+    normalised = None if amplitude is None else amplitude * radial_distance.square()
+    near_and_far, *others = (
+        None if values is None else Interval(*without_strays(values.numpy()))
+        for values in (radial_distance, amplitude, normalised)
+    )
     assert near_and_far is not None
+    known = zip(CONDITIONS, conditions.unbind(1), strict=True)
     return Domain(
         height=camera.height,
         width=camera.width,
         radial_distance=near_and_far,
-        amplitude=interval(amplitude),
-        normalised_amplitude=interval(
-            None if amplitude is None else amplitude * radial_distance.square()
-        ),
+        amplitude=others[0],
+        normalised_amplitude=others[1],
         modulation_frequency=modulation_frequency,
         # Of those that are known of all frames.
         conditions={

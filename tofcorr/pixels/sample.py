@@ -377,7 +377,7 @@ def usable_pixels(
     dataset = without_outliers(dataset, options.outlier_window_mm, frames)
     rays = dataset.ray_directions()
     if options.mask == "ransac":
-        dataset = dataset.without(off_largest_plane(rays, options.mask_tolerance_mm * 1e-3))
+        dataset = dataset.without(off_largest_plane(rays, options.mask_tolerance_mm / 1000))
     if options.edge_contrast is not None:
         dataset.require("amplitude", "the mask of edges (edge_contrast)")
         dataset = dataset.without(edges(options.edge_contrast))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.estimation.linear import NormalEquations, solved
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
+from tofcorr.estimation.moments import LEAST_RESIDUAL, ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.robust import robust_weights
 from tofcorr.estimation.solvers import rotation_from_normals
@@ -28,8 +28,6 @@ TINY = float(np.finfo(np.float64).tiny)
 # the distance (clocks are right to a percent, and no unit may hide in it). Chosen; against a misfit
 # of one frame of 10 mm. The hand-eye has one of a metre and a radian, wide enough for any.
 _PRIOR = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.05, 0.01], dtype=torch.float64) / 0.01
-# The least misfit that weights look at, metres. Chosen.
-_LEAST = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +198,7 @@ def _refined(scene: Scene, start: Tensor, walls: Walls | None) -> Alignment:
     # Quadratic convergence from the closed form takes five, the weights a few more.
     for _ in range(12):
         rms = MomentObjective(moments).image_losses(at).clamp(min=0).sqrt()
-        weight = robust_weights(rms / rms.quantile(0.5).clamp(min=_LEAST), "cauchy")
+        weight = robust_weights(rms / rms.quantile(0.5).clamp(min=LEAST_RESIDUAL), "cauchy")
         images = joint_image_equations(moments.weighted(weight), at, walls).total()
         pull = torch.nn.functional.pad(at.coefficients, (at.twist_size, unknowns - at.size))
         equations = images.plus(NormalEquations(images.loss, scale * pull, scale.diag()))

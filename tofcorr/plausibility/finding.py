@@ -39,6 +39,16 @@ SIGMAS = 5
 """An estimate counts from so many of its standard errors on. Chosen: of 560 estimates in 62 clean
 recordings none reached four."""
 
+WORTH_A_WORD = 1e-3
+"""Shift of a camera, or root mean square change of points, that is reported, metres: no error of a
+usual camera makes less of a difference. Chosen."""
+MANY_FRAMES = 20
+"""Frames that determine twice the unknowns of camera and errors, some thirty: three a frame.
+Chosen."""
+FEWEST_PIXELS = 50
+"""Pixels by which a distribution, or an image of a wall, is judged. Chosen: a wall has three
+unknowns."""
+
 
 @dataclass(frozen=True)
 class Finding:

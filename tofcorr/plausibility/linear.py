@@ -5,6 +5,7 @@ amplitude, and smooth errors over the image. Whoever looks for something else (a
 a drift of the poses) adds its own columns to these: a function of some lines below.
 """
 
+import math
 from copy import copy
 from functools import cached_property
 from itertools import pairwise
@@ -14,19 +15,14 @@ import numpy as np
 import torch
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.estimation.linear import Curvature
-from tofcorr.geometry.rays import moved_rays, unambiguous_range
+from tofcorr.estimation.linear import RESOLVED, Curvature
+from tofcorr.estimation.robust import without_strays
+from tofcorr.geometry.rays import moved_rays, tangents, unambiguous_range
 from tofcorr.plausibility.alignment import TINY, Alignment, Scene
-from tofcorr.plausibility.finding import CAMERA
+from tofcorr.plausibility.finding import CAMERA, MANY_FRAMES
 
 # Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
 _KNOTS = 8
-# Unknowns of the hand-eye transform, and of one frame: two tilts and the offset of its plane.
-_RIGID, _OF_A_FRAME = 6, 3
-# Fewest frames from which the shape of the image is told from the camera's errors: 30 unknowns,
-# three determined by each frame. From which a drift is: twice as many as determine 25 unknowns. And
-# from which conditions and phase are taken into account: ten determine all the rest. Chosen.
-_FEWEST_FOR_SHAPE, _FEWEST_FOR_DRIFT, _FEWEST_FOR_CONDITIONS = 11, 16, 20
 # Cosine of the angle of incidence from which the distance to the plane is computed. Chosen: 87 deg.
 _GRAZING = 0.05
 # Waves of the circular error in one unambiguous range: harmonics of four taps (Lange 2000).
@@ -115,7 +111,14 @@ class LinearResiduals:
     @property
     def rigid(self) -> np.ndarray:
         """The columns of the hand-eye transform: turns and shifts, shape (F, P, 6)."""
-        return self.columns[..., :_RIGID]
+        return self.columns[..., :6]
+
+    def frames_for(self, further: int = 0, times: int = 1) -> int:
+        """Return how many frames determine the unknowns and further ones, so many times over.
+
+        Each determines three: the offset and two tilts of its plane.
+        """
+        return math.ceil(times * (self.columns.shape[-1] + further) / 3)
 
     def with_columns(self, columns: np.ndarray, first: np.ndarray | None = None) -> Self:
         """Return the problem with further unknowns, after all that it has or after `first`."""
@@ -133,7 +136,7 @@ class LinearResiduals:
     def plane_directions(self) -> np.ndarray:
         """What offset and tilts of a frame's plane do, orthonormal over its pixels, (F, P, 3)."""
         moved = np.where(self.used[..., None], self.rigid, 0.0)
-        return np.linalg.svd(moved, full_matrices=False)[0][..., :_OF_A_FRAME]
+        return np.linalg.svd(moved, full_matrices=False)[0][..., :3]
 
     def frame_planes_off(self, left: np.ndarray) -> np.ndarray:
         """Return how far the planes of what is left (F, P) are from flat and zero, (F,), metres.
@@ -160,7 +163,7 @@ class LinearResiduals:
         scores = np.einsum("fpa,fp->fa", weighted, left) @ inverse
         # The residuals are smaller than the errors, by the unknowns that were fitted to them.
         count, error = len(self.residual), np.full(len(inverse), np.inf)
-        freedom = count - len(unknowns) / _OF_A_FRAME
+        freedom = count - len(unknowns) / 3
         if freedom > 0:
             error = np.sqrt(count / freedom * np.square(scores).sum(axis=0))
         ends = np.cumsum([self.columns.shape[-1], *(block.shape[-1] for block in blocks)])
@@ -171,9 +174,9 @@ def _hats(d: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return hat functions over the distance, which sum to one, shape (8, ...).
 
     Few pixels of a steep wall are several times as far as all others, and would take most of the
-    knots: the knots end at 2 thousandths of the pixels.
+    knots: the knots end where stray pixels may begin.
     """
-    low, high = np.quantile(d[used], [0.002, 0.998]) if used.any() else (0.0, 1.0)
+    low, high = without_strays(d[used]) if used.any() else (0.0, 1.0)
     place = ((d - low) / max(high - low, TINY)).clip(0, 1) * (_KNOTS - 1)
     return np.maximum(1 - np.abs(place - np.arange(_KNOTS)[:, None, None]), 0.0)
 
@@ -198,7 +201,7 @@ def by_conditions(conditions: np.ndarray) -> np.ndarray:
     Args:
         conditions: In the order of `CONDITIONS`, shape (F, C); NaN: unknown.
     """
-    few, found = len(conditions) < _FEWEST_FOR_CONDITIONS, []
+    few, found = len(conditions) < MANY_FRAMES, []
     for name, values in zip(CONDITIONS, conditions.T, strict=True):
         kind = condition(name)
         if not few and not kind.required and np.isfinite(values).all() and np.ptp(values) > 0:
@@ -215,7 +218,7 @@ def by_phase(problem: LinearResiduals, frequency: float | None) -> np.ndarray:
     distance, used = problem.distance, problem.used
     longest = unambiguous_range(frequency) / _WAVES[0] if frequency else np.inf
     span = np.ptp(distance[used]) if used.any() else 0.0
-    if len(distance) < _FEWEST_FOR_CONDITIONS or span < longest:
+    if len(distance) < MANY_FRAMES or span < longest:
         return np.zeros((*distance.shape, 0))
     phase = 2 * np.pi / longest * distance[..., None] * (_WAVES / _WAVES[0])
     return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
@@ -253,7 +256,8 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
           are estimated together: `left` of `kind` is what no error of a camera explains.
     """
     scene = problem.scene
-    if not scene.moves or len(scene.poses) < _FEWEST_FOR_SHAPE:
+    # The errors estimated together are nine.
+    if not scene.moves or len(scene.poses) <= problem.frames_for(9):
         return None
     rays, distance = torch.from_numpy(problem.rays), torch.from_numpy(problem.distance)
     normal = torch.from_numpy(problem.normal)[:, None].expand(rays.shape)
@@ -288,11 +292,8 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
 
 def places_on_wall(problem: LinearResiduals) -> tuple[np.ndarray, np.ndarray]:
     """Return the points' places on the target along two directions, from its middle, metres."""
-    along = np.eye(3)[np.abs(problem.scene.normal).mean(0).argmin()]
-    first = np.cross(problem.scene.normal, along)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), TINY)
-    second = np.cross(problem.scene.normal, first)
-    s, t = (np.einsum("fpa,fa->fp", problem.world, one) for one in (first, second))
+    across = tangents(torch.from_numpy(problem.scene.normal)).numpy()
+    s, t = np.einsum("fpa,fka->kfp", problem.world, across)
     return s - np.median(s[problem.used]), t - np.median(t[problem.used])
 
 
@@ -309,15 +310,15 @@ def pose_drift(problem: LinearResiduals) -> Estimate | None:
         None where there is none, there are too few frames, or no robot moves.
     """
     scene, used = problem.scene, problem.used
-    if not scene.moves or len(scene.poses) < _FEWEST_FOR_DRIFT:
+    if not scene.moves or len(scene.poses) < problem.frames_for(4, times=2):
         return None
     shifted = np.broadcast_to(scene.normal[:, None], problem.world.shape)
     turned = np.cross(problem.world - problem.world[used].mean(0), scene.normal[:, None])
     drift = np.concatenate([shifted, turned], axis=-1)
     # Unknowns of which each moves the points by as much, and independently.
     _, extent, directions = np.linalg.svd(drift[used], full_matrices=False)
-    floor = 1e-9 * extent[0]
-    each = np.where(extent > floor, np.sqrt(used.sum()) / np.maximum(extent, floor), 0.0)
+    resolved = extent > RESOLVED * extent[0]
+    each = np.where(resolved, np.sqrt(used.sum()) / np.where(resolved, extent, 1.0), 0.0)
     drift = drift @ (directions.T * each)
     when = np.linspace(-0.5, 0.5, len(scene.poses))[:, None, None]
     (found,) = problem.added(when * drift)
@@ -334,6 +335,6 @@ def length_scale(given: Alignment, problem: LinearResiduals) -> tuple[float, flo
     estimated beside errors of amplitude and place, with no other error over the distance.
     """
     longer = np.stack([problem.cosine, problem.cosine * problem.distance], axis=-1)
-    others = problem.with_columns(problem.columns[..., _RIGID + _KNOTS :], first=problem.rigid)
+    others = problem.with_columns(problem.columns[..., 6 + _KNOTS :], first=problem.rigid)
     (found,) = others.added(longer)
     return given.slope - float(found.value[-1]), float(found.error[-1])

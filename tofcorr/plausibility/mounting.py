@@ -12,23 +12,19 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.plausibility.alignment import TINY, distinct
-from tofcorr.plausibility.finding import Finding, doubtful, in_words, note
+from tofcorr.plausibility.finding import (
+    MANY_FRAMES,
+    WORTH_A_WORD,
+    Finding,
+    doubtful,
+    in_words,
+    note,
+)
 from tofcorr.plausibility.linear import LinearResiduals
 from tofcorr.plausibility.look import Look
 
-_FEWEST_FOR_STEP = 14
-"""Distinct poses from which offsets and tilts are compared. Chosen: the unknowns of camera and
-error, some twenty, and those of a step leave fourteen of the three numbers of each."""
-_FEWEST_FOR_PARTS = 20
-"""Distinct poses from which two parts are looked for. Chosen: two hand-eye transforms have twelve
-unknowns, and some parts of few frames always differ."""
-
-# Prior standard deviation of a step, metres and radians. Chosen: who moves a camera by more starts
-# a new recording; without it, parts could disagree by metres in what they do not determine.
-_PRIOR = 0.05
-# A step moves points by so many metres. Chosen.
-_LEAST_SIZE = 1e-3
 # F and the share of the sum of squares that a step must reach. At one moment: of 24 recordings of
 # 20 or 40 frames, knocked by 8 mm and a degree, all had that, F from 17 and the share from 0.76 on;
 # of 361 clean ones, or with another error, two had it.
@@ -51,9 +47,9 @@ def remounting(look: Look) -> Iterator[Finding]:
     if look.linear is None or not look.scene.moves:
         return
     frames = look.frames[look.scene.known]
-    poses = len(distinct(look.linear.scene.poses))
+    poses, fewest = len(distinct(look.linear.scene.poses)), look.linear.frames_for(times=2)
     # A drift explains what would be found.
-    drifts = look.drift is not None or poses < _FEWEST_FOR_STEP
+    drifts = look.drift is not None or poses < fewest
     mounting = None if drifts else Mounting(look.of_camera)
     if mounting is not None and (found := mounting.moment()):
         where = f"From frame {frames[found[0][0]]} on, or about there,"
@@ -62,10 +58,10 @@ def remounting(look: Look) -> Iterator[Finding]:
     elif mounting is not None and (found := mounting.parts()):
         cause = "some poses are of another frame of the robot, such as its flange"
         yield _moved(found, f"In {in_words(frames[found[0]].tolist())}", cause)
-    elif (poses := len(distinct(look.scene.poses))) < _FEWEST_FOR_PARTS:
-        unseen = f"some poses are of another frame of the robot ({_FEWEST_FOR_PARTS} are needed)"
-        if poses < _FEWEST_FOR_STEP:
-            unseen = f"the camera moved on the tool ({_FEWEST_FOR_STEP} are needed) or {unseen}"
+    elif (poses := len(distinct(look.scene.poses))) < MANY_FRAMES:
+        unseen = f"some poses are of another frame of the robot ({MANY_FRAMES} are needed)"
+        if poses < fewest:
+            unseen = f"the camera moved on the tool ({fewest} are needed) or {unseen}"
         few = f"{poses} distinct poses are too few to see whether {unseen}."
         yield note(few, check="remounting")
 
@@ -114,9 +110,12 @@ class Mounting:
         return columns - self._basis @ (self._basis.T @ columns)
 
     def _solved(self, columns: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the unknowns of columns under their prior, and its weight."""
+        """Return the unknowns of columns under their prior, and its weight.
+
+        Without it, parts could disagree by metres in what they do not determine.
+        """
         left, count = self._left, columns.shape[1]
-        prior = max(float(left @ left) / len(left), TINY) / _PRIOR**2
+        prior = max(float(left @ left) / len(left), TINY) / PRIOR_SIGMA**2
         held = np.concatenate([columns, math.sqrt(prior) * np.eye(count)])
         return np.linalg.lstsq(held, np.append(left, np.zeros(count)), rcond=None)[0], prior
 
@@ -142,7 +141,7 @@ class Mounting:
             size, share = math.sqrt(max(gained, 0.0) / smaller), gained / square
             if freedom > 0 and ratio > best:
                 best = ratio
-                sure = share > least[1] and size > _LEAST_SIZE
+                sure = share > least[1] and size > WORTH_A_WORD
                 parts = (self.frame[chosen], size, share) if sure else None
         return parts
 
@@ -160,7 +159,7 @@ class Mounting:
         if number < 2 * least:
             return None
         tried = np.unique(np.linspace(least, number - least, 41).astype(int))
-        limits = _LEAST_OTHERWISE if number < _FEWEST_FOR_PARTS else _LEAST_AT_A_MOMENT
+        limits = _LEAST_OTHERWISE if number < MANY_FRAMES else _LEAST_AT_A_MOMENT
         return self._best((np.arange(number) >= moment for moment in tried), limits)
 
     def parts(self) -> Parts | None:
@@ -170,7 +169,7 @@ class Mounting:
         those that agree best with one of many such twists are one part, and parts and twists are
         then improved in turn.
         """
-        if len(self.frame) < _FEWEST_FOR_PARTS:
+        if len(self.frame) < MANY_FRAMES:
             return None
         improved = map(self._improved, self._starts())
         return self._best((one for one in improved if one is not None), _LEAST_OTHERWISE)

@@ -155,7 +155,7 @@ def poses_from_above(look: Look, found: Inspection) -> Figure:
     first, second = np.sort(np.argsort(-np.ptp(place, axis=0))[:2])
     figure = Figure(figsize=(5, 4), layout="constrained")
     axes = figure.subplots()
-    length = max(float(np.ptp(place, axis=0).max()), 1e-3) / 8
+    length = (float(np.ptp(place, axis=0).max()) or 1.0) / 8
     across, along = place[:, first], place[:, second]
     reach = length * axis[:, [first, second]]
     # One unit of an arrow is one of the axes.
@@ -193,7 +193,7 @@ def residuals(look: Look, found: Inspection) -> Figure:
 
 def _map(figure: Figure, axes: Axes, values: np.ndarray, title: str) -> AxesImage:
     shown = axes.imshow(values)
-    figure.colorbar(shown, ax=axes, shrink=0.9)
+    figure.colorbar(shown, ax=axes)
     axes.set_title(title, fontsize=10)
     axes.set(xticks=[], yticks=[])
     return shown

@@ -26,7 +26,12 @@ from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
+from tofcorr.geometry.rays import (
+    SPEED_OF_LIGHT,
+    plane_in_frame,
+    ray_directions,
+    ray_plane_distance,
+)
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.support import (
     ENOUGH_REFLECTIVITY,
@@ -504,7 +509,7 @@ def _domain(camera: CameraIntrinsics, workspace: Workspace) -> Domain:
         radial_distance=Interval(workspace.nearest, far),
         amplitude=Interval(dark / far**2, 1 / workspace.nearest**2),
         normalised_amplitude=Interval(dark, 1.0),
-        modulation_frequency=20e6,
+        modulation_frequency=SPEED_OF_LIGHT / (2 * far),
         conditions=dict.fromkeys(CONDITIONS, (0.0, 1.0, 0.5)),
     )
 

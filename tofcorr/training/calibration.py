@@ -105,16 +105,13 @@ def calibrate(
         "after": fitted.model,
     }
     errors = frame_errors(data, stages, device=options.device)
-    found = Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
-    if not fitted.solution.parameters.hand_eye_is_free:
-        return found
-    with thread_number(1):
-        seen = misfit_pixels(data, fitted, found.frames)
-        if seen is None:
-            return found
-        assumed = assumptions(seen, fitted)
-        misfit = find_misfit(seen, fitted)
-    return replace(found, fit=replace(fitted, misfit=misfit, assumptions=assumed))
+    if fitted.solution.parameters.hand_eye_is_free:
+        with thread_number(1):
+            seen = misfit_pixels(data, fitted, np.union1d(train, test))
+            if seen is not None:
+                assumed, misfit = assumptions(seen, fitted), find_misfit(seen, fitted)
+                fitted = replace(fitted, misfit=misfit, assumptions=assumed)
+    return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
 
 
 def without_correction(domain: Domain, tool_from_camera: Tensor) -> CalibrationModel:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tofcorr.estimation.robust import without_strays
 from tofcorr.pixels.passes import frame_errors
 from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
 from tofcorr.training.calibration import Calibration
@@ -35,10 +36,10 @@ def profile(
     Args:
         x: The covariate, shape (M,).
         error: The error of each pixel, shape (M,); NaN is left out.
-        ends: Range of the covariate; None: see `ends_of`.
+        ends: Range of the covariate; None: see `without_strays`.
     """
     bins = 30
-    edges = np.linspace(*(ends or ends_of(x)), bins + 1)
+    edges = np.linspace(*(ends or without_strays(x)), bins + 1)
     number = np.digitize(x, edges) - 1
     inside = (number >= 0) & (number < bins) & np.isfinite(error)
     count, total, square = (
@@ -49,12 +50,6 @@ def profile(
     mean = total / count
     spread = np.sqrt(np.maximum(square / count - mean**2, 0))
     return (edges[1:] + edges[:-1]) / 2, mean, spread
-
-
-def ends_of(x: np.ndarray) -> tuple[float, float]:
-    """Return the range of a covariate without the outermost thousandth at either end."""
-    low, high = np.quantile(x, (1 / 1000, 1 - 1 / 1000))
-    return float(low), float(high)
 
 
 def coloured(image: np.ndarray, limit: float) -> np.ndarray:
@@ -132,7 +127,7 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
     figure = Figure(figsize=(11, 4), layout="constrained")
     panels = figure.subplots(1, 2)
     x, last = sample.covariates[covariate], list(sample.errors_mm.values())[-1]
-    ends, tested = ends_of(x), np.isin(sample.frame, held_out)
+    ends, tested = without_strays(x), np.isin(sample.frame, held_out)
     for stage, error in sample.errors_mm.items():
         label, colour = _STAGES.get(stage, (stage, "k"))
         draw_profile(panels[0], x, error, colour, label)
@@ -166,11 +161,13 @@ def draw_profile(
         error: The error of each pixel, shape (M,).
         colour: Of line and band.
         label: Of the line.
-        ends: Range of the covariate; None: see `ends_of`.
+        ends: Range of the covariate; None: see `without_strays`.
     """
+    from tofcorr.plausibility.page import FAINT
+
     middle, mean, spread = profile(x, error, ends)
     axes.plot(middle, mean, color=colour, label=label)
-    axes.fill_between(middle, mean - spread, mean + spread, color=(colour, 0.2), linewidth=0)
+    axes.fill_between(middle, mean - spread, mean + spread, color=(colour, FAINT), linewidth=0)
 
 
 def residual_figure(calibration: Calibration) -> "Figure":

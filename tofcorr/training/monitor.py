@@ -12,12 +12,13 @@ import torch
 
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.regularisation import total_weight
+from tofcorr.estimation.robust import without_strays
 from tofcorr.estimation.solvers import Solution
 from tofcorr.geometry import se3
 from tofcorr.pixels.sample import sample_pixels
 from tofcorr.progress import event_writer
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.figures import ends_of, error_picture, profile
+from tofcorr.training.figures import error_picture, profile
 from tofcorr.training.judgement import report_text
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
     sample = sample_pixels(calibration.data, calibration.stages, calibration.frames)
     tested = np.isin(sample.frame, calibration.test)
     for covariate, x in sample.covariates.items():
-        low, high = ends = ends_of(x)
+        low, high = ends = without_strays(x)
         # TensorBoard counts steps in whole numbers, so a covariate is multiplied by the power of
         # ten that the tag names, until its range has 300 of them: bins stay apart.
         power = max(math.ceil(math.log10(300 / max(high - low, sys.float_info.epsilon))), 0)

@@ -52,6 +52,8 @@ def recording_support(
         frames: Global numbers of the frames.
         tool_from_camera: The hand-eye transform, shape (4, 4).
     """
+    from scipy.stats import circstd  # Slow to import.
+
     names = "world_from_tool", "normal_world", "offset"
     world_from_tool, normal_world, offset = (dataset.column(name)[frames] for name in names)
     world_from_camera = world_from_tool @ tool_from_camera
@@ -60,7 +62,7 @@ def recording_support(
     roll = _roll(world_from_camera, normal_world)
     return Support(
         _tilt(normal),
-        _circular_spread_deg(roll) if dataset.moves else None,
+        math.degrees(circstd(roll.numpy())) if dataset.moves else None,
         (float(distance.min()), float(distance.max())),
         _reflectivity_ratio(dataset, frames, tool_from_camera) if dataset.has_amplitude else None,
     )
@@ -133,12 +135,6 @@ def _tilt(normals: Tensor) -> tuple[float, float]:
     values = torch.linalg.eigvalsh(centred.T @ centred / max(len(normals) - 1, 1)).clamp(min=0)
     weak, strong = values[-2:].sqrt().tolist()
     return math.degrees(strong), math.degrees(weak)
-
-
-def _circular_spread_deg(angles: Tensor) -> float:
-    least = torch.finfo(angles.dtype).eps
-    resultant = torch.polar(torch.ones_like(angles), angles).mean().abs().clamp(least, 1.0)
-    return math.degrees(math.sqrt(abs(2 * math.log(float(resultant)))))
 
 
 def _reflectivity_ratio(

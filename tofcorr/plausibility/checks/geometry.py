@@ -122,7 +122,7 @@ def _far_off(look: Look) -> np.ndarray:
 def _range_in_words(frequency: float) -> str:
     """Return the unambiguous range of a modulation frequency (Hz), to follow "off by"."""
     multiples = multiples_in_words(unambiguous_range(frequency))
-    return f"{multiples} of {1e-6 * frequency:.4g} MHz"
+    return f"{multiples} of {frequency / 1_000_000:.4g} MHz"
 
 
 def _wrapping(look: Look) -> Iterator[Finding]:

@@ -10,6 +10,8 @@ from tofcorr.geometry.rays import lens_misses
 from tofcorr.plausibility.alignment import TINY, distinct
 from tofcorr.plausibility.finding import (
     CAMERA,
+    FEWEST_PIXELS,
+    WORTH_A_WORD,
     Finding,
     doubtful,
     impossible,
@@ -18,8 +20,6 @@ from tofcorr.plausibility.finding import (
 )
 from tofcorr.plausibility.look import Look
 
-# Fewest values by which a distribution is judged. Chosen.
-_FEWEST_VALUES = 50
 # Percent of one value from which it counts as a limit of the camera: clipped depth, saturated
 # amplitude. Chosen.
 _COMMON = 1
@@ -80,7 +80,7 @@ def depth_values(look: Look) -> Iterator[Finding]:
             "masked out.",
             frames,
         )
-    if len(values) >= _FEWEST_VALUES:
+    if len(values) >= FEWEST_PIXELS:
         yield from _repeated_or_rounded(values)
 
 
@@ -220,11 +220,12 @@ def amplitude(look: Look) -> Iterator[Finding]:
         return
     usable = np.isfinite(look.amplitude) & np.isfinite(look.stored)
     values, depth = look.amplitude[usable], look.stored[usable]
-    if len(values) < _FEWEST_VALUES:
+    if len(values) < FEWEST_PIXELS:
         return
-    low, median, high = np.quantile(values, [0.05, 0.5, 0.95])
+    median = np.median(values)
+    spread = sigma_from_mad(np.median(np.abs(values - median)))
     percent = 100 * float((values >= values.max()).mean())
-    if 1000 * (high - low) <= max(median, TINY):
+    if 1000 * spread <= max(median, TINY):
         sentence = (
             f"The amplitude is {median:.4g} nearly everywhere: it was not measured; remove "
             "amplitude.npy, and use a model without an intensity term."
@@ -415,6 +416,6 @@ def _moment(pattern: np.ndarray, fewest: int) -> int | None:
         )
         both = float(one @ other)
         correlation = 100 * both / max(math.sqrt(float((one @ one) * (other @ other))), TINY)
-        if correlation > best and 1e6 * both > pixels:
+        if correlation > best and both > pixels * WORTH_A_WORD**2:
             best, found = correlation, int(moment)
     return found
