@@ -92,11 +92,11 @@ def recorded_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Foun
     # A wall has three unknowns, and one image determines about three: fewer than three images
     # contribute little to the other unknowns.
     for place in np.flatnonzero(count < (1 if dataset.planes_are_estimated else 3))[:1]:
-        said = "unknown needs at least 3 images of each wall (target and plane in frames.csv)"
-        said = f"{said}, '{names[numbers[place]]}' has {count[place]}"
-        raise CalibrationDataError(
-            f"{dataset.first.path}: planes: {said}. Record more, or measure."
+        said = (
+            "planes: unknown needs at least 3 images of each wall (target and plane in frames.csv)"
         )
+        said = f"{said}, '{names[numbers[place]]}' has {count[place]}"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}. Record more, or measure.")
     columns = "normal_world", "offset", "world_from_tool"
     normal, offset, pose = (dataset.column(name)[frames] for name in columns)
     walls = Walls(normal[first], offset[first], torch.from_numpy(index), pose)

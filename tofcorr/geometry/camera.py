@@ -40,9 +40,8 @@ def _pinhole_matrix(rows: Matrix3) -> Matrix3:
 
 def _opencv_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
     if len(coefficients) not in DISTORTION_LENGTHS:
-        raise ValueError(
-            f"expected 0, 4, 5, 8, 12 or 14 coefficients in OpenCV's order, got {len(coefficients)}"
-        )
+        lengths = ", ".join(map(str, DISTORTION_LENGTHS))
+        raise ValueError(f"expected {lengths} coefficients as of OpenCV, got {len(coefficients)}")
     return coefficients
 
 
@@ -84,10 +83,8 @@ class CameraIntrinsics:
 
 def _bounded(size: _SizeT) -> _SizeT:
     if size.width * size.height > _MOST_PIXELS:
-        raise ValueError(
-            f"an image of {size.width} x {size.height} pixels is larger than any that is read "
-            f"here: at most {_MOST_PIXELS} pixels"
-        )
+        given = f"an image of {size.width} x {size.height} pixels is larger than any that is read"
+        raise ValueError(f"{given} here: at most {_MOST_PIXELS} pixels")
     return size
 
 

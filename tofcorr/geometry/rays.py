@@ -328,10 +328,9 @@ def phase_from_radial_distance(radial_distance: Tensor, modulation_frequency: fl
 
 def _check_sizes(distances: Tensor, ray_directions: Tensor, name: str) -> None:
     if distances.shape[-2:] != ray_directions.shape[:2]:
-        raise ValueError(
-            f"{name} and ray_directions must share (H, W): got {list(distances.shape[-2:])} and "
-            f"{list(ray_directions.shape[:2])}. Were the rays built for another resolution or crop?"
-        )
+        got = f"got {list(distances.shape[-2:])} and {list(ray_directions.shape[:2])}"
+        why = "Were the rays built for another resolution or crop?"
+        raise ValueError(f"{name} and ray_directions must share (H, W): {got}. {why}")
 
 
 def multiples_in_words(size: float) -> str:

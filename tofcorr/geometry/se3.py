@@ -52,7 +52,8 @@ def exp(twist: Tensor) -> Tensor:
     """
     matrix = (twist[..., None, None] * GENERATORS.to(twist)).sum(-3)
     # In float64, whose products no program asks for in fewer digits.
-    return torch.linalg.matrix_exp(matrix.double()).to(twist)
+    found = torch.linalg.matrix_exp(matrix.double()).to(twist)
+    return assemble(found[..., :3, :3], found[..., :3, 3])
 
 
 def _generators() -> Tensor:
@@ -144,12 +145,10 @@ def refuse_unless_rigid(matrix: np.ndarray, tolerance: float = UNIT_LENGTH_TOLER
         raise ValueError("the last row of a rigid transform is 0 0 0 1")
     rotation = matrix[:3, :3]
     # Entries above 2 cannot belong to a rotation, and their squares may overflow.
-    if np.abs(rotation).max() > 2 or (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * tolerance
-    ):
-        raise ValueError(
-            f"the upper left 3x3 block must be a rotation: orthonormal, to {tolerance:g}"
-        )
+    small = np.abs(rotation).max() <= 2
+    if not small or np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * tolerance:
+        said = f"the upper left 3x3 block must be a rotation: orthonormal, to {tolerance:g}"
+        raise ValueError(said)
     if np.linalg.det(rotation) < 0:
         raise ValueError("the upper left 3x3 block is a reflection, not a rotation")
 

@@ -58,18 +58,15 @@ class Dataset:
         first, *others = self.recordings
         for other in others:
             for name in ("camera", "depth_kind", "modulation_frequency"):
-                if getattr(other, name) != getattr(first, name):
-                    raise CalibrationDataError(
-                        f"{other.path}: its {name} is {getattr(other, name)}, that of "
-                        f"{first.path} is {getattr(first, name)}; recordings that are calibrated "
-                        "together come from one camera in one setting."
-                    )
-
+                one, its = getattr(first, name), getattr(other, name)
+                if its != one:
+                    differ = f"its {name} is {its}, that of {first.path} is {one}"
+                    need = "recordings that are calibrated together come from one camera"
+                    raise CalibrationDataError(f"{other.path}: {differ}; {need} in one setting.")
             if other.frame_names.eye_to_hand != first.frame_names.eye_to_hand:
-                raise CalibrationDataError(
-                    f"{other.path}: the camera stands still in one of this and {first.path}, and "
-                    "the robot carries it in the other; their hand-eye transforms differ."
-                )
+                differ = f"the camera stands still in one of this and {first.path}, and not in the"
+                said = f"{differ} other; their hand-eye transforms differ"
+                raise CalibrationDataError(f"{other.path}: {said}.")
 
     @property
     def first(self) -> Recording:
@@ -270,10 +267,9 @@ def split_frames(dataset: Dataset, options: SplitOptions) -> tuple[np.ndarray, n
     held_out = np.isin(group, poses[: round(options.test_fraction * len(poses))])
     test, train = np.flatnonzero(held_out), np.flatnonzero(~held_out)
     if len(train) < 3:  # The covariance leaves out one pose of at least three.
-        raise CalibrationDataError(
-            f"{dataset.first.path}: {len(train)} of {dataset.num_frames} frames are left to train "
-            "on, 3 are needed; record more, or set split.test_fraction to 0."
-        )
+        left = f"{len(train)} of {dataset.num_frames} frames are left to train on, 3 are needed"
+        advice = "record more, or set split.test_fraction to 0"
+        raise CalibrationDataError(f"{dataset.first.path}: {left}; {advice}.")
     return train, test
 
 
@@ -285,10 +281,9 @@ def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
     """
     group, poses = _poses(dataset, seed)
     if len(poses) < num_folds:
-        raise CalibrationDataError(
-            f"{dataset.first.path}: {len(poses)} poses cannot be divided into {num_folds} folds; "
-            "record more, or ask for fewer folds."
-        )
+        said = f"{len(poses)} poses cannot be divided into {num_folds} folds"
+        advice = "record more, or ask for fewer folds"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
     return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(poses, num_folds)]
 
 
@@ -316,10 +311,9 @@ def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Doma
         ]
     distance, amplitude = torch.cat(parts, dim=1)
     if not distance.numel():
-        raise CalibrationDataError(
-            f"{first.path}: no pixel of the {len(frames)} frames asked for is usable; "
-            "check mask.npy, saturation_amplitude and the unit of depth.npy (metres)."
-        )
+        advice = "check mask.npy, saturation_amplitude and the unit of depth.npy (metres)"
+        said = f"no pixel of the {len(frames)} frames asked for is usable; {advice}"
+        raise CalibrationDataError(f"{first.path}: {said}.")
     return domain_from(
         first.camera,
         distance,

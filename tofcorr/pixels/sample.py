@@ -165,10 +165,8 @@ class PixelSample:
         """
         labels = {label.split(" [")[0]: label for label in self.covariates}
         if name not in labels:
-            raise CalibrationDataError(
-                f"There is no covariate '{name}' to draw errors against; this recording has: "
-                f"{', '.join(labels)}."
-            )
+            has = f"this recording has: {', '.join(labels)}"
+            raise CalibrationDataError(f"There is no covariate '{name}' to draw against; {has}.")
         return labels[name]
 
 
@@ -317,10 +315,9 @@ def without_outliers(
     ]
     finite = torch.cat([own[own.isfinite()] for own in errors])
     if not finite.numel():
-        raise CalibrationDataError(
-            f"{dataset.first.path}: outlier_window_mm needs pixels that look at their plane, and "
-            "there are none; check the planes in frames.csv and tool_from_camera."
-        )
+        said = "outlier_window_mm needs pixels that look at their plane, and there are none"
+        advice = "check the planes in frames.csv and tool_from_camera"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
     centre = float(np.median(finite.numpy()))
     return dataset.without(outside_window(rays, transform, centre, window_mm / 1e3))
 
@@ -369,11 +366,9 @@ def usable_pixels(
             within `outlier_window_mm`; or that is set and the planes are estimated.
     """
     if options.outlier_window_mm is not None and dataset.planes_are_estimated:
-        raise CalibrationDataError(
-            f"{dataset.first.path}: outlier_window_mm compares with the recorded planes, and these "
-            "are estimated from the depth (recording.yaml: planes); use weights.robust or mask: "
-            "ransac instead."
-        )
+        said = "outlier_window_mm compares with planes, and these are estimated from the depth"
+        advice = "use weights.robust or mask: ransac instead"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
     dataset = without_outliers(dataset, options.outlier_window_mm, frames)
     rays = dataset.ray_directions()
     if options.mask == "ransac":

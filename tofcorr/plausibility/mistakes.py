@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tofcorr.plausibility.alignment import Alignment, Scene, align, align_with_free_walls
+from tofcorr.plausibility.alignment import Alignment, Scene, align_with_free_walls
 from tofcorr.plausibility.finding import CAMERA, FAR_OFF, SPOILS
 from tofcorr.plausibility.look import Look
 
@@ -190,31 +190,13 @@ def _of_planes(look: Look) -> Iterator[tuple[str, str, Scene | Alignment | None]
         yield f"the planes' offsets d are in {unit}", "write d in metres", in_metres
     free = align_with_free_walls(scene)
     yield WRONG_PLANES, "measure them again, or train with `planes: unknown`", free
-    if scene.moves:
-        cause = "two cameras, or one camera mounted twice, are in one recording"
-        yield cause, "split it where the camera was changed", _in_two_parts(look)
-    else:
+    if not scene.moves:
         yield (
             "the planes are not in the camera's frame, which a recording without robot poses asks "
             "for",
             "write the planes in camera coordinates, or the robot's poses",
             look.aligned(replace(scene, moves=True)),
         )
-
-
-def _in_two_parts(look: Look) -> Alignment | None:
-    """Return the alignment of the two sides of a cut, each by itself, at the best of some cuts.
-
-    Either side has six frames at least: seven unknowns, three from a frame.
-    """
-    number, found = np.arange(len(look.scene.poses)), []
-    for twelfths in (6, 3, 9, 4, 8):
-        before = number < round(twelfths * len(number) / 12)
-        if min(before.sum(), (~before).sum()) >= 6:
-            one, other = (align(look.scene.some(part)) for part in (before, ~before))
-            rms, angle = np.append(one.rms, other.rms), np.append(one.angle, other.angle)
-            found.append(Alignment(np.eye(4), 0.0, 0.0, rms, angle))
-    return min(found, key=lambda one: one.misfit, default=None)
 
 
 def _of_images(look: Look) -> Iterator[tuple[str, str, Scene]]:

@@ -68,13 +68,10 @@ def remounting(look: Look) -> Iterator[Finding]:
 
 def _moved(found: Parts, where: str, cause: str) -> Finding:
     _, size, share = found
-    return doubtful(
-        f"{where} the points lie {1e3 * size:.0f} mm elsewhere, as if the camera had moved "
-        f"on the tool (two hand-eye transforms explain {100 * share:.0f} % of what one "
-        f"leaves): {cause}; train the parts apart.",
-        spoils=True,
-        check="remounting",
-    )
+    moved = f"{where} the points lie {1e3 * size:.0f} mm elsewhere, as if the camera had moved"
+    said = f"{moved} on the tool (two hand-eye transforms explain {100 * share:.0f} % of what one"
+    said = f"{said} leaves): {cause}; train the parts apart."
+    return doubtful(said, spoils=True, check="remounting")
 
 
 class Mounting:

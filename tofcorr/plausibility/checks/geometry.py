@@ -6,6 +6,7 @@ shows how many pass.
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,12 +55,9 @@ def lone_walls(look: Look) -> Iterator[Finding]:
     remedy = "measure the planes, or record the poses of a robot"
     if look.data.moves:
         remedy = "give all frames of one wall the same nx, ny, nz, d and target in frames.csv"
-    yield impossible(
-        f"{few.sum()} of {len(wall)} frames have a plane that fewer than 3 frames share, "
-        "and the planes are to be estimated: a fit could place each wall where its "
-        f"frame measured it, and would leave no error at all; {remedy}.",
-        check="lone_walls",
-    )
+    said = f"{few.sum()} of {len(wall)} frames have a plane that fewer than 3 frames share"
+    error = "a fit of the planes could place each where its frame measured it, without any error"
+    yield impossible(f"{said}: {error}; {remedy}.", check="lone_walls")
 
 
 def garbage(look: Look) -> Iterator[Finding]:
@@ -67,12 +65,9 @@ def garbage(look: Look) -> Iterator[Finding]:
     if not look.scene.known.any():
         return
     if look.flatness > HOPELESS:
-        yield Finding(
-            "impossible" if look.fits else "doubtful",
-            f"The points of a frame lie {1e3 * look.flatness:.0f} mm off a plane of their own: the "
-            "target is not flat, the mask shows something else, or the depth is decoded "
-            "wrongly.",
-        )
+        said = f"The points of a frame lie {1e3 * look.flatness:.0f} mm off a plane of their own"
+        why = "the target is not flat, the mask shows something else, or the depth is misread"
+        yield Finding("impossible" if look.fits else "doubtful", f"{said}: {why}.")
         return
     share, bent, dominated = garbage_of(look)
     if 1000 * share < 3 and not bent:
@@ -87,11 +82,8 @@ def garbage(look: Look) -> Iterator[Finding]:
             "`tofcorr train`, `evaluate` and `select` leave them out, unless their configuration "
             "says which pixels count; mask.npy does so for every command"
         )
-    yield Finding(
-        "doubtful" if bent else "note",
-        f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane "
-        f"of their frame: {what}; {advice}.",
-    )
+    said = f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane"
+    yield Finding("doubtful" if bent else "note", f"{said} of their frame: {what}; {advice}.")
 
 
 def garbage_of(look: Look) -> tuple[float, bool, bool]:
@@ -143,14 +135,12 @@ def _wrapping(look: Look) -> Iterator[Finding]:
     share = float(wrapped(errors, frequency).mean()) if len(errors) else 0.0
     if 10 * share < 1 or range_of_wrapped(errors[np.abs(errors) > FAR_OFF], frequency) is None:
         return
-    yield Finding(
-        "impossible" if look.fits else "doubtful",
-        f"{100 * share:.0f} % of the pixels are off the recorded planes by "
-        f"{_range_in_words(frequency)}: they show targets beyond it. Mask them, or record nearer "
-        "than that.",
-        spoils=True,
-        check="wrapping",
+    severity = "impossible" if look.fits else "doubtful"
+    by = f"{100 * share:.0f} % of the pixels are off the recorded planes by "
+    said = (
+        f"{by}{_range_in_words(frequency)}: they show targets beyond it. Mask them, or go nearer."
     )
+    yield Finding(severity, said, spoils=True, check="wrapping")
 
 
 def normals(look: Look) -> Iterator[Finding]:
@@ -166,11 +156,9 @@ def normals(look: Look) -> Iterator[Finding]:
         return
     frames = tuple(look.frames[away].tolist())
     which = "all frames" if len(away) == len(found.angle) else in_words(frames)
-    yield impossible(
-        f"The normals of the planes point away from the camera in {which}, by "
-        f"{np.degrees(np.median(found.angle[away])):.0f} degrees: write -nx, -ny, -nz, -d.",
-        frames,
-    )
+    off = f"{np.degrees(np.median(found.angle[away])):.0f} degrees"
+    said = f"The normals of the planes point away from the camera in {which}, by {off}"
+    yield impossible(f"{said}: write -nx, -ny, -nz, -d.", frames)
 
 
 def shape(look: Look) -> Iterator[Finding]:
@@ -188,12 +176,13 @@ def shape(look: Look) -> Iterator[Finding]:
     share = float(kind.value[0])
     # 0 is the declared one, 1 the other one, from which it is so many standard errors.
     if 2 * SIGMAS * kind.size_error < 1 and abs(share - 1) < 0.5:
-        yield impossible(
-            f"recording.yaml says depth_kind: {declared}, but walls are bent as if the depth were "
-            f"{other} ({100 * share:.0f} % of the difference, standard error "
-            f"{100 * kind.size_error:.0f} %); write depth_kind: {other}.",
-            check="kind",
+        sure = (
+            f"{100 * share:.0f} % of the difference, standard error {100 * kind.size_error:.0f} %"
         )
+        said = (
+            f"recording.yaml says depth_kind: {declared}, but walls are bent as if it were {other}"
+        )
+        yield impossible(f"{said} ({sure}); write depth_kind: {other}.", check="kind")
         return
     wrong = _wrong_camera(look.shape)
     yield from _curved(look, look.shape["curvature"]) if wrong is None else [wrong]
@@ -244,15 +233,11 @@ def _wrong_camera(found: dict[str, Estimate]) -> Finding | None:
     first, second = 100 * one.value[0], 100 * one.value[-1]
     longer, out = ("longer", "out") if first > 0 else ("shorter", "in")
     better = words.format(size=abs(first), first=first, second=second, longer=longer, out=out)
-    return Finding(
-        # With a quarter more it is another camera's.
-        "impossible" if name == "focal" and 4 * one.size > 1 else "doubtful",
-        f"Walls fit better if {better} (standard error {100 * one.size_error:.1f} %): are K and "
-        "distortion of this camera, of this resolution and crop, and of images as they are here, "
-        "rectified or not?",
-        spoils=True,
-        check=check,
-    )
+    # With a quarter more it is another camera's.
+    severity = "impossible" if name == "focal" and 4 * one.size > 1 else "doubtful"
+    said = f"Walls fit better if {better} (standard error {100 * one.size_error:.1f} %)"
+    ask = "are K and distortion of this camera, resolution and crop, and of images rectified or not"
+    return Finding(severity, f"{said}: {ask}, as these are?", spoils=True, check=check)
 
 
 def _curved(look: Look, found: Estimate) -> Iterator[Finding]:
@@ -262,12 +247,11 @@ def _curved(look: Look, found: Estimate) -> Iterator[Finding]:
     curvature = np.abs(found.value)
     sag = curvature * half_width**2
     if ((sag > SPOILS) & (curvature > SIGMAS * found.error)).any():
-        yield doubtful(
-            f"The target is bent by {1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of "
-            "its middle, from wherever it is seen: use a flat one, or mask what is not.",
-            spoils=True,
-            check="target",
+        where = f"{1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of its middle"
+        said = (
+            f"The target is bent by {where}, from wherever it is seen: use a flat one, or mask it."
         )
+        yield doubtful(said, spoils=True, check="target")
 
 
 def drift(look: Look) -> Iterator[Finding]:
@@ -275,12 +259,11 @@ def drift(look: Look) -> Iterator[Finding]:
     found = look.drift
     if found is not None:
         # Frames miss their planes by a quarter of it in the middle of each half.
-        meaningless = found.size > 4 * CAMERA
+        size = f"{1e3 * found.size:.0f} mm (standard error {1e3 * found.size_error:.0f} mm)"
         yield Finding(
-            "impossible" if meaningless else "doubtful",
-            f"From the first frame to the last the points move {1e3 * found.size:.0f} mm off the "
-            f"recorded planes (standard error {1e3 * found.size_error:.0f} mm): the poses drift, "
-            "or robot, target or camera was moved while recording; record again, or in parts.",
+            "impossible" if found.size > 4 * CAMERA else "doubtful",
+            f"From first to last frame the points move {size} off the recorded planes: the poses "
+            "drift, or robot, target or camera was moved; record again, or in parts.",
         )
 
 
@@ -305,16 +288,16 @@ def agreement(look: Look) -> Iterator[Finding]:
     if named:
         yield _explained(look, named)
     elif excess > (CAMERA if look.shape is None else fine):
-        # A camera that moved on the tool explains it, unless by far too much.
-        moved = [] if excess > HOPELESS else list(remounting(look))
+        # A camera that moved on the tool explains it; by far, one fit to both parts is meaningless.
+        moved = list(remounting(look))
+        if given.badness > CAMERA:
+            moved = [replace(one, severity="impossible") for one in moved if one.spoils]
         yield from moved or list(_wrapping(look)) or [_unexplained(look, excess)]
     else:
         yield from _scale(look)
         if large:
-            yield note(
-                f"The distances are {1e3 * given.constant:+.0f} mm off on the whole, much for a "
-                "camera: is this the depth of the target, and in metres?"
-            )
+            said = f"The distances are {1e3 * given.constant:+.0f} mm off on the whole"
+            yield note(f"{said}, much for a camera: are they of the target, and in metres?")
 
 
 def _excess(look: Look) -> float:
@@ -344,18 +327,15 @@ def _explained(look: Look, named: "list[Explanation]") -> Finding:
     meaningless = given.badness > CAMERA
     if cause == WRONG_PLANES:
         meaningless = given.badness > HOPELESS or math.degrees(given.typical_angle) > 15
-    return Finding(
-        "impossible" if meaningless else "doubtful",
-        f"{_misfit(look)}, and by {_mm(found.misfit)} if one mistake is undone: {cause}"
-        f"{also}; {advice}.",
-        spoils=True,
-    )
+    undone = f"by {_mm(found.misfit)} if one mistake is undone: {cause}{also}; {advice}."
+    severity = "impossible" if meaningless else "doubtful"
+    return Finding(severity, f"{_misfit(look)}, and {undone}", spoils=True)
 
 
 def _unexplained(look: Look, excess: float) -> Finding:
     """Return what says that no mistake explains the misfit."""
-    hints = "; if nobody measured the planes, use `planes: unknown`"
-    hints = hints if look.planes == "known" else ""
+    known = look.planes == "known"
+    hints = "; if nobody measured the planes, use `planes: unknown`" if known else ""
     # Without the frequency, waves of the circular error cannot be told from wrong poses.
     if look.recording.modulation_frequency is None:
         hints += "; state `modulation_frequency_hz` if you know it"
@@ -392,12 +372,9 @@ def _scale(look: Look) -> Iterator[Finding]:
     """
     given = look.given
     if 100 * abs(given.slope) > 15:
-        yield impossible(
-            f"All distances are {100 * given.slope:+.0f} % off against the poses: depth or "
-            "poses are in another unit, or scaled.",
-            spoils=True,
-            check="scale",
-        )
+        said = f"All distances are {100 * given.slope:+.0f} % off against the poses"
+        unit = "depth or poses are in another unit, or scaled"
+        yield impossible(f"{said}: {unit}.", spoils=True, check="scale")
         return
     share, error = 0.0, math.inf
     if look.linear is not None and look.scene.moves:

@@ -33,28 +33,21 @@ def units(look: Look) -> Iterator[Finding]:
     """
     values = look.stored[np.isfinite(look.stored)]
     median = float(np.median(values)) if len(values) else 1.0
+    far = f"The median distance is {median:.4g} m"
     if median > 100:
         unit = "millimetres" if median > 400 else "centimetres"
-        yield impossible(
-            f"The median distance is {median:.4g} m: depth.npy seems to be in {unit}, or to "
-            "hold amplitudes; write metres."
-        )
+        said = f"seems to be in {unit}, or to hold amplitudes"
+        yield impossible(f"{far}: depth.npy {said}; write metres.")
     elif 1000 * median < 5:
-        yield impossible(
-            f"The median distance is {1e3 * median:.3g} mm: depth.npy seems to be in "
-            "kilometres, or scaled twice; write metres."
-        )
+        said = "seems to be in kilometres, or scaled twice"
+        yield impossible(f"{far}: depth.npy {said}; write metres.")
     elif median > 20:
-        yield doubtful(
-            f"The median distance is {median:.3g} m, far for a wall: is depth.npy in metres?"
-        )
+        yield doubtful(f"{far}, much for a wall: is depth.npy in metres?")
     place = look.poses[:, :3, 3]
     extent = float(np.linalg.norm(place - np.median(place, axis=0), axis=1).max())
     if extent > 50 and look.planes != "ignored":
-        yield impossible(
-            f"The poses extend over {extent:.4g} m: tx, ty, tz in frames.csv seem to be in "
-            "millimetres; write metres."
-        )
+        said = "tx, ty, tz in frames.csv seem to be in millimetres; write metres"
+        yield impossible(f"The poses extend over {extent:.4g} m: {said}.")
 
 
 def depth_values(look: Look) -> Iterator[Finding]:
@@ -66,20 +59,15 @@ def depth_values(look: Look) -> Iterator[Finding]:
     valid = np.isfinite(look.stored)
     values = look.stored[valid]
     if not len(values):
-        yield impossible(
-            "No pixel looked at holds a usable distance: depth.npy is NaN or zero there, "
-            "saturated, or the mask is empty."
-        )
+        why = "depth.npy is NaN or zero there, saturated, or the mask is empty"
+        yield impossible(f"No pixel looked at holds a usable distance: {why}.")
         return
     missing = np.flatnonzero(20 * valid.mean(1) < 1)
     if len(missing):
         frames = tuple(look.sampled[missing].tolist())
-        yield Finding(
-            "doubtful" if 2 * len(missing) > len(valid) else "note",
-            f"Hardly any usable pixel is left in {in_words(frames)}: no return, saturated, or "
-            "masked out.",
-            frames,
-        )
+        severity = "doubtful" if 2 * len(missing) > len(valid) else "note"
+        said = f"Hardly any usable pixel is left in {in_words(frames)}"
+        yield Finding(severity, f"{said}: no return, saturated, or masked out.", frames)
     if len(values) >= FEWEST_PIXELS:
         yield from _repeated_or_rounded(values)
 
@@ -96,27 +84,16 @@ def _repeated_or_rounded(values: np.ndarray) -> Iterator[Finding]:
     percent, value = 100 * count[order[0]] / len(values), distinct[order[0]]
     common = 100 * count[order[min(20, len(order) - 1)]] / len(values)
     step = 1e3 * float(np.diff(distinct).min()) if len(distinct) > 2 else 0.0
+    held = f"{percent:.1f} % of the pixels hold exactly {value:.4g} m: the depth is"
+    steps = 1e3 * distinct / (step or 1.0)
     if percent >= 90:
-        yield impossible(
-            f"{percent:.0f} % of the pixels hold exactly {value:.4g} m: the depth is stuck "
-            "at one value; record again."
-        )
+        yield impossible(f"{held} stuck at one value; record again.")
     elif percent >= max(_COMMON, 5 * common):
-        yield doubtful(
-            f"{percent:.1f} % of the pixels hold exactly {value:.4g} m: the depth is "
-            "clipped, or the value stands for no return; write NaN there."
-        )
-    elif step >= 4 and _multiples(1e3 * distinct, step):
-        yield Finding(
-            "doubtful" if step >= 20 else "note",
-            f"The depth comes in steps of {step:.3g} mm: it was rounded; errors below that "
-            "cannot be calibrated pixel by pixel.",
-        )
-
-
-def _multiples(values: np.ndarray, step: float) -> bool:
-    """Whether all values are multiples of a step, to a twentieth of it."""
-    return np.allclose(values, step * np.round(values / step), rtol=0, atol=step / 20)
+        yield doubtful(f"{held} clipped, or the value stands for no return; write NaN there.")
+    elif step >= 4 and np.abs(steps - np.round(steps)).max() < 1 / 20:
+        lost = "it was rounded; errors below that cannot be calibrated pixel by pixel"
+        severity = "doubtful" if step >= 20 else "note"
+        yield Finding(severity, f"The depth comes in steps of {step:.3g} mm: {lost}.")
 
 
 def stillness(look: Look) -> Iterator[Finding]:
@@ -136,15 +113,11 @@ def stillness(look: Look) -> Iterator[Finding]:
         if len(distinct(np.column_stack([*planes]))) == 1:
             yield _still(look)
     elif number < 3:
-        yield impossible(
-            f"The frames have {number} distinct poses; 3 at least are needed for a "
-            "hand-eye transform."
-        )
+        yield impossible(f"Only {number} distinct poses; a hand-eye transform needs 3 at least.")
     elif number < 8:
-        yield doubtful(
-            f"Only {number} distinct poses: hand-eye and errors can hardly be told apart; "
-            "record 8 or more, tilted and at several distances."
-        )
+        advice = "record 8 or more, tilted and at several distances"
+        told = "hand-eye and errors can hardly be told apart"
+        yield doubtful(f"Only {number} distinct poses: {told}; {advice}.")
 
 
 def _still(look: Look) -> Finding:
@@ -155,17 +128,13 @@ def _still(look: Look) -> Finding:
     distance = look.scene.distance
     distance = np.nanmedian(distance, axis=1) if len(distance) else np.zeros(1)
     moved = float(np.ptp(distance))
-    kind = "same" if look.data.moves else "identity"
+    told = "one view determines neither distance errors nor a hand-eye transform"
+    rest = f"the wall stays where it is: {told}; record other poses"
     if moved > CAMERA and 100 * moved > 3 * float(np.median(distance)):
-        return impossible(
-            f"All poses are the {kind} and all frames have one plane, yet the wall's distance "
-            f"changes by {1e3 * moved:.0f} mm: the robot's poses were not recorded; write "
-            "world_from_tool of each frame, or the plane of each in the camera's frame."
-        )
-    return impossible(
-        f"All poses are the {kind} and the wall stays where it is: one view determines neither "
-        "distance errors nor a hand-eye transform; record other poses."
-    )
+        yet = f"yet the wall's distance changes by {1e3 * moved:.0f} mm"
+        advice = "write world_from_tool of each frame, or the plane of each in the camera's frame"
+        rest = f"all planes one, {yet}: the robot's poses were not recorded; {advice}"
+    return impossible(f"All poses are the {'same' if look.data.moves else 'identity'} and {rest}.")
 
 
 def duplicates(look: Look) -> Iterator[Finding]:
@@ -183,14 +152,10 @@ def duplicates(look: Look) -> Iterator[Finding]:
     pairs = ([k, images.index(images[k])] for k in copies)
     moved = any(len(distinct(look.poses[both])) > 1 for both in pairs)
     meaningless = moved and look.fits and 2 * len(copies) > len(images)
-    cause = ": the frames were written twice"
-    if moved:
-        cause = ", with another pose: the camera hung or images were paired wrongly"
-    yield Finding(
-        "impossible" if meaningless else "doubtful",
-        f"The depth of {in_words(frames)} repeats an earlier frame bit by bit{cause}; remove them.",
-        frames,
-    )
+    cause = ", with another pose: the camera hung or images were paired wrongly"
+    cause = cause if moved else ": the frames were written twice"
+    said = f"The depth of {in_words(frames)} repeats an earlier frame bit by bit{cause}"
+    yield Finding("impossible" if meaningless else "doubtful", f"{said}; remove them.", frames)
 
 
 def stamps(look: Look) -> Iterator[Finding]:
@@ -200,11 +165,9 @@ def stamps(look: Look) -> Iterator[Finding]:
         steps = np.diff(recording.frames.timestamp)
         back = start + 1 + np.flatnonzero(steps < 0)
         if len(back):
-            yield doubtful(
-                f"timestamp_s goes back {len(back)} times, first at frame {back[0]}: the rows are "
-                "not in the order of time; check that images and poses are paired, and sort them.",
-                tuple(back.tolist()),
-            )
+            said = f"timestamp_s goes back {len(back)} times, first at frame {back[0]}"
+            advice = "check that images and poses are paired, and sort them by time"
+            yield doubtful(f"{said}: {advice}.", tuple(back.tolist()))
         elif len(steps) > 1 and not steps.any():
             yield note("timestamp_s is the same in all frames: nothing can be said of warm-up.")
         start += recording.num_frames
@@ -226,23 +189,15 @@ def amplitude(look: Look) -> Iterator[Finding]:
     spread = sigma_from_mad(np.median(np.abs(values - median)))
     percent = 100 * float((values >= values.max()).mean())
     if 1000 * spread <= max(median, TINY):
-        sentence = (
-            f"The amplitude is {median:.4g} nearly everywhere: it was not measured; remove "
-            "amplitude.npy, and use a model without an intensity term."
-        )
+        advice = "remove amplitude.npy, and use a model without an intensity term"
+        said = f"The amplitude is {median:.4g} nearly everywhere"
+        yield doubtful(f"{said}: it was not measured; {advice}.")
     elif np.ptp(depth) > 0 and 1000 * np.corrcoef(values, depth)[0, 1] > 999:
-        sentence = (
-            "The amplitude follows the depth exactly: amplitude.npy seems to hold depth again."
-        )
+        yield doubtful("The amplitude follows the depth exactly: is amplitude.npy depth again?")
     elif percent >= _COMMON:
-        sentence = (
-            f"{percent:.1f} % of the pixels have the largest amplitude, {values.max():.6g}: "
-            "they are saturated and their depth is wrong; set saturation_amplitude in "
-            "recording.yaml."
-        )
-    else:
-        return
-    yield doubtful(sentence)
+        said = f"{percent:.1f} % of the pixels have the largest amplitude, {values.max():.6g}"
+        wrong = "they are saturated, their depth is wrong"
+        yield doubtful(f"{said}: {wrong}; set saturation_amplitude in recording.yaml.")
 
 
 def temperatures(look: Look) -> Iterator[Finding]:
@@ -250,10 +205,8 @@ def temperatures(look: Look) -> Iterator[Finding]:
     values = look.condition("body_temperature")
     known = values[np.isfinite(values)]
     if len(known) >= 10 and np.ptp(known) == 0:
-        yield note(
-            f"body_temperature_c is {known[0]:g} in all frames: the sensor was not read, or the "
-            "camera was warm; temperature terms cannot be estimated."
-        )
+        said = f"body_temperature_c is {known[0]:g} in all frames"
+        yield note(f"{said}: not read, or the camera was warm; no temperature term can be fitted.")
 
 
 def lens(look: Look) -> Iterator[Finding]:
@@ -265,11 +218,11 @@ def lens(look: Look) -> Iterator[Finding]:
     missed = lens_misses(look.recording.camera).reshape(-1).numpy() > 0.5
     share = float(missed[look.pixel][used].mean()) if used.any() else 0.0
     if share > 0:
+        turned = "`distortion` in recording.yaml turns back before it reaches them"
         yield doubtful(
-            f"About {100 * share:.2g} % of the pixels have no viewing ray: `distortion` in "
-            "recording.yaml turns back before it reaches them, so their points are wrong whatever "
-            "their depth. Mask them (mask.npy), or calibrate the lens with views of a board that "
-            "reach the corners; the order is k1 k2 p1 p2 k3 k4 k5 k6."
+            f"About {100 * share:.2g} % of the pixels have no viewing ray: {turned}. Mask them "
+            "(mask.npy), or calibrate the lens with views of a board that reach the corners; the "
+            "order is k1 k2 p1 p2 k3 k4 k5 k6."
         )
 
 
@@ -295,12 +248,10 @@ def exposure(look: Look) -> Iterator[Finding]:
         enough = min(brighter.sum(), (~brighter).sum()) >= 3
         if enough and apart >= max(np.log(2), 8 * spread) and in_any_order:
             frames = tuple(look.frames[own[brighter]].tolist())
-            yield doubtful(
-                f"{in_words(frames).capitalize()} see {name} {np.exp(apart):.1f} times as bright "
-                "as the others do: frames of two exposures, whose distances may differ; record "
-                "integration_time_us, or train them apart.",
-                frames,
-            )
+            said = f"{in_words(frames).capitalize()} see {name} {np.exp(apart):.1f} times as bright"
+            differ = "frames of two exposures, whose distances may differ"
+            advice = "record integration_time_us, or train them apart"
+            yield doubtful(f"{said} as the others do: {differ}; {advice}.", frames)
             return
 
 
@@ -363,12 +314,10 @@ def two_cameras(look: Look) -> Iterator[Finding]:
             return
         group = chosen[one == one[-1]]
     frames = look.frames[group]
-    yield doubtful(
-        f"The pattern of the pixels' errors is another one in {len(frames)} of {len(chosen)} "
-        f"frames, from frame {int(frames.min())} on: frames of two cameras, or of two settings of "
-        "one; train them apart.",
-        spoils=True,
-    )
+    where = f"{len(frames)} of {len(chosen)} frames, from frame {int(frames.min())} on"
+    cause = "frames of two cameras, or of two settings of one; train them apart"
+    said = f"The pattern of the pixels' errors is another one in {where}: {cause}."
+    yield doubtful(said, spoils=True)
 
 
 def _patterns(look: Look, chosen: np.ndarray) -> np.ndarray | None:
