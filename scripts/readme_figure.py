@@ -14,12 +14,12 @@ def command(config: Path, recording: Path, out: Path) -> None:
     from matplotlib.figure import Figure
 
     import tofcorr
-    from tofcorr.pixels.sample import sample_pixels
+    from tofcorr.pixels.sample import PixelSample
     from tofcorr.training.figures import draw_profile, save_figure
 
     found = tofcorr.train(recording, config).calibration
     stages = {name: found.stages[name] for name in ("before", "after")}
-    sample = sample_pixels(found.data, stages, found.test)
+    sample = PixelSample(found.data, stages, found.test)
     figure = Figure(figsize=(12, 3.4), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
     for axes, name in zip(panels, ("distance", "column", "amplitude"), strict=True):

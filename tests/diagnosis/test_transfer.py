@@ -15,7 +15,7 @@ from tofcorr.diagnosis.rerun.checks import measure_transfer, noisy_frames
 from tofcorr.diagnosis.rerun.simulator import Evidence, fitted_to, mount_at
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
-from tofcorr.observables.compare import compare_observables
+from tofcorr.observables.compare import Observables
 
 
 def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetre(
@@ -54,7 +54,7 @@ def test_the_simulator_that_took_the_recording_has_its_noise(
     assert frames.num_frames == nothing_missing.num_frames
     poses = torch.from_numpy(frames.frames.world_from_tool)
     torch.testing.assert_close(poses, torch.from_numpy(nothing_missing.frames.world_from_tool))
-    found = compare_observables(nothing_missing, frames, seed=7)
+    found = Observables(nothing_missing, frames, seed=7)
     assert found.noise is not None
     assert found.noise["same_poses"]
     assert found.noise["ratio"] == pytest.approx(1.0, abs=0.05)
@@ -70,7 +70,7 @@ def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
     for sim in (frames, lambda _: depth):
         opened = open_simulator(sim, nothing_missing)
         assert opened is not None
-        found.append(compare_observables(nothing_missing, opened.frames, seed=7))
+        found.append(Observables(nothing_missing, opened.frames, seed=7))
     compared, without_amplitude = found
     assert compared.noise is not None
     assert compared.noise["same_poses"]

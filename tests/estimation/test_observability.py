@@ -22,7 +22,7 @@ from tofcorr.estimation.uncertainty import (
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.judgement import judge
-from tofcorr.training.support import recording_support, shortcomings
+from tofcorr.training.support import Support, shortcomings
 
 FitOf = Callable[[str], Fit]
 NO_ERRORS = {
@@ -59,7 +59,7 @@ def warned(walls: dict[str, Dataset], fits: FitOf) -> Callable[[str], str]:
 
 def _warned(dataset: Dataset, result: Fit) -> str:
     best = result.solution.parameters.tool_from_camera
-    support = recording_support(dataset, np.arange(dataset.num_frames), best)
+    support = Support(dataset, np.arange(dataset.num_frames), best)
     inspection = tofcorr.inspect(dataset.first)
     return "\n".join(judge(result, NO_ERRORS, support, inspection)[2])
 
@@ -87,7 +87,7 @@ def test_only_a_correction_that_clearly_does_harm_is_advised_against(
     after = {"train": {"rms": 1.0}, "test": {"rms": left}}
     errors = {"after": after, "hand_eye_only": {"test": {"rms": 1.0}}}
     fit, wall = fits("good"), walls["good"]
-    support = recording_support(wall, np.arange(3), fit.solution.parameters.tool_from_camera)
+    support = Support(wall, np.arange(3), fit.solution.parameters.tool_from_camera)
     found = judge(fit, errors, support, tofcorr.inspect(wall.first))
     assert said in found[2][0]
     assert (found[0] == "do not use") == (left > 1.1)
@@ -130,7 +130,7 @@ def test_one_reflectivity_is_named_only_if_the_model_has_an_intensity(
     assert warned("good") == ""
     assert "one reflectivity" in warned("white")
     dataset = walls["white"]
-    support = recording_support(dataset, np.arange(dataset.num_frames), true_hand_eye(dataset))
+    support = Support(dataset, np.arange(dataset.num_frames), true_hand_eye(dataset))
     assert not list(shortcomings(support, moves=True, with_intensity=False))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy_camera import Camera, record
 
-from tofcorr.observables.compare import Observables, compare_observables
+from tofcorr.observables.compare import Observables
 from tofcorr.observables.figures import drawings
 from tofcorr.observables.pairs import PoseSums, permutation_p, sign_flip_p
 from tofcorr.plausibility.page import WIDTH
@@ -22,7 +22,7 @@ def differing(tmp_path_factory: pytest.TempPathFactory) -> Observables:
     folder = tmp_path_factory.mktemp("pair")
     real = record(folder / "real", REAL, 11).recording
     sim = record(folder / "sim", Camera(), 12).recording
-    return compare_observables(real, sim, seed=1)
+    return Observables(real, sim, seed=1)
 
 
 def test_ratio_shares_and_causes_at_the_same_poses(differing: Observables) -> None:
@@ -54,7 +54,7 @@ def test_every_comparison_has_a_figure(differing: Observables) -> None:
 def test_other_poses_are_compared_at_like_brightness(tmp_path: Path) -> None:
     real = record(tmp_path / "real", REAL, 21, poses_seed=5).recording
     sim = record(tmp_path / "sim", Camera(), 22, poses_seed=6).recording
-    found = compare_observables(real, sim, seed=1)
+    found = Observables(real, sim, seed=1)
     noise = found.to_dict()["noise"]
     assert not noise["same_poses"]
     assert noise["ratio"] == pytest.approx(2.0, rel=0.06)
@@ -64,7 +64,7 @@ def test_other_poses_are_compared_at_like_brightness(tmp_path: Path) -> None:
 def test_a_simulator_without_noise_has_no_ratio(tmp_path: Path) -> None:
     real = record(tmp_path / "real", Camera(), 31).recording
     sim = record(tmp_path / "sim", Camera(times=0.0, has_amplitude=False), 32).recording
-    found = compare_observables(real, sim, seed=1).to_dict()
+    found = Observables(real, sim, seed=1).to_dict()
     assert found["noise"]["ratio"] is None
     assert found["noise"]["p_value"] == pytest.approx(0.001)
     assert found["amplitude"] is None
@@ -72,7 +72,7 @@ def test_a_simulator_without_noise_has_no_ratio(tmp_path: Path) -> None:
 
 
 def test_without_a_simulator_every_block_is_null(tmp_path: Path) -> None:
-    found = compare_observables(record(tmp_path / "real", Camera(), 41).recording, None, seed=1)
+    found = Observables(record(tmp_path / "real", Camera(), 41).recording, None, seed=1)
     assert found.to_dict() == {"noise": None, "dropouts": None, "amplitude": None}
     assert found.real_noise.temporal_m > 0
     assert set(drawings(found)) == {"noise", "dropouts"}
@@ -139,7 +139,7 @@ def test_a_simulator_with_the_right_noise_is_let_alone_in_forty_pairs(
     for seed in range(40):
         how = {"poses_seed": seed, "repeats": repeats}
         pair = [record(tmp_path / f"{seed}_{k}", same, 100 * seed + k, **how) for k in range(2)]
-        found = compare_observables(*(one.recording for one in pair), seed=seed)
+        found = Observables(*(one.recording for one in pair), seed=seed)
         noise = found.to_dict()["noise"]
         assert noise["ratio"] == pytest.approx(1.0, abs=0.08)
         p_values.append(noise["p_value"])

@@ -14,7 +14,7 @@ from training.trained import Trained
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.sample import errors_along_ray, sample_pixels, thinned
+from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
 from tofcorr.training.figures import coloured
 
 
@@ -80,7 +80,7 @@ def test_curves_are_means_of_the_sampled_errors_in_bins_of_their_covariate(
     trained: Trained, shown: EventAccumulator
 ) -> None:
     found = trained.result.calibration
-    sample = sample_pixels(trained.data, found.stages, found.frames)
+    sample = PixelSample(trained.data, found.stages, found.frames)
     tags = [tag for tag in shown.Tags()["scalars"] if "/distance_x1000/" in tag]
     (tag,) = [tag for tag in tags if tag.endswith("/after")]
     x, error = sample.covariates["distance [m]"], sample.errors_mm["after"]
@@ -112,12 +112,12 @@ def test_errors_are_measured_minus_true_along_the_ray(tmp_path: Path) -> None:
     torch.testing.assert_close(found[used], drawn[used], rtol=0.0, atol=1e-9)
     assert found[~used].isnan().all()
     assert (cosine < 0).all()
-    assert not any("amplitude" in name for name in sample_pixels(data, {"b": bare}, [1]).covariates)
+    assert not any("amplitude" in name for name in PixelSample(data, {"b": bare}, [1]).covariates)
 
 
 def test_a_sample_holds_usable_pixels_and_thinning_keeps_both_ends(trained: Trained) -> None:
     found, camera = trained.result.calibration, trained.data.first.camera
-    sample = sample_pixels(trained.data, found.stages, found.test)
+    sample = PixelSample(trained.data, found.stages, found.test)
     assert set(sample.frame) == set(found.test)
     for values in (*sample.covariates.values(), *sample.errors_mm.values()):
         assert values.shape == sample.frame.shape

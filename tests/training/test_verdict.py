@@ -13,7 +13,7 @@ import tofcorr
 from tofcorr.estimation.solvers import Stopped
 from tofcorr.fit.problem import Fit
 from tofcorr.training.judgement import beyond_noise, judge
-from tofcorr.training.support import recording_support
+from tofcorr.training.support import Support
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_an_error_that_the_model_lacks_is_no_good_run(tmp_path: Path) -> None:
 
 def judged(trained: Trained, fit: Fit) -> tuple[str, str]:
     train, hand_eye = trained.result.calibration.train, fit.solution.parameters.tool_from_camera
-    support, found = recording_support(trained.data, train, hand_eye), trained.report()
+    support, found = Support(trained.data, train, hand_eye), trained.report()
     inspection = tofcorr.inspect(trained.recording)
     return judge(fit, found["error_mm"], support, inspection)[:2]
 

@@ -62,7 +62,7 @@ from tofcorr.error_terms.pixel_terms import FixedPatternOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import solvable
 from tofcorr.files import staged_folder
-from tofcorr.observables.compare import compare_observables
+from tofcorr.observables.compare import Observables
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
 from tofcorr.plausibility.examine import vet
@@ -284,9 +284,7 @@ def conclude(
     frames = None if simulator is None else simulator.frames
     if given is not None:
         frames = noisy_frames(recording, given, options.seed + 3)
-    observables = compare_observables(
-        recording, frames, seed=options.seed + 3, level=options.tests.level
-    )
+    observables = Observables(recording, frames, seed=options.seed + 3, level=options.tests.level)
     found = replace(found, patterns=whole_patterns(found))
     beyond = [] if found.rendered else found.tables[1]
     warnings = list(prepared.warnings)

@@ -265,8 +265,8 @@ def neighbour_differences(
 WIDEST_PX = 5.0
 """Widest filter of the noise that is looked for, pixels. Chosen: beyond all filters of cameras."""
 # Correlation of nearest neighbours below which noise counts as white. Chosen: it changes the
-# variance of a mean of nine pixels by less than 5 %. A filter of 0.2 pixels has 2 e^-12.5.
-_WHITE, _NARROWEST_PX = 0.01, 0.2
+# variance of a mean of nine pixels by less than 5 %.
+_WHITE = 0.01
 
 
 def neighbour_correlation(width_px: float, lag: int) -> float:
@@ -305,11 +305,11 @@ def filter_width(correlations: Sequence[float]) -> float:
         return sum(neighbour_correlation(width, lag) for lag in lags) - wanted
 
     white = not (correlations[0] > _WHITE and wanted > _WHITE)
-    if white or not np.isfinite(wanted) or excess(_NARROWEST_PX) >= 0:
+    if white or not np.isfinite(wanted):
         return 0.0
     if excess(WIDEST_PX) <= 0:
         return WIDEST_PX
-    return float(brentq(excess, _NARROWEST_PX, WIDEST_PX))  # pyright: ignore[reportArgumentType]
+    return float(brentq(excess, 0.0, WIDEST_PX))  # pyright: ignore[reportArgumentType]
 
 
 def frame_correlation(differences: np.ndarray) -> tuple[float, float]:

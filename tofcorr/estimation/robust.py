@@ -185,11 +185,13 @@ def fit_plane(
             off = (inverse - gradient @ rays.T) / inverse.square()
             used = valid & (off.abs() <= tolerance)
             typical = torch.where(used, off.abs(), torch.nan).nanmedian(dim=1, keepdim=True).values
-            scale = sigma_from_mad(typical.nan_to_num(0.0)).clamp(min=1e-6)
+            # No recording tells distances more finely than float32.
+            least = torch.finfo(torch.float32).eps
+            scale = sigma_from_mad(typical.nan_to_num(0.0)).clamp(min=least)
             weight = torch.where(used, full * robust_weights(off / scale, "cauchy"), 0.0)
         matrix = torch.einsum("bv,va,vc->bac", weight, rays, rays)
         right = (weight * inverse) @ rays
-        ridge = 1e-12 * torch.eye(3).to(inverse)
+        ridge = torch.finfo(inverse.dtype).eps * torch.eye(3).to(inverse)
         enough = (weight > 0).sum(dim=1) > 2
         found = torch.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
         gradient = torch.where(enough[:, None], found, gradient)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from tofcorr.estimation.linear import ROUNDING, Curvature
+from tofcorr.estimation.linear import RESOLVED, ROUNDING, Curvature
 from tofcorr.estimation.moments import (
     LEAST_RESIDUAL,
     ImageMoments,
@@ -194,9 +194,9 @@ def rotation_from_normals(
         normal_tool: Unit normals in the tool frame, shape (N, 3).
         normal_camera: The same normals in the camera frame, shape (N, 3).
         guess: A rotation, shape (3, 3); decides the turn about the normal where all normals are
-            parallel. It weighs a millionth of an image.
+            parallel. It weighs as little as rounding may.
     """
-    u, _, vh = torch.linalg.svd(normal_tool.T @ normal_camera + 1e-6 * guess)
+    u, _, vh = torch.linalg.svd(normal_tool.T @ normal_camera + RESOLVED * guess)
     sign = torch.ones(3, dtype=u.dtype)
     sign[2] = torch.det(u @ vh).sign()
     return u @ torch.diag(sign) @ vh

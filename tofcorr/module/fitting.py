@@ -8,7 +8,7 @@ from pydantic import TypeAdapter
 from tofcorr.correction.state import CalibrationState
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.calibration import TrainingOptions, calibrate
+from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.judgement import report_text
 from tofcorr.training.report import training_report
 from tofcorr.training.run import calibration_state, inspected
@@ -86,7 +86,7 @@ def fit_to(
         CalibrationDataError: The data cannot support the model, or cannot be what they say.
     """
     dataset, options, inspection, left_out = inspected(dataset, options, force=force)
-    found = calibrate(dataset, options, watcher, left_out=left_out)
+    found = Calibration(dataset, options, watcher, left_out=left_out)
     told = training_report(found, options.model_copy(update={"advice": 0}), inspection)
     half = "test" if len(found.test) else "train"
     errors = {

@@ -4,13 +4,13 @@ Each comparison is a block of `diagnosis.json`; its `explained_by` says what of 
 simulator lacks or exaggerates, and is empty where nothing is significant and material.
 """
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import Source
+from tofcorr.estimation.robust import LEVEL
 from tofcorr.observables.measure import (
     DropoutMeasurement,
     NoiseMeasurement,
@@ -31,9 +31,22 @@ Block = dict[str, Any]
 _MATERIAL, _MATERIAL_SHARE = 0.05, 0.002
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Observables:
     """Noise, missing pixels and amplitude of a recording, and of a simulated one if there is one.
+
+    They are compared with poses as the unit of every test. At the same poses the same pixels are
+    compared. At other poses, pixels of like brightness and target are: brightness is the amplitude
+    in a unit that both share, or cos / d^2.
+
+    Args:
+        real: The recording.
+        sim: The simulated one, with the noise that the simulator states; None: the recording alone
+            is measured.
+        seed: Of resamples and permutations.
+        level: Significance level of what is reported.
+
+    Raises:
+        CalibrationDataError: One of them has no image with 100 usable pixels, or breaks the format.
 
     Attributes:
         real_noise: Noise of the recording, by its best source.
@@ -46,14 +59,28 @@ class Observables:
         both: The pixels compared; None without a simulated recording.
     """
 
-    real_noise: NoiseMeasurement
-    real_dropouts: DropoutMeasurement
-    noises: tuple[NoiseMeasurement, NoiseMeasurement] | None = None
-    sim_dropouts: DropoutMeasurement | None = None
-    noise: Block | None = None
-    dropouts: Block | None = None
-    amplitude: Block | None = None
-    both: Matched | None = field(default=None, repr=False)
+    def __init__(
+        self, real: Recording, sim: Recording | None, *, seed: int, level: float = LEVEL
+    ) -> None:
+        seen = Observed(real)
+        self.real_noise, self.real_dropouts = NoiseMeasurement(seen), DropoutMeasurement(seen)
+        self.noises: tuple[NoiseMeasurement, NoiseMeasurement] | None = None
+        self.noise = self.dropouts = self.amplitude = self.sim_dropouts = self.both = None
+        if sim is None:
+            return
+        simulated, noise = Observed(sim), self.real_noise
+        self.sim_dropouts = DropoutMeasurement(simulated)
+        lost = self.real_dropouts, self.sim_dropouts
+        self.both = Matched(seen, simulated, (lost[0].amplitude, lost[1].amplitude))
+        alike = self.both if self.both.paired else Matched(seen, simulated, None)
+        source: Source = noise.source
+        if noise_source(simulated) != source:
+            source, noise = "neighbours", NoiseMeasurement(seen, "neighbours")
+        self.noises = noise, NoiseMeasurement(simulated, source)
+        random = np.random.default_rng(seed)
+        self.noise = _compare_noise(self.both, *self.noises, random, level)
+        self.dropouts = _compare_dropouts(self.both, *lost, random, level)
+        self.amplitude = _compare_amplitude(alike, *lost, random, level)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the blocks `noise`, `dropouts` and `amplitude` of diagnosis.json."""
@@ -64,50 +91,6 @@ class Observables:
         """What of the camera the simulator lacks or exaggerates; empty: nothing was found."""
         blocks = (block for block in self.to_dict().values() if block is not None)
         return tuple(cause for block in blocks for cause in block["explained_by"])
-
-
-def compare_observables(
-    real: Recording, sim: Recording | None, *, seed: int, level: float = 0.05
-) -> Observables:
-    """Compare noise, missing pixels and amplitude, with poses as the unit of every test.
-
-    At the same poses the same pixels are compared. At other poses, pixels of like brightness and
-    target are: brightness is the amplitude in a unit that both share, or cos / d^2.
-
-    Args:
-        real: The recording.
-        sim: The simulated one, with the noise that the simulator states; None: the recording alone
-            is measured.
-        seed: Of resamples and permutations.
-        level: Significance level of what is reported.
-
-    Raises:
-        CalibrationDataError: One of them has no image with 100 usable pixels, or breaks the format.
-    """
-    seen = Observed(real)
-    noise, dropouts = NoiseMeasurement(seen), DropoutMeasurement(seen)
-    if sim is None:
-        return Observables(real_noise=noise, real_dropouts=dropouts)
-    simulated = Observed(sim)
-    lost = dropouts, DropoutMeasurement(simulated)
-    both = Matched(seen, simulated, (lost[0].amplitude, lost[1].amplitude))
-    alike = both if both.paired else Matched(seen, simulated, None)
-    source: Source = noise.source if noise_source(simulated) == noise.source else "neighbours"
-    noises = (
-        noise if source == noise.source else NoiseMeasurement(seen, source),
-        NoiseMeasurement(simulated, source),
-    )
-    random = np.random.default_rng(seed)
-    return Observables(
-        real_noise=noise,
-        real_dropouts=dropouts,
-        noises=noises,
-        sim_dropouts=lost[1],
-        noise=_compare_noise(both, *noises, random, level),
-        dropouts=_compare_dropouts(both, *lost, random, level),
-        amplitude=_compare_amplitude(alike, *lost, random, level),
-        both=both,
-    )
 
 
 def _causes(level: float, *found: tuple[str, float | None, float | None, float]) -> list[str]:

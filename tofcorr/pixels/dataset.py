@@ -64,8 +64,8 @@ class Dataset:
                     need = "recordings that are calibrated together come from one camera"
                     raise CalibrationDataError(f"{other.path}: {differ}; {need} in one setting.")
             if other.frame_names.eye_to_hand != first.frame_names.eye_to_hand:
-                differ = f"the camera stands still in one of this and {first.path}, and not in the"
-                said = f"{differ} other; their hand-eye transforms differ"
+                differ = f"the camera stands still in one of this and {first.path}"
+                said = f"{differ}, and the robot carries it in the other; their hand-eye transforms differ"
                 raise CalibrationDataError(f"{other.path}: {said}.")
 
     @property

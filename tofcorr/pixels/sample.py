@@ -143,9 +143,14 @@ def distance_to_plane(
     return found, (ray_directions @ normal.T).permute(2, 0, 1)
 
 
-@dataclass(frozen=True)
 class PixelSample:
-    """Usable pixels, drawn at random.
+    """Usable pixels of some frames, drawn at random, and their errors; always the same ones.
+
+    Args:
+        dataset: The recordings.
+        stages: The models whose errors are wanted; the last one's hand-eye defines incidence.
+        frames: Global numbers of the frames; of long recordings only some frames, evenly spread,
+            are read.
 
     Attributes:
         frame: Global number of each pixel's frame, shape (M,).
@@ -153,9 +158,33 @@ class PixelSample:
         errors_mm: Measured minus true distance along the ray at each stage, each (M,).
     """
 
-    frame: np.ndarray
-    covariates: dict[str, np.ndarray]
-    errors_mm: dict[str, np.ndarray]
+    def __init__(
+        self,
+        dataset: Dataset,
+        stages: Mapping[str, CalibrationModel],
+        frames: Sequence[int] | np.ndarray,
+    ) -> None:
+        camera = dataset.first.camera
+        # Of four million pixels, which bounds the time, enough for narrow bins.
+        read = thinned(np.asarray(frames), max(4_000_000 // (camera.height * camera.width), 1))
+        drawn = draw_pixels(dataset, read, 300_000, seed=0)
+        covariates = {
+            "distance [m]": drawn.pixels.radial_distance,
+            "row [pixel]": drawn.pixels.rows,
+            "column [pixel]": drawn.pixels.columns,
+        }
+        if dataset.has_amplitude:
+            covariates["amplitude [camera's units]"] = drawn.pixels.amplitude
+        self.errors_mm: dict[str, np.ndarray] = {}
+        for name, model in stages.items():
+            hand_eye = model.hand_eye().detach()
+            off, cosine = model.error.error_at(drawn.pixels), drawn.cosine(hand_eye)
+            error = 1e3 * drawn.distance_to_plane(hand_eye, off) / cosine
+            self.errors_mm[name] = error.numpy()
+            angle = torch.rad2deg(torch.acos(cosine.abs().clamp(max=1.0)))
+            covariates["angle of incidence [degrees]"] = angle
+        self.covariates = {name: one.double().numpy() for name, one in covariates.items()}
+        self.frame = read[drawn.frame.numpy()]
 
     def covariate_named(self, name: str) -> str:
         """Return the axis label of a covariate from its name without unit.
@@ -168,43 +197,6 @@ class PixelSample:
             has = f"this recording has: {', '.join(labels)}"
             raise CalibrationDataError(f"There is no covariate '{name}' to draw against; {has}.")
         return labels[name]
-
-
-def sample_pixels(
-    dataset: Dataset,
-    stages: Mapping[str, CalibrationModel],
-    frames: Sequence[int] | np.ndarray,
-) -> PixelSample:
-    """Draw pixels at random from some frames, and compute their errors.
-
-    The same call always draws the same pixels.
-
-    Args:
-        dataset: The recordings.
-        stages: The models whose errors are wanted; the last one's hand-eye defines incidence.
-        frames: Global numbers of the frames; of long recordings only some frames, evenly spread,
-            are read.
-    """
-    camera = dataset.first.camera
-    # Of four million pixels, which bounds the time, enough for narrow bins.
-    read = thinned(np.asarray(frames), max(4_000_000 // (camera.height * camera.width), 1))
-    drawn = draw_pixels(dataset, read, 300_000, seed=0)
-    covariates = {
-        "distance [m]": drawn.pixels.radial_distance,
-        "row [pixel]": drawn.pixels.rows,
-        "column [pixel]": drawn.pixels.columns,
-    }
-    if dataset.has_amplitude:
-        covariates["amplitude [camera's units]"] = drawn.pixels.amplitude
-    errors = {}
-    for name, model in stages.items():
-        hand_eye = model.hand_eye().detach()
-        off, cosine = model.error.error_at(drawn.pixels), drawn.cosine(hand_eye)
-        errors[name] = (1e3 * drawn.distance_to_plane(hand_eye, off) / cosine).numpy()
-        angle = torch.rad2deg(torch.acos(cosine.abs().clamp(max=1.0)))
-        covariates["angle of incidence [degrees]"] = angle
-    values = {name: column.double().numpy() for name, column in covariates.items()}
-    return PixelSample(read[drawn.frame.numpy()], values, errors)
 
 
 def thinned(values: np.ndarray, most: int) -> np.ndarray:

@@ -139,8 +139,7 @@ def depth_maps(look: Look) -> Figure:
     used = np.isfinite(depth) & (depth > 0)
     if recording.mask is not None:
         used &= np.array(recording.mask[chosen, ::step, ::step]) > 0
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = panels(3, 1, 2)
     _map(figure, left, np.ma.median(np.ma.masked_where(~used, depth), axis=0), "median depth, m")
     share = "frames in which a pixel is used, %"
     _map(figure, right, 100 * used.mean(0), share).set_clim(0, 100)
@@ -153,8 +152,7 @@ def poses_from_above(look: Look, found: Inspection) -> Figure:
     guess = np.asarray(look.recording.tool_from_camera)
     axis = (look.poses @ guess)[:, :3, 2]
     first, second = np.sort(np.argsort(-np.ptp(place, axis=0))[:2])
-    figure = Figure(figsize=(5, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = panels(4)
     length = (float(np.ptp(place, axis=0).max()) or 1.0) / 8
     across, along = place[:, first], place[:, second]
     reach = length * axis[:, [first, second]]
@@ -175,8 +173,7 @@ def poses_from_above(look: Look, found: Inspection) -> Figure:
 def residuals(look: Look, found: Inspection) -> Figure:
     """Draw each frame's distance to its plane before and after the best alignment."""
     before = judged(look.scene, look.scene.guess if look.scene.moves else np.eye(4), 0.0, 0.0)
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = panels(4)
     axes.plot(look.frames, 1e3 * before.rms, "o", color=GREY, markersize=4, label="as recorded")
     axes.plot(look.frames, 1e3 * look.rms, "o", color=BLUE, markersize=4, label="best alignment")
     odd = np.isin(look.frames, list(found.outlying))
@@ -186,7 +183,6 @@ def residuals(look: Look, found: Inspection) -> Figure:
     axes.set_yscale("log")
     plain_numbers(axes.yaxis)
     axes.set(xlabel="frame", ylabel="distance to the plane, mm RMS")
-    axes.spines[["top", "right"]].set_visible(False)
     axes.legend(ncols=4, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     return figure
 

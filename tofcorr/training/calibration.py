@@ -1,7 +1,7 @@
 """The options of a training, and its computation: split the frames, fit, measure the errors."""
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -15,7 +15,7 @@ from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.fit.fitting import calibrated, fit
 from tofcorr.fit.misfit import assumptions, find_misfit, misfit_pixels
-from tofcorr.fit.problem import Fit, FitOptions
+from tofcorr.fit.problem import FitOptions
 from tofcorr.fit.walls import with_every_wall
 from tofcorr.pixels.dataset import (
     Dataset,
@@ -25,7 +25,7 @@ from tofcorr.pixels.dataset import (
     split_frames,
     thread_number,
 )
-from tofcorr.pixels.passes import FrameErrors, frame_errors
+from tofcorr.pixels.passes import frame_errors
 from tofcorr.pixels.sample import MaskOptions
 
 
@@ -47,9 +47,20 @@ class TrainingOptions(FitOptions, MaskOptions):
     figures: bool = True
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
     """A fitted model and its errors on the frames fitted and held out.
+
+    The frames are split, and the model is fitted to one half and measured on both.
+
+    Args:
+        data: The recordings, without the pixels that the options leave out.
+        options: Model, split, solver and device.
+        watcher: Called after each iteration of the solver; returning False ends it.
+        resumed: Where an interrupted run stood; None starts anew.
+        left_out: Global numbers of frames that are neither fitted nor held out.
+
+    Raises:
+        CalibrationDataError: The recordings cannot support the model.
 
     Attributes:
         data: The recordings; estimated walls stand in place of the recorded ones.
@@ -61,57 +72,38 @@ class Calibration:
         errors: The errors of each stage on all frames.
     """
 
-    data: Dataset
-    fit: Fit
-    train: np.ndarray
-    test: np.ndarray
-    stages: Mapping[str, CalibrationModel]
-    errors: Mapping[str, FrameErrors]
+    def __init__(
+        self,
+        data: Dataset,
+        options: TrainingOptions,
+        watcher: Watcher | None = None,
+        resumed: Parameters | None = None,
+        left_out: Collection[int] = (),
+    ) -> None:
+        self.train, self.test = (
+            frames[~np.isin(frames, list(left_out))] for frames in split_frames(data, options.split)
+        )
+        domain = covered_domain(data, self.train)
+        found = fit(data, self.train, options, domain, watcher, resumed)
+        self.data = data = with_every_wall(data, found.walls, found.model)
+        self.stages = {
+            "before": without_correction(domain, recorded_hand_eye(data)),
+            "hand_eye_only": without_correction(domain, found.hand_eye_only.tool_from_camera),
+            "after": found.model,
+        }
+        self.errors = frame_errors(data, self.stages, device=options.device)
+        if found.solution.parameters.hand_eye_is_free:
+            with thread_number(1):
+                seen = misfit_pixels(data, found, self.frames)
+                if seen is not None:
+                    assumed, misfit = assumptions(seen, found), find_misfit(seen, found)
+                    found = replace(found, misfit=misfit, assumptions=assumed)
+        self.fit = found
 
     @property
     def frames(self) -> np.ndarray:
         """Global numbers of all frames used, fitted or held out, increasing."""
         return np.sort(np.concatenate([self.train, self.test]))
-
-
-def calibrate(
-    data: Dataset,
-    options: TrainingOptions,
-    watcher: Watcher | None = None,
-    resumed: Parameters | None = None,
-    left_out: Collection[int] = (),
-) -> Calibration:
-    """Split the frames, fit the model to one half and measure it on both.
-
-    Args:
-        data: The recordings, without the pixels that the options leave out.
-        options: Model, split, solver and device.
-        watcher: Called after each iteration of the solver; returning False ends it.
-        resumed: Where an interrupted run stood; None starts anew.
-        left_out: Global numbers of frames that are neither fitted nor held out.
-
-    Raises:
-        CalibrationDataError: The recordings cannot support the model.
-    """
-    train, test = (
-        frames[~np.isin(frames, list(left_out))] for frames in split_frames(data, options.split)
-    )
-    domain = covered_domain(data, train)
-    fitted = fit(data, train, options, domain, watcher, resumed)
-    data = with_every_wall(data, fitted.walls, fitted.model)
-    stages = {
-        "before": without_correction(domain, recorded_hand_eye(data)),
-        "hand_eye_only": without_correction(domain, fitted.hand_eye_only.tool_from_camera),
-        "after": fitted.model,
-    }
-    errors = frame_errors(data, stages, device=options.device)
-    if fitted.solution.parameters.hand_eye_is_free:
-        with thread_number(1):
-            seen = misfit_pixels(data, fitted, np.union1d(train, test))
-            if seen is not None:
-                assumed, misfit = assumptions(seen, fitted), find_misfit(seen, fitted)
-                fitted = replace(fitted, misfit=misfit, assumptions=assumed)
-    return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
 
 
 def without_correction(domain: Domain, tool_from_camera: Tensor) -> CalibrationModel:

@@ -15,7 +15,7 @@ from tofcorr.estimation.regularisation import total_weight
 from tofcorr.estimation.robust import without_strays
 from tofcorr.estimation.solvers import Solution
 from tofcorr.geometry import se3
-from tofcorr.pixels.sample import sample_pixels
+from tofcorr.pixels.sample import PixelSample
 from tofcorr.progress import event_writer
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.figures import error_picture, profile
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 class RunMonitor:
     """Remembers the course of a run, and writes it for TensorBoard once the run is on disk.
 
-    `iteration` is a `Watcher`: pass it to `calibrate`.
+    `iteration` is a `Watcher`: pass it to `Calibration`.
 
     Attributes:
         iterations: Every iteration of the solver so far.
 
     Example:
         monitor = RunMonitor()
-        calibration = calibrate(data, options, watcher=monitor.iteration)
+        calibration = Calibration(data, options, watcher=monitor.iteration)
         monitor.write(run / "tb", calibration, report)
     """
 
@@ -113,7 +113,7 @@ def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
     None of it is drawn by Matplotlib, which takes longer than a short fit. `plot_profile` of a
     `TrainingResult`, and its neighbours, draw the same with labelled axes.
     """
-    sample = sample_pixels(calibration.data, calibration.stages, calibration.frames)
+    sample = PixelSample(calibration.data, calibration.stages, calibration.frames)
     tested = np.isin(sample.frame, calibration.test)
     for covariate, x in sample.covariates.items():
         low, high = ends = without_strays(x)

@@ -21,7 +21,7 @@ from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.judgement import judge, left_out_mapping
-from tofcorr.training.support import Support, recording_support
+from tofcorr.training.support import Support
 from tofcorr.version import __version__
 
 
@@ -127,7 +127,7 @@ def training_report(
     fit, data, seed = calibration.fit, calibration.data, options.split.seed
     solution, after = fit.solution, calibration.errors["after"]
     hand_eye = solution.parameters.tool_from_camera
-    support = recording_support(data, calibration.train, hand_eye)
+    support = Support(data, calibration.train, hand_eye)
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
     verdict, reason, found = judge(fit, errors, support, inspection)
     rms = np.sqrt(after.squared / np.maximum(after.count, 1))

@@ -28,11 +28,11 @@ from tofcorr.fit.reference import REFERENCE_FILE, estimate_reference, save_refer
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
 from tofcorr.pixels.passes import alone, is_first, process_group
-from tofcorr.pixels.sample import PixelSample, sample_pixels, usable_pixels
+from tofcorr.pixels.sample import PixelSample, usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import stages
-from tofcorr.training.calibration import Calibration, TrainingOptions, calibrate
+from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.figures import (
     profile_figure,
     residual_figure,
@@ -178,7 +178,7 @@ class TrainingResult:
 
     @cached_property
     def _sample(self) -> PixelSample:
-        return sample_pixels(self.data, self.calibration.stages, self.calibration.frames)
+        return PixelSample(self.data, self.calibration.stages, self.calibration.frames)
 
 
 Config = str | Path | Mapping[str, Any] | TrainingOptions
@@ -295,7 +295,7 @@ def train(
 
                 local = options.model_copy(update={"device": device})
                 with stage("fit"):
-                    calibration = calibrate(data, local, watch, start, left_out)
+                    calibration = Calibration(data, local, watch, start, left_out)
                 with stage("report"):
                     report = training_report(calibration, options, inspection)
                 result = TrainingResult(

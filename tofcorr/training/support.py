@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +17,13 @@ from tofcorr.pixels.dataset import Dataset
 ENOUGH_REFLECTIVITY = 2
 
 
-class Support(NamedTuple):
+class Support:
     """What a set of frames covers.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+        tool_from_camera: The hand-eye transform, shape (4, 4).
 
     Attributes:
         tilt_deg: Standard deviation of the direction of the wall's normal in the camera frame,
@@ -31,41 +36,27 @@ class Support(NamedTuple):
             wall at the same distance, incidence and place; None without amplitudes.
     """
 
-    tilt_deg: tuple[float, float]
-    roll_deg: float | None
-    distance_m: tuple[float, float]
-    reflectivity_ratio: float | None
+    def __init__(
+        self, dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
+    ) -> None:
+        from scipy.stats import circstd  # Slow to import.
+
+        names = "world_from_tool", "normal_world", "offset"
+        world_from_tool, normal_world, offset = (dataset.column(name)[frames] for name in names)
+        world_from_camera = world_from_tool @ tool_from_camera
+        normal, offset = plane_in_frame(normal_world, offset, world_from_camera)
+        distance, roll = -offset / normal[:, 2], _roll(world_from_camera, normal_world).numpy()
+        self.tilt_deg = _tilt(normal)
+        self.roll_deg = math.degrees(circstd(roll)) if dataset.moves else None
+        self.distance_m = float(distance.min()), float(distance.max())
+        self.reflectivity_ratio = None
+        if dataset.has_amplitude:
+            self.reflectivity_ratio = _reflectivity_ratio(dataset, frames, tool_from_camera)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        given = self._asdict().items()
+        given = vars(self).items()
         return {name: list(one) if isinstance(one, tuple) else one for name, one in given}
-
-
-def recording_support(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
-) -> Support:
-    """Measure what some frames cover.
-
-    Args:
-        dataset: The recordings.
-        frames: Global numbers of the frames.
-        tool_from_camera: The hand-eye transform, shape (4, 4).
-    """
-    from scipy.stats import circstd  # Slow to import.
-
-    names = "world_from_tool", "normal_world", "offset"
-    world_from_tool, normal_world, offset = (dataset.column(name)[frames] for name in names)
-    world_from_camera = world_from_tool @ tool_from_camera
-    normal, offset = plane_in_frame(normal_world, offset, world_from_camera)
-    distance = -offset / normal[:, 2]
-    roll = _roll(world_from_camera, normal_world)
-    return Support(
-        _tilt(normal),
-        math.degrees(circstd(roll.numpy())) if dataset.moves else None,
-        (float(distance.min()), float(distance.max())),
-        _reflectivity_ratio(dataset, frames, tool_from_camera) if dataset.has_amplitude else None,
-    )
 
 
 # Least standard deviation of the tilt, degrees. On simulated walls c0 and t_z correlate by 0.99 for

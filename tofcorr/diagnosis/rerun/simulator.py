@@ -26,7 +26,7 @@ from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions, unambiguous_range
 from tofcorr.geometry.se3 import RigidTransform
-from tofcorr.observables.compare import Observables, compare_observables
+from tofcorr.observables.compare import Observables
 from tofcorr.sensor.model import section_of
 from tofcorr.sensor.sensor_file import (
     ErrorSection,
@@ -509,7 +509,7 @@ def _sections(
     recording = study.observations.recording
     if observables.real_noise.observed.recording is not recording:
         # Its planes were estimated with the rest.
-        observables = compare_observables(recording, None, seed=study.options.seed)
+        observables = Observables(recording, None, seed=study.options.seed)
     curve, observed = observables.real_noise.curve, observables.real_noise.observed
     return {
         # The fixed part may stand among the effects, pixel by pixel.
