@@ -65,8 +65,8 @@ class Dataset:
                     raise CalibrationDataError(f"{other.path}: {differ}; {need} in one setting.")
             if other.frame_names.eye_to_hand != first.frame_names.eye_to_hand:
                 differ = f"the camera stands still in one of this and {first.path}"
-                said = f"{differ}, and the robot carries it in the other; their hand-eye transforms differ"
-                raise CalibrationDataError(f"{other.path}: {said}.")
+                other_one = "the robot carries it in the other; their hand-eye transforms differ"
+                raise CalibrationDataError(f"{other.path}: {differ}, and {other_one}.")
 
     @property
     def first(self) -> Recording:
