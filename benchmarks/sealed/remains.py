@@ -106,8 +106,8 @@ def _holds(interval: Sequence[float | None] | None, value: float) -> bool:
 def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
     observations = study.observations
     theta = study.sums.ols.left_out_coefficients(names)[study.unit_of_pixel]
-    left, start = study.system.residual.clone(), 0
-    for part in study.system.of(names):
+    left, start = study.residual.clone(), 0
+    for part in study.columns_of(names):
         left -= (part * theta[:, start : start + part.shape[1]]).sum(1)
         start += part.shape[1]
     own = noise.reshape(len(noise), -1)[observations.frame.numpy(), observations.pixel.numpy()]

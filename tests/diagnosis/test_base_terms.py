@@ -96,9 +96,7 @@ def test_a_term_never_makes_the_fit_worse(
         without = beside_pixels("pixel_polynomial")
     with_term = beside_pixels(kind)
     weight = without.fit.trust / without.fit.sigma**2
-    squares = [
-        float((weight * study.system.residual_of(()) ** 2).sum()) for study in (with_term, without)
-    ]
+    squares = [float((weight * study.residual_of(()) ** 2).sum()) for study in (with_term, without)]
     # Each fit chooses weights of its own, which changes the sum by a few per mille.
     assert squares[0] < 1.01 * squares[1]
 
@@ -109,7 +107,7 @@ def test_the_simulator_makes_the_error_of_the_base_model(
 ) -> None:
     study = beside_pixels(kind)
     twin = Evidence(study=study, named=unnamed(study)).distance()
-    fitted = study.observations.measured - study.system.residual_of(())
+    fitted = study.observations.measured - study.residual_of(())
     # Tables have knots, and a delay changes the amplitude that the next one depends on.
     assert float((twin - fitted).square().mean().sqrt()) < 3e-4
 

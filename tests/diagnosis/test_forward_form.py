@@ -26,7 +26,7 @@ def _point_to_plane(study: Study) -> tuple[Tensor, Tensor, Tensor]:
     slope = (normal * directions).sum(1, keepdim=True)
     # The same columns as the forward form's, but of the measured distance.
     error = study.fit.model.error_columns(measured) * slope
-    hand_eye = study.system.columns[BASE][:, : study.fit.model.num_hand_eye] * slope
+    hand_eye = study.columns[BASE][:, : study.fit.model.num_hand_eye] * slope
     scale = normal * facts.world_from_tool[frame, :3, 3]
     return residual, torch.cat([hand_eye, error], dim=1), scale
 

@@ -67,7 +67,7 @@ def test_a_floor_is_no_larger_than_what_is_left_inside_images(
     """However large the noise is said to be, here by half too large."""
     known = BaseFit.floor.func  # type: ignore[attr-defined]
     monkeypatch.setattr(BaseFit, "floor", property(lambda fit: 1.5 * known(fit)))
-    left, share = time_named.study.system.residual_of(time_named.columns), time_study.fit.share
+    left, share = time_named.study.residual_of(time_named.columns), time_study.fit.share
     whole = float((share * left**2).sum() / share.sum()) ** 0.5
     assert 0.95 * whole < noise_floor(time_named).size <= whole
 

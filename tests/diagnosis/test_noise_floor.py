@@ -35,7 +35,7 @@ def _with_residual(study: Study, residual: Tensor) -> Study:
     weighted = study.sums.weighted.clone()
     weighted[:, -1] = weighted[:, :, -1] = 0.0
     sums = replace(study.sums, weighted=weighted)
-    return replace(study, system=replace(study.system, residual=residual, sums=sums))
+    return replace(study, residual=residual, sums=sums)
 
 
 def _noise(study: Study, seed: int, width: float = 0.0) -> Tensor:
@@ -78,7 +78,7 @@ def test_stripes_that_move_from_frame_to_frame_are_found_under_filtered_noise(
 def test_neither_the_noise_nor_the_poses_offsets_matter(nothing_study: Study) -> None:
     noise = _noise(nothing_study, 5)
     first = unlike_waves(_with_residual(nothing_study, noise), ())
-    poses = torch.full((nothing_study.system.sums.num_units, 3), 2e-3, dtype=torch.float64)
+    poses = torch.full((nothing_study.sums.num_units, 3), 2e-3, dtype=torch.float64)
     moved = 3 * noise + nothing_study.pose_surface(poses)
     again = unlike_waves(_with_residual(nothing_study, moved), ())
     assert again.p_value == pytest.approx(first.p_value, rel=1e-3)

@@ -17,13 +17,13 @@ from tofcorr.simulation.effects import CATALOGUE
 
 def _density(study: Study, sizes: dict[str, float], unit: int, prior: Tensor) -> float:
     """Return the log density of a pose given all others, pixel by pixel."""
-    columns = torch.cat(study.system.of(list(sizes)), dim=1)
-    known, spread = study.system.residual, study.sums.pose_sd.diag() ** 2
+    columns = torch.cat(study.columns_of(list(sizes)), dim=1)
+    known, spread = study.residual, study.sums.pose_sd.diag() ** 2
     precision, right = prior.clone(), torch.zeros(len(prior), dtype=torch.float64)
     parts = []
     for number in range(study.sums.num_units):
         own = study.unit_of_pixel == number
-        turns = study.system.pose[own]
+        turns = study.pose[own]
         covariance = (1 / study.weight[own]).diag() + turns @ spread @ turns.T
         parts.append((columns[own], known[own], covariance))
         if number != unit:
@@ -58,7 +58,7 @@ def test_the_temperature_is_the_variance_of_the_scores(nothing_study: Study) -> 
     """One where poses depart by pixel noise, four where by twice as much."""
     generator = torch.Generator().manual_seed(8)
     sums = replace(nothing_study.sums, dispersion=1.0)
-    study = replace(nothing_study, system=replace(nothing_study.system, sums=sums))
+    study = replace(nothing_study, sums=sums)
     deviation = study.weight.clamp(min=1e-12) ** -0.5
     noise = deviation * torch.randn(len(deviation), generator=generator, dtype=torch.float64)
     own = sums.pose_sd * torch.randn(sums.num_units, 3, generator=generator).double()
@@ -66,7 +66,7 @@ def test_the_temperature_is_the_variance_of_the_scores(nothing_study: Study) -> 
     for factor in (1.0, 2.0):
         drawn = with_residual(study, factor * (noise + study.pose_surface(own)))
         known = replace(drawn.sums, dispersion=1.0, pose_sd=sums.pose_sd)
-        drawn = replace(drawn, system=replace(drawn.system, sums=known))
+        drawn = replace(drawn, sums=known)
         temperatures.append(Evidence(drawn).temperature({}))
     assert temperatures[0] == pytest.approx(1, abs=0.4)
     assert temperatures[1] == pytest.approx(4 * temperatures[0], rel=0.5)

@@ -91,7 +91,7 @@ def test_the_fitted_simulator_measures_what_the_fit_predicts(
     """Tables, hand-eye transform and effect pass through the whole simulator unharmed."""
     study, named = time_diagnosis.evidence.study, time_diagnosis.evidence.named
     twin = time_diagnosis.evidence.distance()
-    fitted = study.observations.measured - named.study.system.residual_of(named.columns)
+    fitted = study.observations.measured - named.study.residual_of(named.columns)
     # The fit is linear around the base fit; the simulator is not.
     assert float((twin - fitted).square().mean().sqrt()) < 2e-4
 

@@ -49,7 +49,7 @@ def test_what_a_filter_makes_neighbours_share_is_measured_and_is_no_structure(
     shared = study.fit.shared
     assert shared.from_repeats == (changes is REPEATED)
     assert shared.share["squares"] == pytest.approx(_shared_in_squares(), rel=0.2)
-    left = coherence(study, study.system.residual_of(()))
+    left = coherence(study, study.residual_of(()))
     assert abs(left.within) < 4 * left.within_error
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
@@ -65,7 +65,7 @@ def test_a_filter_is_measured_from_some_poses_of_a_long_recording(
         frames.append(len(values))
         return Lags(values, used)
 
-    monkeypatch.setattr(shared_noise, "_MOST_PIXELS", 24 * 32 * 20)
+    monkeypatch.setattr(shared_noise, "MOST_PIXELS", 24 * 32 * 20)
     monkeypatch.setattr(shared_noise, "Lags", noted)
     study = _filtered(tmp_path / "filtered", longer, 3)
     assert study.fit.shared.share["squares"] == pytest.approx(_shared_in_squares(), rel=0.2)
@@ -114,7 +114,7 @@ def test_repeats_show_a_filter_where_a_recording_is_thinned_out(tmp_path: Path) 
     study = prepare(recording, options).study
     assert study.fit.shared.from_repeats
     assert study.fit.shared.share["squares"] > 0.1
-    left = coherence(study, study.system.residual_of(()))
+    left = coherence(study, study.residual_of(()))
     assert abs(left.within) < 4 * left.within_error
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 

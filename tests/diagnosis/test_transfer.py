@@ -36,15 +36,14 @@ def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetr
 
 def test_poses_that_are_held_out_have_no_influence_on_what_is_fitted(nothing_study: Study) -> None:
     held_out = nothing_study.folds.argmax(0) < 3
-    system = nothing_study.system
-    plain = system.sums.plain + 1e3 * held_out[:, None, None]
-    wild = replace(system, sums=replace(system.sums, plain=plain))
+    sums = nothing_study.sums
+    wild = replace(sums, plain=sums.plain + 1e3 * held_out[:, None, None])
     fitted = [
         fitted_to(study, ~held_out, ()).sums.ols.solve(())
-        for study in (nothing_study, replace(nothing_study, system=wild))
+        for study in (nothing_study, replace(nothing_study, sums=wild))
     ]
     assert torch.equal(*fitted)
-    assert not torch.allclose(fitted[0], system.sums.ols.solve(()))
+    assert not torch.allclose(fitted[0], sums.ols.solve(()))
 
 
 def test_the_simulator_that_took_the_recording_has_its_noise(

@@ -46,6 +46,7 @@ from tofcorr.diagnosis.sums.base import (
     fit_base,
 )
 from tofcorr.diagnosis.sums.observations import (
+    TINY,
     Observations,
     effect_inputs,
     observe,
@@ -237,10 +238,9 @@ def _with_base_pattern(study: Study) -> Study:
     kind = CATALOGUE[term.kind]
     pattern = kind.for_recording(study.inputs)
     assert isinstance(pattern, MapEffect)
-    residual = study.system.residual_of(())
+    residual = study.residual_of(())
     spread = None if term.spread_mm == "auto" else term.spread_mm / 1000
-    # A micrometre at least, so that the inverse of the spread is finite.
-    fitted = FittedMap(study, pattern, residual, prior_sd=spread, least_sd=1e-6)
+    fitted = FittedMap(study, pattern, residual, prior_sd=spread, least_sd=TINY)
     study = without_map(study, fitted.values, {kind.name, *kind.contains})
     return replace(study, pattern=pattern.with_coefficients(fitted.whole()))
 

@@ -189,9 +189,8 @@ def _carried(study: Study, real: Observations, here: EffectInputs) -> tuple[Tens
         here: What effects may depend on there, with the simulator's hand-eye transform.
 
     Returns:
-        The error there, (M,), metres; columns of what is uncertain of it, (M, J), metres, without
-        directions that change no finding; and the root mean square error on held-out poses in
-        excess of noise, metres.
+        The error there, (M,), metres; columns of what is uncertain of it, (M, J), metres; and the
+        root mean square error on held-out poses in excess of noise, metres.
     """
     names = _needed(study)
     study = relinearised(with_poses_reestimated(study, names), names)
@@ -210,16 +209,16 @@ def _carried(study: Study, real: Observations, here: EffectInputs) -> tuple[Tens
         columns.append(effect.slope(here, own) * effect.prior_sd())
     kinds = [kind for kind in CATALOGUE.values() if issubclass(kind, MapEffect)]
     pattern = max(kinds, key=lambda kind: len(kind.contains)).for_recording(study.inputs)
-    fixed = FittedMap(study, pattern, study.system.residual_of(names, gls=True), least_sd=1e-5)
+    fixed = FittedMap(study, pattern, study.residual_of(names, gls=True), least_sd=TINY)
     error = error + pattern.shift(here, fixed.whole())
     left = study.left_out_mean_square(names) - fit.floor**2 - fixed.prior_sd**2
     # The matrix is singular to rounding where the frames determine a coefficient very well.
     variance, turn = torch.linalg.eigh(covariance[carried][:, carried])
     uncertain = torch.cat(columns, dim=1) @ (turn * variance.clamp(min=0.0).sqrt())
     directions = uncertain @ torch.linalg.eigh(uncertain.T @ uncertain)[1]
-    size = directions.square().mean(0).sqrt()
-    order = size.argsort(descending=True)[:24]
-    return error, directions[:, order[size[order] > 1e-5]], max(left, 0.0) ** 0.5
+    # Beyond the largest two dozen none changes a finding.
+    largest = directions.square().mean(0).argsort(descending=True)[:24]
+    return error, directions[:, largest], max(left, 0.0) ** 0.5
 
 
 def _needed(study: Study) -> list[str]:

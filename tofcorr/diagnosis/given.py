@@ -35,6 +35,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import Alignment, judged
 from tofcorr.plausibility.checks.geometry import agreement
+from tofcorr.plausibility.finding import CAMERA, LARGEST_GAP
 from tofcorr.plausibility.look import Look
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import default_hand_eye
@@ -177,11 +178,9 @@ def frames_of(returned: Any, recording: Recording) -> Recording:  # noqa: ANN401
 # metres for the position of the tool and the distance of the target's plane, radians for the turn
 # of either. Chosen: geometry is corrected for the difference, and errors of a camera hardly change.
 _TOLERANCE = 1e-3
-# Frames within this share of the tolerance of the nearest one are renders of one pose. Chosen: what
-# the rounding of a text file leaves.
-_SAME_POSE = 0.01
-# Relative difference of two equal values of a condition. Chosen: the rounding of a text file.
-_SAME_CONDITION = 1e-5
+# What the rounding of a text file changes at most: metres and radians of a pose or a plane, and a
+# share of a condition. Chosen.
+_ROUNDING = 1e-5
 
 
 def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
@@ -200,13 +199,12 @@ def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
     exact = "donot_use_mm_for_euclid_dist"
     apart = [torch.cdist(own, other, compute_mode=exact) for own, other in places]
     away = torch.stack(apart).amax(0).numpy()
-    found = away <= np.minimum(away.min(1, keepdims=True) + _SAME_POSE, 1.0)
+    found = away <= np.minimum(away.min(1, keepdims=True) + _ROUNDING, _TOLERANCE)
     alike = [real.frames.target[:, None] == simulated.frames.target]
     for name in CONDITIONS:
         own, others = (getattr(recording.frames, name) for recording in (real, simulated))
         if own is not None and others is not None:
-            limit = _SAME_CONDITION * np.abs(own[:, None])
-            alike.append(np.abs(others - own[:, None]) <= limit)
+            alike.append(np.abs(others - own[:, None]) <= _ROUNDING * np.abs(own[:, None]))
     for same in alike:
         found = np.where((found & same).any(1, keepdims=True), found & same, found)
     return [torch.from_numpy(np.flatnonzero(row)) for row in found]
@@ -215,22 +213,22 @@ def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
 def _places(recording: Recording) -> list[np.ndarray]:
     """Return position and turn of the tool, and normal and distance of the plane there, (F, ...).
 
-    Unit: the tolerance.
+    In metres and radians.
     """
     pose = recording.frames.world_from_tool
     normal, offset = (values.numpy() for values in planes_in_tool(recording))
     # A turn by a small angle changes a rotation matrix by sqrt(2) times the angle.
     turn = pose[:, :3, :3].reshape(-1, 9) / np.sqrt(2)
-    return [part / _TOLERANCE for part in (pose[:, :3, 3], offset[:, None], turn, normal)]
+    return [pose[:, :3, 3], offset[:, None], turn, normal]
 
 
 def repeats_of(recording: Recording) -> np.ndarray:
     """Return a number for each frame without a pose_id; renders of one pose share it, (F,)."""
     table = recording.frames
     _, target = np.unique(table.target, return_inverse=True)
-    rows = [np.round(np.concatenate(_places(recording), axis=1) / _SAME_POSE), target[:, None]]
+    rows = [np.round(np.concatenate(_places(recording), axis=1) / _ROUNDING), target[:, None]]
     if table.integration_time is not None:
-        rows.append(np.round(np.log(table.integration_time) / _SAME_CONDITION)[:, None])
+        rows.append(np.round(np.log(table.integration_time) / _ROUNDING)[:, None])
     keys = np.nan_to_num(np.concatenate(rows, axis=1), nan=-1.0)
     return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
@@ -357,14 +355,13 @@ def refuse_without_truth(simulated: Recording, observations: Observations) -> No
     between = between - between.mean()
     slope = float(between @ difference[difference.isfinite()] / (between @ between).clamp(min=TINY))
     # It is 0 if the kind of depth is right, and -1 if it is the other one.
-    if abs(slope + 1) < 0.3:
+    if abs(slope + 1) < 0.5:
         raise CalibrationDataError(
             f"{simulated.path}: its depth differs from its own planes as depth_kind {other} "
             f"does from {simulated.depth_kind}; render {simulated.depth_kind} depth, or correct "
             "depth_kind in their own recording.yaml."
         )
-    # No depth camera is as wrong, and every mistaken axis or unit gives more.
-    if not off <= 0.3:
+    if not off <= LARGEST_GAP:  # Every mistaken axis or unit gives more.
         raise CalibrationDataError(
             f"{simulated.path}: its depth is {off:.2f} m off from its own planes; check "
             "tool_from_camera and its axes (x right, y down, z forward), the planes in "
@@ -406,8 +403,7 @@ def _refuse_guess(simulated: Recording) -> None:
     except ConfigError:  # Not a file of this program: the frames themselves tell.
         return
     shift, turn = se3.apart(true, torch.as_tensor(simulated.tool_from_camera))
-    # A tenth of the least gap that matters, metres and radians.
-    if max(shift, turn) <= 1e-4:
+    if max(shift, turn) <= _ROUNDING:
         return
     raise CalibrationDataError(
         f"{simulated.path}: its tool_from_camera is a guess, as a robot's user would make it: "
@@ -418,17 +414,14 @@ def _refuse_guess(simulated: Recording) -> None:
 
 
 def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) -> None:
-    """Refuse a transform far from where the frames agree with their planes.
+    """Refuse a transform under which the frames disagree with their planes as no camera does.
 
-    Errors of a depth camera move it by millimetres and tenths of a degree, not by 50 mm or two
-    degrees. Directions that the frames do not determine leave no misfit.
+    Directions that the frames do not determine leave no misfit.
     """
     stated = np.asarray(simulated.tool_from_camera)
-    shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
-    if shift <= 0.05 and turn <= math.radians(2.0):
-        return
     misfit = judged(look.scene, stated, best.constant, best.slope).misfit
-    if misfit > max(0.02, 4 * best.misfit):
+    if misfit > max(CAMERA, 4 * best.misfit):
+        shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
         raise CalibrationDataError(
             f"{simulated.path}: its frames agree with its planes if the camera sits "
             f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "

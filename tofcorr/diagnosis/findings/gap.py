@@ -148,7 +148,7 @@ def measure_gap(
         own, least, most = explained.numpy().T
         given = np.minimum(np.maximum(own + squares[:, 1].clip(min=0), least), most.clip(min=0))
         as_given = Estimated.of(np.sqrt(given.clip(min=0)))
-    structure = coherence(study, study.system.residual_of(()))
+    structure = coherence(study, study.residual_of(()))
     between = float(np.clip(structure.between, 0.0, before**2))
     fixed = float(np.clip(structure.fixed, 0.0, before**2 - between))
     count = study.fit.model.num_hand_eye if named.columns else 0
@@ -319,9 +319,9 @@ def judge_remainder(study: Study, named: NamedEffects, gap: Gap) -> OpenSet:
         gap: Before and after them.
     """
     options, tiny, poses = study.options, OpenSet.least_variance, study.sums.num_units
-    theta, system = named.study.sums.ols.solve(named.with_probes), named.study.system
-    known = len(system.sums.layout.of(named.columns))
-    left = system.residual - system.times(named.columns, theta[:known])
+    theta = named.study.sums.ols.solve(named.with_probes)
+    known = len(named.study.sums.layout.of(named.columns))
+    left = named.study.residual - named.study.times(named.columns, theta[:known])
     after = coherence(named.study, left)
     allowed, target = allowed_scatter(study, after), options.target_gap_mm / 1000
 

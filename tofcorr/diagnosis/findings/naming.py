@@ -181,7 +181,7 @@ def _beside(study: Study, model: Model, evidence: Evidence) -> Study:
     columns = [name for name in model if name in study.sums.layout.effects]
     sums = with_poses_reestimated(evidence.without_map_of(model), columns).sums
     known = replace(study.sums, dispersion=sums.dispersion, pose_sd=sums.pose_sd)
-    return relinearised(replace(study, system=replace(study.system, sums=known)), columns)
+    return relinearised(replace(study, sums=known), columns)
 
 
 def _without_probes(models: Models, probability: Tensor) -> dict[Model, float]:

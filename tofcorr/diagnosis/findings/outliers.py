@@ -184,9 +184,8 @@ def _at_edges(observations: Observations, images: Tensor, ratio: float) -> Tenso
     for frame, (start, end) in enumerate(observations.frame_ends):
         image = images[frame][None].float()
         high, low = max_pool2d(image, 3, 1, 1)[0], -max_pool2d(-image, 3, 1, 1)[0]
-        near = (high / low.clamp(min=1e-3 * high)).nan_to_num(1.0)
-        near = torch.where(observations.on_target[frame], near, 1.0)
-        found.append(near.flatten()[observations.pixel[start:end]] > ratio)
+        there = (high > ratio * low) & observations.on_target[frame]
+        found.append(there.flatten()[observations.pixel[start:end]])
     return torch.cat(found)
 
 

@@ -43,6 +43,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import (
+    LEAST_LEFT,
     FittedMap,
     Study,
     absorbed_share,
@@ -76,11 +77,10 @@ class Evidence:
         self._study = study
         sums, base = study.sums.gls, study.sums.layout.base
         left = {name: 1 - absorbed_share(study, name) for name in sums.layout.effects}
-        # Of less than a thousandth nothing can be said but rounding.
         self.columns = {
             name: slice(low - base, high - base)
             for name, (low, high) in sums.layout.effects.items()
-            if left[name] > 1e-3
+            if left[name] > LEAST_LEFT
         }
         pixels = study.sums.ols.scale * float(study.sums.count.sum())
         # The root mean square of each at one prior standard deviation, metres; see `SIZES`.
@@ -93,7 +93,7 @@ class Evidence:
         self._factor = torch.linalg.cholesky(_regular(normal))
         self._base = _solved(self._factor, some[:, :base, base:])
         self.gram = some[:, base:, base:] - self._base.mT @ self._base
-        residual = study.system.residual_of(beside, gls=True)
+        residual = study.residual_of(beside, gls=True)
         self.maps = {n: FittedMap(study, e, residual) for n, e in study.candidates.maps.items()}
         self._studies = {"": study}
         self._given: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
@@ -106,7 +106,7 @@ class Evidence:
         """Return the study with a model's map subtracted, and poses as uncertain as before."""
         of_map = self.map_of(model)
         if of_map not in self._studies:
-            residual = self._study.system.residual - self.maps[of_map].values
+            residual = self._study.residual - self.maps[of_map].values
             self._studies[of_map] = with_residual(self._study, residual, None)
         return self._studies[of_map]
 
@@ -199,7 +199,7 @@ class Evidence:
         ratios = []
         for name in self.columns:
             own = torch.arange(*layout.effects[name])
-            own = own[left[own] > 1e-3 * total.diagonal()[own]]
+            own = own[left[own] > LEAST_LEFT * total.diagonal()[own]]
             if name not in names and len(own):
                 ratios.append(float((score[:, own].square().sum(0) / left[own]).mean()))
         return max(1.0, float(torch.tensor(ratios or [1.0]).quantile(0.9)))

@@ -48,13 +48,15 @@ from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study, fitted_coefficients, hidden_effects
 from tofcorr.error_terms.base import Term
-from tofcorr.estimation.robust import student_quantile
+from tofcorr.estimation.robust import LEVEL, student_quantile
 from tofcorr.simulation.effects import CATALOGUE
 
 # The cause that a constant counts as: a wall cannot tell whose it is.
 _OF_CONSTANT = "distance"
 HAND_EYE = "hand_eye"
 """The name of the hand-eye transform as a cause."""
+TWO_SIDED = student_quantile(1 - LEVEL / 2, math.inf)
+"""Standard errors from a normal estimate to either end of its interval."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Sh
             start = end
         if study.pattern is not None:
             members.setdefault(study.pattern.name, ())
-            offsets[study.pattern.name] = study.fit.residual - study.system.residual
+            offsets[study.pattern.name] = study.fit.residual - study.residual
     for name in named.names:  # They come last.
         members[name] = (*members.pop(name, ()), *places.get(name, ()))
         offsets[name] = _beyond_columns(study, named, name)
@@ -144,7 +146,7 @@ def _bent(study: Study) -> Tensor | None:
     poses = study.fit.tool_from_camera, study.fit.known.tool_from_camera
     here, there = (predicted_distance(study.observations, pose) for pose in poses)
     twist = twist_of(study)
-    return here - there - study.system.columns[BASE][:, : len(twist)] @ twist
+    return here - there - study.columns[BASE][:, : len(twist)] @ twist
 
 
 def twist_of(study: Study) -> Tensor:
@@ -165,10 +167,10 @@ def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | No
     if [n for n in named.columns if not effects[n].linear] == [name]:
         # What the fit itself subtracted: its last linearisation, not a step beyond it, where a
         # signal near saturation may jump.
-        kept = named.study.system.residual + sum(named.maps.values())
-        return study.system.residual - kept
+        kept = named.study.residual + sum(named.maps.values())
+        return study.residual - kept
     own = fitted_coefficients(named.study, named.columns)[name]
-    slope = named.study.system.columns[name]
+    slope = named.study.columns[name]
     return effects[name].shift(study.inputs, own) - slope @ (own / effects[name].prior_sd())
 
 
@@ -346,12 +348,12 @@ def parts_of(
             what models miss.
     """
     model, sums, tests = study.fit.model, named.study.sums.ols, study.options.tests
-    fitted, columns = sums.of(named.columns), named.study.system.of(named.columns)
+    fitted, columns = sums.of(named.columns), named.study.columns_of(named.columns)
     start = torch.zeros(len(fitted[2]), dtype=torch.float64)
     # The gap as given is of all pixels alike; after recalibration noisy ones count less.
     weight, shared = study.fit.trust, residual
     if shared is None:
-        shared, weight = study.system.residual, study.fit.share
+        shared, weight = study.residual, study.fit.share
     else:
         start[: model.num_hand_eye] = twist_of(study)
         start[model.num_geometry : model.num_columns] = study.fit.coefficients
@@ -397,7 +399,7 @@ def hidden_shares(
     centred, whole, widths = refitted.centred, float(refitted.products[-2, -2]), []
     if whole <= 0:
         return [0.0] * len(parts.causes)
-    reach = _two_sided() * math.sqrt(unexplained / (len(centred) - 1) / whole)
+    reach = TWO_SIDED * math.sqrt(unexplained / (len(centred) - 1) / whole)
     for cause in parts.causes:
         known = square = float(centred[-1, -1])
         if cause.kind == "parameter":
@@ -407,11 +409,6 @@ def hidden_shares(
             known = min(float(right @ torch.linalg.solve(gram + ridge, right)), square)
         widths.append(reach * math.sqrt(max(known, 0.0)))
     return widths
-
-
-def _two_sided(level: float = 0.95) -> float:
-    """Return the standard deviations on either side that hold a share of normal values."""
-    return student_quantile((1 + level) / 2, math.inf)
 
 
 def shrinkage_of_values(parts: Parts, refitted: Refitted) -> list[float]:
@@ -429,7 +426,7 @@ def shrinkage_of_values(parts: Parts, refitted: Refitted) -> list[float]:
     rest = 2 * right - inner @ refitted.coefficients.sum(0)
     slopes = (parts.owned * rest[:fitted]) - (refitted.coefficients @ inner)[:, :fitted]
     variances = torch.einsum("kp,pq,kq->k", slopes, covariance, slopes)
-    return (_two_sided() * variances.clamp(min=0).sqrt()).tolist()
+    return (TWO_SIDED * variances.clamp(min=0).sqrt()).tolist()
 
 
 def values_beside_base(parts: Parts, weights: Tensor) -> Tensor:

@@ -132,7 +132,7 @@ def without_pose(study: Study, residual: Tensor, *, ridge: float = 1e-3) -> tupl
     inner = inner + ridge * torch.eye(3, dtype=torch.float64)
     surface = study.pose_surface(torch.linalg.solve(inner, score))
     covariance = torch.linalg.inv(inner)[study.unit_of_pixel]
-    pose, share = study.system.pose, study.fit.share
+    pose, share = study.pose, study.fit.share
     noise = ((pose[:, None, :] @ covariance)[:, 0] * pose).sum(1)
     between = float((share * (surface**2 - noise)).sum() / share.sum())
     return residual - surface, between
@@ -214,7 +214,7 @@ def unlike_waves(study: Study, chosen: Sequence[str]) -> Structure:
         The p-value of the strongest, adjusted for their number; and the mean square that they add
         beyond what each of them has by noise.
     """
-    squares, seen, weight = _energies(study, study.system.residual_of(chosen, gls=True))
+    squares, seen, weight = _energies(study, study.residual_of(chosen, gls=True))
     own = squares.sum(1) / seen.sum(1).clamp(min=_LEAST_SEEN)
     known = own > 0
     if seen.shape[1] < 2 or not bool(known.any()):
@@ -245,7 +245,7 @@ def _energies(study: Study, left: Tensor, *, ridge: float = 1e-6) -> tuple[Tenso
     """
     step = slice(None, None, max(1, len(left) // 100_000))  # More would take longer than 50 ms.
     observations, weight = study.observations.at(step), study.weight[step]
-    pose, count = study.system.pose[step], study.system.pose.shape[1]
+    pose, count = study.pose[step], study.pose.shape[1]
     columns = torch.cat([pose, _waves(study, step), left[step, None]], dim=1)
     sums = observations.products(columns * weight[:, None], columns)
     size = sums.diagonal(dim1=1, dim2=2).clamp(min=TINY).sqrt()
@@ -307,7 +307,7 @@ def noise_floor(named: NamedEffects, *, sure: float = 0.01) -> NoiseFloor:
         sure: Waves with at most this p-value are no noise. The usual convention.
     """
     study, fit, found = named.study, named.study.fit, named.study.fit.shared
-    left = study.system.residual_of(named.columns)
+    left = study.residual_of(named.columns)
     if named.columns and not found.from_repeats:
         found = shared_noise(study.observations, left, fit.sigma, fit.trust)
         if study.observations.is_sample:  # Whole images said more of it.

@@ -19,6 +19,7 @@ from torch import Tensor
 from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.estimation.robust import LEVEL
 from tofcorr.geometry.se3 import by_frame
 from tofcorr.simulation.effects.base import is_clock
 
@@ -26,15 +27,9 @@ Interval = tuple[float, float]
 StageName = Literal["as_given", "recalibrated", "with_effects"]
 
 
-def interval_of(draws: Sequence[float], estimate: float, *, level: float = 0.95) -> Interval:
-    """Return the percentile interval, widened to contain the estimate.
-
-    Args:
-        draws: Of a quantity.
-        estimate: Of the same quantity.
-        level: Coverage of all intervals. The usual convention.
-    """
-    low, high = np.quantile(list(draws), [(1 - level) / 2, (1 + level) / 2])
+def interval_of(draws: Sequence[float], estimate: float) -> Interval:
+    """Return the percentile interval of some draws, widened to contain the estimate."""
+    low, high = np.quantile(list(draws), [LEVEL / 2, 1 - LEVEL / 2])
     return min(float(low), estimate), max(float(high), estimate)
 
 
@@ -126,7 +121,7 @@ the covariate scaled to a range from 0 to 1, shape (M,)."""
 
 def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
     """Return residuals of a model of some effects with the variance of the errors, (M,), metres."""
-    parts, left = study.system.of(chosen), study.system.residual
+    parts, left = study.columns_of(chosen), study.residual
     theta = study.sums.ols.left_out_solutions(chosen)[study.observations.unit][:, :, None]
     of_parts = theta.split([part.shape[1] for part in parts], dim=1)
     for part, own in zip(parts, of_parts, strict=True):
@@ -213,7 +208,7 @@ def flipped(
     signs = torch.cat([torch.ones_like(study.signs[:1]), study.signs]).T
     if chosen is None:
         return lambda sums, place, along: sums @ signs
-    columns, ols = study.system.of(chosen), study.sums.ols
+    columns, ols = study.columns_of(chosen), study.sums.ols
     weighted = (ols.scale * study.fit.share * residual)[:, None]
     scores = [study.observations.products(own, weighted)[..., 0] for own in columns]
     theta = torch.linalg.solve(ols.normal(chosen), torch.cat(scores, dim=1).T @ signs)
@@ -307,8 +302,9 @@ def _assembled(
     spread = torch.maximum(total[:, 1:].square().mean(1).sqrt(), least_left * spread)
     scaled = torch.where(enough[:, None], total.abs() / spread.clamp(min=TINY)[:, None], 0.0)
     observed, largest = scaled[:, 0], scaled[:, 1:].amax(0)
-    p_values = (1 + (largest >= (1 - rounding) * observed[:, None]).sum(1)) / (len(largest) + 1)
-    critical, weight = float(torch.quantile(largest, 0.95)), counts.sum(1).clamp(min=TINY)
+    as_large = (largest >= (1 - rounding) * observed[:, None]).sum(1).double()
+    p_values = (1 + as_large) / (len(largest) + 1)
+    critical, weight = float(torch.quantile(largest, 1 - LEVEL)), counts.sum(1).clamp(min=TINY)
     bias, half = total[:, 0] / weight, critical * spread / weight
     found = []
     for place in observed[: len(regions)].argsort(descending=True, stable=True).tolist():

@@ -18,7 +18,14 @@ from tofcorr.diagnosis.sums.observations import (
     effect_inputs,
     predicted_distance,
 )
-from tofcorr.diagnosis.sums.study import Study, absorbed_share, hidden_effects, left_over, signal
+from tofcorr.diagnosis.sums.study import (
+    LEAST_LEFT,
+    Study,
+    absorbed_share,
+    hidden_effects,
+    left_over,
+    signal,
+)
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.base import is_clock
@@ -164,7 +171,7 @@ def _sums(
     pose, layout = study.fit.tool_from_camera, study.sums.layout
     inputs = effect_inputs(made, pose)
     seen = (inputs.radial_distance > _NEAREST) & (inputs.incidence_cosine > steepest)
-    base = study.fit.model.on(made).columns(pose)
+    _, base = study.fit.model.on(made).linearised(pose)
     # What is uncertain of the simulator's own error, or of the amplitude, is not computed anew.
     rest = base.new_zeros(len(base), layout.base - base.shape[1])
     columns = {BASE: torch.cat([base, rest], dim=1)}
@@ -208,10 +215,10 @@ def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str
         if name not in study.candidates.effects:  # A map of independent values.
             needed = noncentrality(study, len(study.candidates.maps[name].coefficients))
             detectable = (needed / float(study.weight.sum())) ** 0.5
-            found[name] = max(detectable, study.material_mm * 1e-3)
+            found[name] = max(detectable, study.material_mm / 1000)
             continue
         found[name] = None
-        if absorbed_share(study, name) > 0.999:  # The rest is rounding error.
+        if 1 - absorbed_share(study, name) < LEAST_LEFT:
             continue
         size = len(range(*study.sums.layout.effects[name]))
         drawn = torch.randn(64, size, generator=generator, dtype=torch.float64)
@@ -239,19 +246,17 @@ def _of_columns(study: Study, name: str, drawn: Tensor) -> float:
     gls, ols = study.sums.gls, study.sums.ols
     own = torch.arange(*ols.layout.effects[name])
     members = torch.arange(study.fit.model.num_columns)
-    plain = ols.total / (ols.scale * study.sums.count.sum())
-    # So that the base model's system can be solved: four digits above the rounding of float64.
-    ridge = 1e-12 * torch.eye(len(members), dtype=torch.float64)
+    prior, pixels = ols.layout.prior_of(members), ols.scale * float(study.sums.count.sum())
     signal, size, remains = (
         torch.einsum("di,ij,dj->d", drawn, matrix, drawn).clamp(min=TINY)
         for matrix in (
-            left_over(gls.total, members, own, ols.layout.prior_of(members)),
-            plain[own][:, own],
-            left_over(plain, members, own, ridge),
+            left_over(gls.total, members, own, prior),
+            ols.total[own][:, own],
+            left_over(ols.total, members, own, prior),
         )
     )
-    detectable = (size / signal * noncentrality(study, len(own))).sqrt()
-    reportable = (size / remains).sqrt() * study.material_mm * 1e-3
+    detectable = (size / pixels / signal * noncentrality(study, len(own))).sqrt()
+    reportable = (size / remains).sqrt() * study.material_mm / 1000
     return float(torch.maximum(detectable, reportable).median())
 
 

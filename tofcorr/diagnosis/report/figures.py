@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tofcorr.diagnosis.findings.where import Estimated, Interval, Stage
+from tofcorr.diagnosis.findings.shares import TWO_SIDED
+from tofcorr.diagnosis.findings.where import Estimated, Interval
 from tofcorr.diagnosis.report.words import (
     SHARE_ENDS,
-    SIGNIFICANT,
     STAGE_WORDS,
     axis_label,
     cause_words,
@@ -24,7 +25,7 @@ from tofcorr.diagnosis.report.words import (
     stages_shown,
 )
 from tofcorr.diagnosis.sums.study import absorption_table
-from tofcorr.estimation.robust import student_quantile
+from tofcorr.estimation.robust import LEVEL
 from tofcorr.observables.figures import drawings as observable_drawings
 from tofcorr.plausibility.page import BLUE, FAINT, GREY, RED, line_across, panels
 
@@ -35,8 +36,6 @@ STAGE_COLOURS = {"as_given": GREY, "recalibrated": RED, "with_effects": BLUE}
 """The colour of a stage in every figure."""
 _LIGHT_BLUE = "#8fbbd9"
 _KIND_COLOURS = {"parameter": GREY, "effect": RED, "unexplained": "#bbbbbb"}
-# Characters of the longest label in one line. Set by hand: what leaves room for the bars.
-_LONG = 22
 
 
 def all_figures(result: "DiagnosisResult") -> dict[str, Figure]:
@@ -121,23 +120,23 @@ def _bars(
         axes.annotate(f"  {words(size)}", (1, place), xycoords=where, va="center", fontsize=9)
     margin = (max(ends) - min(ends)) / 30
     axes.set_xlim(min(ends) - margin if min(ends) < 0 else 0.0, max(ends) + (margin or 1.0))
-    # A long label is broken before what stands in brackets.
-    names = [bar[0] if len(bar[0]) <= _LONG else bar[0].replace(" (", "\n(") for bar in bars]
-    axes.set_yticks(places, names, fontsize=9)
+    # A label is broken before what stands in brackets, so that room is left for the bars.
+    axes.set_yticks(places, [name.replace(" (", "\n(") for name, *_ in bars], fontsize=9)
     axes.set_xlabel(label)
     return figure, axes
 
 
-def covariate_strips(result: "DiagnosisResult", stages: Sequence[Stage], most: int) -> Figure:
-    """Draw the bias along the covariates of `most_biased` at the first of the stages.
+def covariate_strips(result: "DiagnosisResult", *, as_given: bool = False) -> Figure:
+    """Draw the bias along the covariates of `most_biased`, six at most.
 
     Args:
         result: What was found.
-        stages: One or more, which are drawn over each other.
-        most: Covariates that are drawn at most.
+        as_given: Whether of the simulator as given; else after recalibration, where they are
+            chosen, and over that with the effects.
     """
+    stages = stages_shown(result)[:1] if as_given else stages_shown(result, fitted=True)
     by_stage = [one.by_covariate() for one in stages]
-    groups = most_biased(by_stage[0])[:most]
+    groups = most_biased(by_stage[0])[:6]
     rows = max(1, -(-len(groups) // 2))
     figure, found = panels(2 * rows, rows, 2)
     for axes in found[len(groups) :]:
@@ -154,7 +153,7 @@ def covariate_strips(result: "DiagnosisResult", stages: Sequence[Stage], most: i
         line_across(axes)
         axes.set_xlabel(axis_label(name))
         best = min(region.p_value for region in regions)
-        colour = RED if best <= SIGNIFICANT else GREY
+        colour = RED if best <= LEVEL else GREY
         least = 1 / (result.options.tests.flips + 1)  # That the sign flips can give.
         axes.set_title(f"p {p_words(best, least)}", color=colour, fontsize=9)
         axes.locator_params(nbins=5)
@@ -173,7 +172,7 @@ def image_maps(result: "DiagnosisResult") -> Figure:
         shown = axes.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto")
         axes.set_title(STAGE_WORDS[stage.name], color=STAGE_COLOURS[stage.name], fontsize=9)
         axes.set_axis_off()
-        rows, columns = np.nonzero(stage.tile_p_values <= SIGNIFICANT)
+        rows, columns = np.nonzero(stage.tile_p_values <= LEVEL)
         axes.plot(columns, rows, "k.", markersize=3)
         bar = figure.colorbar(shown, ax=axes, orientation="horizontal")
         bar.ax.tick_params(labelsize=8)
@@ -203,12 +202,12 @@ def effect_forest(result: "DiagnosisResult") -> Figure:
     alike = {member for members in result.cause_sets for member in members}
     for place, name in enumerate(names):
         colour = RED if name in result.effects else BLUE if name in alike else GREY
-        closed = 1e6 * found.closed[name].numpy() / count * len(found.closed[name])
-        error = student_quantile(0.975, math.inf) * closed.std(ddof=1) / len(closed) ** 0.5
+        closed = 1000**2 * found.closed[name].numpy() / count * len(found.closed[name])
+        error = TWO_SIDED * closed.std(ddof=1) / len(closed) ** 0.5
         left.errorbar(
             closed.mean(), place, xerr=error, fmt="o", capsize=2, markersize=4, color=colour
         )
-        right.barh(place, found.probabilities.get(name, 0.0), height=0.6, color=colour)
+        right.barh(place, found.probabilities.get(name, 0.0), color=colour)
     line_across(left, vertical=True)
     left.set_xlabel("closes, mm² of the\nheld-out mean square")
     right.set_xlabel("probability\nthat it is there")
@@ -254,8 +253,8 @@ def paired_poses(result: "DiagnosisResult") -> Figure:
 
 
 FIGURES: dict[str, Callable[["DiagnosisResult"], Figure]] = {
-    "where_as_given": lambda r: covariate_strips(r, stages_shown(r)[:1], most=4),
-    "where": lambda r: covariate_strips(r, stages_shown(r, fitted=True), most=6),
+    "where_as_given": partial(covariate_strips, as_given=True),
+    "where": covariate_strips,
     "which": effect_forest,
     "aliases": absorption_map,
     "map": image_maps,

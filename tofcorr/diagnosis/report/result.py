@@ -402,11 +402,12 @@ def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:
         return "–", ""
     interval = (value, value) if ends is None or None in ends else (ends[0], ends[1])
     largest = max(abs(value), *map(abs, interval))
+    power = math.floor(math.log10(largest)) if largest else 0
     # Up to five digits before or after the point are read at a glance.
-    if largest == 0 or 1e-3 <= largest < 1e5:
+    if -3 <= power < 5:
         numbers = [known(number, interval, 6) for number in (value, *interval)]
     else:  # Pixel terms are as small as 1e-12 m / pixel^4.
-        digits = max(math.floor(math.log10(largest)) + decimals(interval, 16), 1)
+        digits = max(power + decimals(interval, 16), 1)
         numbers = [f"{number:.{min(digits, 3)}e}" for number in (value, *interval)]
     return numbers[0], "" if interval[0] == interval[1] else " to ".join(numbers[1:])
 

@@ -15,6 +15,7 @@ from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study, absorbed_share
 from tofcorr.digits import known, known_interval
+from tofcorr.estimation.robust import LEVEL
 from tofcorr.simulation.effects import CATALOGUE
 
 if TYPE_CHECKING:
@@ -28,8 +29,6 @@ STAGE_WORDS = {
 """What a stage is called on the page."""
 SHARE_ENDS = (-1.0, 2.0)
 """Ends beyond which the interval of a share is cut off. Chosen: it is not determined then."""
-SIGNIFICANT = 0.05
-"""p-value below which a text speaks of a bias. 5 % by convention."""
 # Shares below this are not worth a word (no unit). Chosen: they look as if nothing were there.
 SMALL = 0.05
 _LABELS = {
@@ -130,8 +129,7 @@ def p_words(value: float, least: float) -> str:
         value: The p-value.
         least: The smallest that the test can give: it says "at most".
     """
-    # Some p-values were rounded to float32.
-    return f"{'≤' if value <= least * (1 + 1e-5) else '='} {value:.3f}"
+    return f"{'≤' if value <= least else '='} {value:.3f}"
 
 
 def write_verdict(
@@ -443,6 +441,6 @@ def along(stage: Stage) -> tuple[str, str, str, bool]:
     if not strips:
         return "", "", "", False
     covariate, regions = strips[0]
-    biases, significant = biases_of(regions), min(one.p_value for one in regions) <= SIGNIFICANT
+    biases, significant = biases_of(regions), min(one.p_value for one in regions) <= LEVEL
     bins = f"from {mm(min(biases))} to {mm(max(biases))} mm" if biases else ""
     return axis_label(covariate).split(",")[0], bins, f"by {mm(regions[0].bias)} mm", significant

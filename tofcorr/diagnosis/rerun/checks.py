@@ -18,6 +18,7 @@ from tofcorr.diagnosis.sums.observations import (
     distance_images,
     predicted_distance,
 )
+from tofcorr.diagnosis.sums.shared_noise import MOST_PIXELS
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions
@@ -325,11 +326,6 @@ def _light_images(model: SensorModel, study: Study) -> Tensor | None:
     return lit.reshape(images.shape)
 
 
-# Pixels that are degraded at most; of larger recordings evenly chosen poses. Chosen: 32 VGA frames,
-# some seconds.
-_MOST_PIXELS = 10_000_000
-
-
 @dataclass(frozen=True, kw_only=True)
 class DegradedStage:
     """Ideal frames through the sensor that was found, against real frames of other poses.
@@ -359,7 +355,7 @@ def degraded_stage(found: Evidence, floor: float, resamples: Tensor) -> Degraded
     """
     study = found.study
     observations = study.observations
-    frames = max(_MOST_PIXELS // observations.distance_images[0].numel(), 1)
+    frames = max(MOST_PIXELS // observations.distance_images[0].numel(), 1)
     units = observations.num_units
     count = int(np.clip(units * frames / observations.num_frames, 1, units))
     chosen = torch.linspace(0, units - 1, count).round().long()

@@ -20,7 +20,8 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE
 from tofcorr.diagnosis.findings.where import Interval, interval_of
-from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
+from tofcorr.diagnosis.sums.observations import TINY, Observations, predicted_distance
+from tofcorr.diagnosis.sums.shared_noise import MOST_PIXELS
 from tofcorr.diagnosis.sums.study import FittedMap, Study, fitted_coefficients
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
@@ -58,16 +59,12 @@ from tofcorr.simulation.signal import (
 from tofcorr.simulation.simulator import twin_frames
 
 # Knots of the distance curve at the least, beside twice the coefficients of a term, so that splines
-# and harmonics are resolved; knots of the amplitude curve; points of the pixel lattice a side.
-# Chosen; a test compares simulator and fit to 0.2 mm.
-_LEAST_KNOTS, _AMPLITUDE_KNOTS, _LATTICE = 13, 26, 9
+# and harmonics are resolved; the amplitude curve has twice as many. And points of the pixel lattice
+# a side. Chosen; a test compares simulator and fit to 0.2 mm.
+_LEAST_KNOTS, _LATTICE = 13, 9
 
 Numbered = tuple[Any, Tensor]
 """A term, and the numbers of its coefficients in the model."""
-
-# Pixels that are simulated at most, and frames at least: of larger recordings only some frames are
-# simulated, evenly spread. Chosen to bound the time.
-_MOST_PIXELS, _LEAST_FRAMES = 6_000_000, 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +125,7 @@ class Evidence:
             values, effect = self.patterns.get(name), study.candidates.maps[name]
             if values is None:
                 # Estimated from all poses; cross-fitted values were subtracted.
-                residual = study.system.residual_of(named.columns)
+                residual = study.residual_of(named.columns)
                 values = FittedMap(study, effect, residual).whole()
             effects.append(effect.with_coefficients(values))
         return effects
@@ -199,7 +196,7 @@ def fitted_to(study: Study, units: Tensor, names: Sequence[str]) -> Study:
     sums = study.sums.of(names)
     sums = replace(sums, plain=sums.plain * used[:, None, None])
     fit = replace(study.fit, trust=study.fit.trust * used[study.unit_of_pixel])
-    return replace(study, system=replace(study.system, sums=sums), fit=fit)
+    return replace(study, sums=sums, fit=fit)
 
 
 def _tables(found: Evidence) -> tuple[MeasuredErrorOptions, list[Numbered]]:
@@ -263,7 +260,7 @@ def _dense_where_dark(values: Tensor) -> Tensor:
     low = float(values.min())
     # An amplitude that never changes still needs knots that do.
     reach = max(float(values.max()) - low, max(abs(low), 1.0) / 1000)
-    return low + reach * torch.linspace(0.0, 1.0, _AMPLITUDE_KNOTS, dtype=torch.float64) ** 2
+    return low + reach * torch.linspace(0.0, 1.0, 2 * _LEAST_KNOTS, dtype=torch.float64) ** 2
 
 
 def _variable_of(term: SignalTerm, observations: Observations) -> str | None:
@@ -288,8 +285,8 @@ def _plain(study: Study) -> SimulatorOptions:
     """Return a sensor without errors, as noisy as the recording, with its targets and frames."""
     observations, recording = study.observations, study.observations.recording
     names, counts = np.unique(recording.frames.target, return_counts=True)
-    # A common frequency; errors are tables of the distance, so that it hardly matters.
-    frequency = recording.modulation_frequency or 20.0e6
+    # Errors are tables of the distance, so that a frequency that is unknown hardly matters.
+    frequency = recording.modulation_frequency or SensorOptions().modulation_frequency_hz
     light = LightOptions()
     electrons_per_count = ReadoutOptions().electrons_per_count
     electrons_at_1m = light.electrons_at_1m
@@ -299,7 +296,7 @@ def _plain(study: Study) -> SimulatorOptions:
         noise = float(study.fit.sigma.median())
         # Shot noise: sigma = scale sqrt(B / 2) / A, with the mean B = A / contrast.
         electrons = scale**2 / (2 * light.demodulation_contrast * noise**2)
-        electrons_per_count = max(electrons / max(amplitude, 1e-12), 1e-9)
+        electrons_per_count = electrons / max(amplitude, TINY)
         distance = float(observations.measured.median())
         # Of a grey wall, which reflects a half.
         electrons_at_1m = electrons * distance**2 / (0.5 * light.demodulation_contrast)
@@ -334,7 +331,7 @@ def mount_at(tool_from_camera: Tensor) -> CameraMountOptions:
 def simulated_frames(recording: Recording) -> list[int]:
     """Return the frames to simulate: all, or as many as do not take long."""
     frames, camera = recording.num_frames, recording.camera
-    most = max(_LEAST_FRAMES, _MOST_PIXELS // (camera.height * camera.width))
+    most = max(MOST_PIXELS // (camera.height * camera.width), 1)
     return torch.linspace(0, frames - 1, min(frames, most)).round().long().unique().tolist()
 
 
@@ -400,7 +397,7 @@ def _of_all_pixels(found: Evidence, effect: MapEffect) -> Tensor:
     observations, camera = study.observations, study.observations.recording.camera
     names = tuple(name for name in named.names if name != effect.name)
     others = replace(found, named=replace(named, names=names))
-    spread = FittedMap(study, effect, study.system.residual_of(named.columns)).prior_sd
+    spread = FittedMap(study, effect, study.residual_of(named.columns)).prior_sd
     frames, usable = simulated_frames(observations.recording), observations.usable
     weights = torch.zeros(observations.num_frames, dtype=torch.float64)
     weights = weights.index_add(0, observations.frame, study.fit.weight)
@@ -453,7 +450,7 @@ def sensor_of(found: Evidence, observables: Observables | None) -> SensorFile:
         f"{study.observations.num_units} poses, {recording.num_frames} frames.",
         *([] if found.named.names else ["No effect beyond the error terms was found."]),
     ]
-    if remainder > 1e-4:  # A tenth of the least gap that matters.
+    if 1e4 * remainder > study.options.target_gap_mm:  # A tenth of it.
         sentences.append(
             f"The simulator under diagnosis makes an error of {1e3 * remainder:.1f} mm RMS that no "
             "term or effect of this file holds."

@@ -38,7 +38,6 @@ from tofcorr.diagnosis.sums.noise import (
     with_residuals,
 )
 from tofcorr.diagnosis.sums.observations import (
-    PER_WALL,
     Observations,
     frame_chunks,
     hand_eye_columns,
@@ -211,7 +210,7 @@ class BaseModel:
     @property
     def num_geometry(self) -> int:
         """Number of columns of hand-eye transform and estimated walls; they come first."""
-        return self.num_hand_eye + PER_WALL * self.observations.num_walls
+        return self.num_hand_eye + len(self.wall_sd) * self.observations.num_walls
 
     @property
     def num_columns(self) -> int:
@@ -253,12 +252,8 @@ class BaseModel:
         error = self.error_columns(distance) @ coefficients
         return self.observations.measured - distance - error
 
-    def columns(self, tool_from_camera: Tensor) -> Tensor:
-        """Return all columns around a hand-eye transform (4, 4), shape (M, K)."""
-        return self.linearised(tool_from_camera)[1]
-
     def linearised(self, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the predicted distance, (M,), metres, and all columns, (M, K)."""
+        """Return predicted distance, (M,), metres, and all columns, (M, K), around a transform."""
         observations, parts = self.observations, []
         distance, columns = hand_eye_columns(observations, tool_from_camera)
         if self.hand_eye_free:
@@ -471,10 +466,9 @@ def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple
         found, pose, coefficients = _descend(model, known, start, 12, None)
         residual = found.residual(pose, coefficients) - known
         loss = float(residual.abs().nan_to_num(1000.0).clamp(max=1.0).mean())
-        # Another start must be better by a tenth. Depth errors leave less than 15 mm, a wrong
-        # hand-eye transform more.
-        if loss < 0.9 * best_loss:
+        if loss < best_loss:
             best, best_loss = (found, pose), loss
+        # Depth errors leave less than 15 mm, a wrong hand-eye transform more.
         if best_loss < 0.015:
             break
     return best
@@ -493,7 +487,7 @@ def _descend(
         model: What to fit, on its pixels, with its walls where they start.
         known: Error that is known already, shape (M,), metres.
         pose: Where to start, shape (4, 4).
-        steps: At most so many.
+        steps: How many; without weights at most.
         weight: Of the pixels, 1 / m^2, shape (M,); None: absolute residuals are minimised instead
             of squares (below their median: squares).
     """
@@ -504,9 +498,6 @@ def _descend(
     tie[:count] = _START_SD**-2 * len(observations.measured) / observations.num_units
     target = observations.measured - known
     coefficients = torch.zeros(model.num_columns - count, dtype=torch.float64)
-    # Steps end when one moves no pixel by more than this, metres: far below any noise; and for a
-    # start, which the next steps improve, far below what they move.
-    small = 1e-4 if weight is None else 1e-7
     for _ in range(steps):
         distance, columns = model.linearised(pose)
         usable = (distance > 0) & distance.isfinite()
@@ -531,7 +522,8 @@ def _descend(
             size = torch.maximum(step[:3].norm(), step[3:6].norm())
             # No step is longer than half a metre or a radian.
             pose = pose @ se3.exp(step[:6] / (2 * size).clamp(min=1.0))
-        if count and float((columns[:, :count] @ step[:count]).abs().max()) < small:
+        # Of a start, which later steps improve, no pixel need move by less than 0.1 mm.
+        if weight is None and float((columns[:, :count] @ step[:count]).abs().max()) < 1e-4:
             break
     return model, pose, coefficients
 

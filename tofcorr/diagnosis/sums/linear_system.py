@@ -1,4 +1,4 @@
-r"""The linear system of a recording: columns over its pixels, and normal equations of every pose.
+r"""Columns over the pixels of a recording, and the normal equations of every pose.
 
 For the poses u (frames taken without moving belong together) and all columns X of base model and
 effects, with residual y of the base fit, there are two kinds of sums
@@ -20,13 +20,13 @@ is complete. Every fold, subset of columns, bootstrap and sign flip is a sum of 
 Poses are the units of every test, because one disturbance affects a whole image.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
 
 import torch
+from numpy.polynomial.chebyshev import chebgauss
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.base import BaseFit, unknown_amplitude_columns
@@ -37,14 +37,9 @@ from tofcorr.simulation.effects.base import EffectInputs
 
 BASE = "base"
 """The name of the base model among the columns."""
-NUM_POSE = 3
-"""Columns of an uncertain pose: an offset and two tilts."""
 OLS_SD = 1e-3
 """Ordinary sums weigh a mean pose as one value with this standard deviation, metres; the same holds
 for offset and tilts in the fit that their uncertainty is estimated from. Chosen: 1 mm."""
-LEFT_OUT = tuple((1 + math.cos((2 * k + 1) * math.pi / 6)) / 2 for k in range(3))
-"""Shares of a unit that are left out of the fits whose mean predicts it: the three nodes of the
-Gauss-Chebyshev quadrature on [0, 1]. Derived in `left_out_solutions`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +164,8 @@ class Sums:
         Returns:
             Shape (U, K).
         """
-        return self.left_out_coefficients(names, *LEFT_OUT)
+        nodes, _ = chebgauss(3)
+        return self.left_out_coefficients(names, *(1 + nodes) / 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +200,7 @@ class PoseSums:
     @property
     def num_columns(self) -> int:
         """Number of columns P of base model and effects; those of the pose follow."""
-        return self.plain.shape[-1] - NUM_POSE - 1
+        return self.plain.shape[-1] - len(self.pose_sd) - 1
 
     @cached_property
     def ols(self) -> Sums:
@@ -238,7 +234,7 @@ class PoseSums:
 
     def with_pose_uncertainty(self, chosen: Sequence[str] = ()) -> "PoseSums":
         """Return the sums with the uncertainty of the poses estimated beside some effects."""
-        assumed = torch.full((NUM_POSE,), OLS_SD, dtype=torch.float64)
+        assumed = torch.full_like(self.pose_sd, OLS_SD)
         start = replace(self, dispersion=1.0, pose_sd=assumed)
         dispersion = _dispersion(start.gls, chosen)
         pose_sd = _pose_sd(replace(start.of(chosen), dispersion=dispersion), chosen)
@@ -275,7 +271,7 @@ def _pose_sd(sums: PoseSums, chosen: Sequence[str]) -> Tensor:
     cross = sums.weighted[:, pose] / sums.dispersion
     score = cross[:, :, -1] - cross[:, :, :count] @ sums.gls.solve(chosen)
     inner = cross[:, :, pose]
-    enough = torch.linalg.matrix_rank(inner) == NUM_POSE
+    enough = torch.linalg.matrix_rank(inner) == len(sums.pose_sd)
     if not bool(enough.any()):
         return sums.pose_sd
     own = torch.linalg.solve(inner[enough], score[enough])
@@ -288,69 +284,17 @@ def _pose_sd(sums: PoseSums, chosen: Sequence[str]) -> Tensor:
     return (spread - noise.median(dim=0).values).clamp(min=2e-5**2).sqrt()
 
 
-@dataclass(frozen=True, kw_only=True)
-class LinearSystem:
-    """Columns of all candidates, the residual they may explain, and their sums.
-
-    Attributes:
-        columns: Of the base model (`BASE`), metres per unit coefficient, and of effects and probes
-            by name, metres at one standard deviation of the prior, shape (M, K) each. They are
-            never copied into one matrix of all pixels.
-        pose: Columns of an uncertain pose, shape (M, 3).
-        residual: Of the base fit less the maps already subtracted, shape (M,), metres.
-        sums: Sums of products of these over the pixels of every pose.
-    """
-
-    columns: Mapping[str, Tensor]
-    pose: Tensor
-    residual: Tensor
-    sums: PoseSums
-
-    def of(self, names: Sequence[str]) -> list[Tensor]:
-        """Return the columns of the base model and of some effects."""
-        return [self.columns[BASE], *(self.columns[name] for name in names)]
-
-    def times(self, names: Sequence[str], coefficients: Tensor) -> Tensor:
-        """Return what base model and some effects predict with coefficients (K,), (M,), metres."""
-        parts = self.of(names)
-        own = coefficients.split([part.shape[1] for part in parts])
-        return torch.stack([x @ theta for x, theta in zip(parts, own, strict=True)]).sum(0)
-
-    def residual_of(self, names: Sequence[str], *, gls: bool = False) -> Tensor:
-        """Return the residual of base model and effects fitted to all poses, shape (M,), metres.
-
-        Args:
-            names: The effects.
-            gls: Whether to fit by likelihood. Where poses scatter, an ordinary fit bends the model
-                towards their offsets, and leaves the same bend in every image.
-        """
-        sums = self.sums.gls if gls else self.sums.ols
-        return self.residual - self.times(names, sums.solve(names))
-
-
-def linear_system(
-    observations: Observations, fit: BaseFit, inputs: EffectInputs, effects: Mapping[str, Tensor]
-) -> LinearSystem:
-    """Sum up the columns of the base model and of some effects.
-
-    Args:
-        observations: The pixels.
-        fit: The base model, fitted.
-        inputs: What effects may depend on.
-        effects: Columns of each effect and probe, (M, K) each, metres at one prior standard
-            deviation.
-    """
+def base_columns(
+    observations: Observations, fit: BaseFit, inputs: EffectInputs
+) -> tuple[Tensor, Tensor]:
+    """Return the columns of the base model, (M, K), and their prior precision, (K, K)."""
     uncertain = unknown_amplitude_columns(observations, inputs)
     if fit.known is not None:
         uncertain = torch.cat([fit.known.uncertain, uncertain], dim=1)
     # The ordinary weights of a pose add up to one value with a variance of OLS_SD^2.
     prior = fit.model.prior_precision(observations.num_units / OLS_SD**2)
     prior = torch.block_diag(prior, torch.eye(uncertain.shape[1], dtype=torch.float64))
-    base = torch.cat([fit.model.columns(fit.tool_from_camera), uncertain], dim=1)
-    columns = {BASE: base, **effects}
-    pose = pose_columns(inputs)
-    sums = pose_sums(observations, columns, pose, fit.residual, fit, prior).with_pose_uncertainty()
-    return LinearSystem(columns=columns, pose=pose, residual=fit.residual, sums=sums)
+    return torch.cat([fit.model.linearised(fit.tool_from_camera)[1], uncertain], dim=1), prior
 
 
 def pose_columns(inputs: EffectInputs, *, arm: float = 0.3) -> Tensor:
@@ -391,7 +335,7 @@ def pose_sums(
 
     Args:
         observations: The pixels.
-        columns: Of base model and effects, as in `LinearSystem`.
+        columns: Of base model and effects by name, as in `Study`, shape (M, K) each.
         pose: Columns of `pose_columns`, shape (M, 3).
         residual: Of the base fit, shape (M,), metres.
         fit: Its noise and robust weights.
@@ -423,7 +367,7 @@ def pose_sums(
         layout=layout,
         scale=1.0 / (float(count.mean()) * OLS_SD**2),
         dispersion=1.0,
-        pose_sd=torch.full((NUM_POSE,), OLS_SD, dtype=torch.float64),
+        pose_sd=torch.full((pose.shape[1],), OLS_SD, dtype=torch.float64),
     )
 
 

@@ -67,10 +67,8 @@ _POINTS = 6
 # Fewest pixels or differences of like brightness that say its noise: 50 determine a standard
 # deviation to 10 %.
 _LEAST_PER_KNOT = 50
-# Least ratio of measured to modelled mean square: values may be equal where depth is rounded.
-_LEAST_RATIO = 1e-3
-# Largest relative error of a level. Chosen: half of it.
-_MOST_ERROR = 0.5
+LEAST_RATIO = 1e-3
+"""Least ratio of measured to modelled mean square: values may be equal where depth is rounded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +250,7 @@ def noise_curve(
         prior = np.sqrt(_PRIOR_COUNT) / max(level, TINY) * np.eye(3)[1:]
         left = np.concatenate([measured * weight[:, None], prior])
         law = nnls(left, np.concatenate([variance * weight, np.zeros(2)]))[0]
-        expected = np.maximum(measured @ law, _LEAST_RATIO * variance)
+        expected = np.maximum(measured @ law, LEAST_RATIO * variance)
     mixed = (count * variance + _LAW_COUNT * (measured @ law)) / (count + _LAW_COUNT)
     # The law goes on from what the mixture says at the ends.
     first, last = mixed[[0, -1]] / (measured[[0, -1]] @ law)
@@ -285,7 +283,7 @@ def with_residuals(
             ratio = ratios[members][no_gross_error(ratios[members])]
             middle = float(np.median(at[members]))
             own = np.exp(np.interp(middle, noise.knots, np.log(noise.sigma)))
-            known.append((middle, np.clip(np.mean(ratio**2), _LEAST_RATIO, most) * own**2))
+            known.append((middle, np.clip(np.mean(ratio**2), LEAST_RATIO, most) * own**2))
     middles, variances = np.array(sorted(known)).T
     # All of it is well known: far beyond what the law counts.
     well_known = np.full(len(known), 500 * _LAW_COUNT)
@@ -312,8 +310,8 @@ def estimate_noise(observations: Observations, tool_from_camera: Tensor) -> Pixe
         random = np.maximum(noise.sigma**2 - fixed, noise.sigma**2 / 20)
         noise = replace(noise, sigma=np.maximum(np.sqrt(random), _LEAST_SIGMA))
     noise = _with_repeats(observations, noise)
-    # Two standard errors; second differences that overlap count half.
-    error = min(2 / np.sqrt(max(len(place), 1)), _MOST_ERROR)
+    # Two standard errors, at most half; second differences that overlap count half.
+    error = min(2 / np.sqrt(max(len(place), 1)), 0.5)
     return replace(
         noise, sigma=np.maximum(noise.sigma * noise.ratios[1], _LEAST_SIGMA), error=error
     )
@@ -418,7 +416,7 @@ def _with_repeats(observations: Observations, noise: PixelNoise) -> PixelNoise:
         """Return the root of measured over modelled mean square, if frames keep this share."""
         used = [group for number, group in enumerate(groups) if number != left_out]
         model = sum(own[2] * (1 - mean_correlation(kept, own[0])) for own in used)
-        return max(float(np.sqrt(sum(own[1] for own in used) / model)), _LEAST_RATIO**2)
+        return max(float(np.sqrt(sum(own[1] for own in used) / model)), LEAST_RATIO)
 
     weakest, kept, strongest = _kept_share([apart for count, *_, apart in groups if count > 2])
     # Poses show other brightnesses, at which the model of the noise may be off more or less.
@@ -429,7 +427,7 @@ def _with_repeats(observations: Observations, noise: PixelNoise) -> PixelNoise:
     ratios = least, max(least, 1.0), np.inf
     if strongest is not None:
         ratios = least, ratio(kept), ratio(strongest)
-    return replace(noise, repeats=sum(frames), ratios=ratios, spread=min(spread, _MOST_ERROR))
+    return replace(noise, repeats=sum(frames), ratios=ratios, spread=min(spread, 0.5))
 
 
 def _repeats(

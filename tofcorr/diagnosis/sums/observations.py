@@ -75,6 +75,7 @@ class Observations:
         wall: The wall that each frame shows, shape (F,), int64, where planes are estimated; None
             where they were measured.
         num_walls: How many walls have estimated planes: 0 where they were measured.
+        is_sample: Whether some of the usable pixels were chosen, as of large images.
     """
 
     recording: Recording
@@ -89,6 +90,7 @@ class Observations:
     unit: Tensor
     wall: Tensor | None = None
     num_walls: int = 0
+    is_sample: bool = False
 
     @property
     def num_frames(self) -> int:
@@ -104,14 +106,6 @@ class Observations:
     def usable(self) -> Tensor:
         """Which pixels of the images show the target at a distance, bool, shape (F, H, W)."""
         return self.on_target & (self.distance_images > 0)
-
-    @cached_property
-    def is_sample(self) -> bool:
-        """Whether some of the usable pixels were chosen, as of large images.
-
-        Saturation and other reasons leave out fewer than a tenth of them.
-        """
-        return int(self.usable.sum()) > 1.1 * len(self.pixel)
 
     @cached_property
     def density(self) -> float:
@@ -192,7 +186,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
     """
     budget = max(64, most_pixels // recording.num_frames)
     order = even_order(recording.camera.height, recording.camera.width)
-    chosen, images, distances, masks = [], [], [], []
+    chosen, images, distances, masks, most = [], [], [], [], 0
     for batch in iterate_frames(recording, image_dtype=torch.float32):
         everywhere = batch.radial_distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
         distances.append(everywhere)
@@ -200,6 +194,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
             images.append(torch.where(everywhere > 0, batch.amplitude, 0.0))
         mask = recording.read("mask", batch.indices.numpy())
         masks.append(torch.ones_like(batch.valid) if mask is None else torch.from_numpy(mask) > 0)
+        most = max(most, int(batch.valid.flatten(1).sum(1).max()))
         chosen += [order[own[order]][:budget].sort().values for own in batch.valid.flatten(1)]
     counts = torch.tensor([len(own) for own in chosen])
     if (seen := int((counts > 0).sum())) < 2:
@@ -218,6 +213,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         distance_images=torch.cat(distances),
         on_target=torch.cat(masks),
         unit=torch.from_numpy(pose_numbers(recording)),
+        is_sample=most > budget,
     )
     return every.choosing(torch.arange(len(chosen)).repeat_interleave(counts), torch.cat(chosen))
 
@@ -356,10 +352,6 @@ def predicted_images(
     return ray_plane_distance(ray_directions(observations.recording.camera)[rows], normal, offset)
 
 
-PER_WALL = 3
-"""Parameters of a wall: two turns, radians, and a shift, metres."""
-
-
 def with_numbered_walls(observations: Observations) -> Observations:
     """Return the observations that know which wall each frame shows, where planes are estimated.
 
@@ -406,11 +398,14 @@ def wall_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor
 
 
 def with_walls_moved(observations: Observations, step: Tensor) -> Observations:
-    """Return the observations after a step (3G,) of the walls; recording and facts both follow."""
+    """Return the observations after a step (3G,) of the walls; recording and facts both follow.
+
+    Each wall has two turns, radians, and a shift, metres.
+    """
     wall, facts = observations.wall, observations.facts
     if wall is None:
         return observations
-    change = step.reshape(-1, PER_WALL)[wall]
+    change = step.reshape(observations.num_walls, -1)[wall]
     turned = facts.normal_world + (change[:, :2, None] * tangents(facts.normal_world)).sum(1)
     normal = torch.nn.functional.normalize(turned, dim=1)
     return with_planes(

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums.noise import FLOOR_ERROR, LEAST_RATIO
 from tofcorr.diagnosis.sums.observations import (
     Observations,
     same_exposure,
@@ -23,12 +24,9 @@ from tofcorr.diagnosis.sums.observations import (
 )
 from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
 
-# Least variance of the noise over that assumed, and what is added to the equations of an image's
-# offset and tilts, pixels. Chosen: keeps both solvable without noise, or of few pixels.
-_TINY = 1e-6
-# Pixels of the images that are looked at: of more, only some poses are. Chosen to bound the memory
-# to about half a gigabyte.
-_MOST_PIXELS = 8_000_000
+MOST_PIXELS = 8_000_000
+"""Pixels of whole images that are looked at, or simulated: of larger recordings some frames alone.
+Chosen to bound the memory to about half a gigabyte."""
 
 
 class Lags:
@@ -94,7 +92,7 @@ class Lags:
         """Return the noise over what second differences between neighbours see of it."""
         plateau = self.plateau("rows")
         own, once, twice = (self.at(0, k * SPACING) - plateau for k in range(3))
-        seen = 1 - (2 * once - twice / 2) / max(own, _TINY) / SECOND_DIFFERENCE
+        seen = 1 - (2 * once - twice / 2) / max(own, LEAST_RATIO) / SECOND_DIFFERENCE
         return float(np.clip(seen, self.least_left, 1.0) ** -0.5)
 
     def reaches_far(self, share: float) -> bool:
@@ -173,7 +171,7 @@ class SharedNoise:
     @property
     def precise(self) -> bool:
         """Whether a filter that is there would be found: filters leave shares of 0.1 to 0.6."""
-        return max(self.error.values()) <= 0.06
+        return max(self.error.values()) <= FLOOR_ERROR
 
 
 def shared_noise(
@@ -222,18 +220,19 @@ def _found(
 ) -> SharedNoise:
     """Estimate what pixels share from images (F, H, W), for tiles (H, W) of every form.
 
-    Without repeats a mean correlation in a tile below 0.05 does not count, even if it is
-    significant: it may be structure. Some of the noise is each pixel's own: at most 0.95 is shared.
+    The noise is known to `FLOOR_ERROR`. Without repeats a mean correlation in a tile below that
+    does not count, even if it is significant: it may be structure. And as much of the noise at
+    least is each pixel's own.
     """
     # Clipped at six standard deviations, as in the noise estimate.
     lags, share, error = Lags(np.clip(values, -6, 6), used), {}, {}
     # Noise over that assumed: less where a filter over time makes repeats alike.
-    whole = max(lags.at(0, 0) - (0.0 if from_repeats else lags.plateau("squares")), _TINY)
+    whole = max(lags.at(0, 0) - (0.0 if from_repeats else lags.plateau("squares")), LEAST_RATIO)
     for form, cells in tiles.items():
         plateau = 0.0 if from_repeats else lags.plateau(form)
         value, own = (x / whole for x in lags.mean_in_tiles(cells, plateau))
-        least = max(lags.significant * own, 0.0 if from_repeats else 0.05)
-        share[form] = min(value, 0.95) if value > least else 0.0
+        least = max(lags.significant * own, 0.0 if from_repeats else FLOOR_ERROR)
+        share[form] = min(value, 1 - FLOOR_ERROR) if value > least else 0.0
         error[form] = own
     most = max(share.values())
     striped = most > 0 and lags.reaches_far(most)
@@ -247,7 +246,7 @@ def _frames(observations: Observations) -> np.ndarray:
     They are 20 at least, so that the mean of the others shows what all have in common.
     """
     seen = observations.frame.unique().numpy()
-    most = max(_MOST_PIXELS // observations.on_target[0].numel(), 20)
+    most = max(MOST_PIXELS // observations.on_target[0].numel(), 20)
     unit = observations.unit.numpy()[seen]
     poses = np.unique(unit)
     some = max(len(poses) * most // len(seen), 1)
@@ -300,8 +299,9 @@ def _apart_from_pattern(
     row, column = (np.linspace(-1, 1, length) for length in images.shape[1:])
     basis = np.stack(np.broadcast_arrays(1.0, row[:, None], column)).reshape(3, -1)
     flat, inside = own.reshape(len(own), -1), use.reshape(len(use), -1).astype(float)
-    inner = np.einsum("fp,ip,jp->fij", inside, basis, basis, optimize=True) + _TINY * np.eye(3)
-    tilts = np.linalg.solve(inner, ((flat * inside) @ basis.T)[..., None])[..., 0]
+    inner = np.einsum("fp,ip,jp->fij", inside, basis, basis, optimize=True)
+    right = ((flat * inside) @ basis.T)[..., None]
+    tilts = (np.linalg.pinv(inner, hermitian=True) @ right)[..., 0]
     return own - (tilts @ basis).reshape(own.shape), use
 
 

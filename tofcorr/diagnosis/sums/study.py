@@ -1,4 +1,4 @@
-"""A recording under diagnosis: pixels, base fit, candidate effects, and their linear system.
+"""A recording under diagnosis: pixels, base fit, candidate effects, their columns and sums.
 
 Effects of the catalogue that the recording can test may be added to the base model, and probes:
 patterns of effects that the catalogue does not contain. A probe is never reported as a cause. Where
@@ -21,10 +21,12 @@ from torch import Tensor
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base import BaseFit
 from tofcorr.diagnosis.sums.linear_system import (
-    LinearSystem,
+    BASE,
     PoseSums,
+    base_columns,
     draw_folds,
-    linear_system,
+    pose_columns,
+    pose_sums,
 )
 from tofcorr.diagnosis.sums.observations import TINY, Observations
 from tofcorr.geometry.rays import phase_from_radial_distance
@@ -179,7 +181,12 @@ class Study:
         fit: The base model, fitted.
         inputs: What effects may depend on.
         candidates: What may be added to the base model.
-        system: Columns, residual and sums.
+        columns: Of the base model (`BASE`), metres per unit coefficient, and of effects and probes
+            by name, metres at one standard deviation of the prior, shape (M, K) each. They are
+            never copied into one matrix of all pixels.
+        pose: Columns of an uncertain pose, shape (M, 3).
+        residual: Of the base fit less the maps already subtracted, shape (M,), metres.
+        sums: Sums of products of these over the pixels of every pose.
         folds: Which poses each fold of the cross-validation holds out, shape (folds, U), float64.
         signs: Sign flips of the poses, shape (B, U).
         pattern: The base model's fixed pattern, estimated; None if it has none.
@@ -190,15 +197,13 @@ class Study:
     fit: BaseFit
     inputs: EffectInputs
     candidates: CandidateEffects
-    system: LinearSystem
+    columns: Mapping[str, Tensor]
+    pose: Tensor
+    residual: Tensor
+    sums: PoseSums
     folds: Tensor
     signs: Tensor
     pattern: MapEffect | None = None
-
-    @property
-    def sums(self) -> PoseSums:
-        """Sums over the pixels of every pose."""
-        return self.system.sums
 
     @cached_property
     def weight(self) -> Tensor:
@@ -223,6 +228,27 @@ class Study:
         """Pose of every pixel, shape (M,), int64."""
         return self.observations.unit[self.observations.frame]
 
+    def columns_of(self, names: Sequence[str]) -> list[Tensor]:
+        """Return the columns of the base model and of some effects."""
+        return [self.columns[BASE], *(self.columns[name] for name in names)]
+
+    def times(self, names: Sequence[str], coefficients: Tensor) -> Tensor:
+        """Return what base model and some effects predict with coefficients (K,), (M,), metres."""
+        parts = self.columns_of(names)
+        own = coefficients.split([part.shape[1] for part in parts])
+        return torch.stack([x @ theta for x, theta in zip(parts, own, strict=True)]).sum(0)
+
+    def residual_of(self, names: Sequence[str], *, gls: bool = False) -> Tensor:
+        """Return the residual of base model and effects fitted to all poses, shape (M,), metres.
+
+        Args:
+            names: The effects.
+            gls: Whether to fit by likelihood. Where poses scatter, an ordinary fit bends the model
+                towards their offsets, and leaves the same bend in every image.
+        """
+        sums = self.sums.gls if gls else self.sums.ols
+        return self.residual - self.times(names, sums.solve(names))
+
     def left_out_squares(self, names: Sequence[str]) -> Tensor:
         """Return the ordinary sum of squares of each pose, predicted by all others, (U,), m^2."""
         return self.sums.ols.left_out_squares(names)
@@ -233,15 +259,14 @@ class Study:
 
     def pose_equations(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """Return the normal equations of each pose's offset and tilts, (U, 3, 3) and (U, 3)."""
-        pose = self.system.pose
-        both = torch.cat([pose, residual[:, None]], dim=1)
-        sums = self.observations.products(pose * self.weight[:, None], both)
+        both = torch.cat([self.pose, residual[:, None]], dim=1)
+        sums = self.observations.products(self.pose * self.weight[:, None], both)
         return sums[..., :-1], sums[..., -1]
 
     def pose_surface(self, own: Tensor) -> Tensor:
         """Return what offsets and tilts (U, 3) add to each pixel's distance, (M,), metres."""
         of_frame = own[self.observations.unit][:, :, None]
-        return by_frame(self.system.pose, of_frame, self.observations.frame)[:, 0]
+        return by_frame(self.pose, of_frame, self.observations.frame)[:, 0]
 
 
 def build_study(
@@ -251,21 +276,27 @@ def build_study(
     inputs: EffectInputs,
     generator: torch.Generator,
 ) -> Study:
-    """Compute the linear system of all candidates; draw folds and sign flips."""
+    """Sum up the columns of base model and candidates; draw folds and sign flips."""
     tests, num_units = options.tests, observations.num_units
     folds = draw_folds(num_units, tests.folds, generator)
     flips = torch.randint(0, 2, (tests.flips, num_units), generator=generator)
     candidates = candidate_effects(options, inputs)
     sources = {**candidates.effects, **candidates.probes}
     found = in_threads(lambda source: source.scaled_columns(inputs), sources.values())
-    system = linear_system(observations, fit, inputs, dict(zip(sources, found, strict=True)))
+    base, prior = base_columns(observations, fit, inputs)
+    columns = {BASE: base, **dict(zip(sources, found, strict=True))}
+    pose = pose_columns(inputs)
+    sums = pose_sums(observations, columns, pose, fit.residual, fit, prior)
     return Study(
         options=options,
         observations=observations,
         fit=fit,
         inputs=inputs,
         candidates=candidates,
-        system=system,
+        columns=columns,
+        pose=pose,
+        residual=fit.residual,
+        sums=sums.with_pose_uncertainty(),
         folds=folds,
         signs=2.0 * flips.double() - 1.0,
     )
@@ -274,8 +305,7 @@ def build_study(
 def with_poses_reestimated(study: Study, names: Sequence[str]) -> Study:
     """Return the study whose pose uncertainty is estimated with these effects in the model."""
     known = [name for name in names if name in study.sums.layout.effects]
-    sums = study.sums.with_pose_uncertainty(known)
-    return replace(study, system=replace(study.system, sums=sums))
+    return replace(study, sums=study.sums.with_pose_uncertainty(known))
 
 
 def with_residual(
@@ -293,14 +323,14 @@ def with_residual(
             None: it is kept.
         changed: The columns of effects that differ, shape (M, E) each; None: all are the same.
     """
-    system, changed, before = study.system, changed or {}, study.sums
-    columns = {**system.columns, **changed}
+    changed, before = changed or {}, study.sums
+    columns = {**study.columns, **changed}
     spans = [before.layout.effects[name] for name in changed]
     places = torch.cat([*(torch.arange(*span) for span in spans), torch.tensor([-1])])
     new = torch.cat([*changed.values(), residual[:, None]], dim=1)
     # One pass over the columns gives both sums.
     right = torch.cat([own[:, None] * new for own in (study.fit.weight, study.fit.share)], dim=1)
-    parts = [*columns.values(), system.pose, residual[:, None]]
+    parts = [*columns.values(), study.pose, residual[:, None]]
     products = torch.cat([study.observations.products(part, right) for part in parts], dim=1)
     weighted, plain = before.weighted.clone(), before.plain.clone()
     for sums, own in zip((weighted, plain), products.chunk(2, dim=-1), strict=True):
@@ -308,7 +338,7 @@ def with_residual(
         sums[:, places, :] = own.mT
     sums = replace(before, weighted=weighted, plain=plain)
     sums = sums if names is None else sums.with_pose_uncertainty(names)
-    return replace(study, system=replace(system, columns=columns, residual=residual, sums=sums))
+    return replace(study, columns=columns, residual=residual, sums=sums)
 
 
 def without_map(study: Study, values: Tensor, spent: Collection[str]) -> Study:
@@ -320,7 +350,7 @@ def without_map(study: Study, values: Tensor, spent: Collection[str]) -> Study:
         spent: Maps that are candidates no longer.
     """
     maps = {name: m for name, m in study.candidates.maps.items() if name not in spent}
-    changed = with_residual(study, study.system.residual - values)
+    changed = with_residual(study, study.residual - values)
     return replace(changed, candidates=replace(study.candidates, maps=maps))
 
 
@@ -341,11 +371,11 @@ def relinearised(study: Study, names: Sequence[str]) -> Study:
 
     def loss(study: Study) -> float:
         """Return the weighted sum of squares of the model fitted to all poses, m^2."""
-        return float((study.fit.share * study.system.residual_of(names) ** 2).sum())
+        return float((study.fit.share * study.residual_of(names) ** 2).sum())
 
     best, best_loss, current = study, loss(study), study
     for _ in range(3 if bent else 0):  # The second or third changes nothing any more.
-        ols, residual, changed = current.sums.ols, study.system.residual, dict[str, Tensor]()
+        ols, residual, changed = current.sums.ols, study.residual, dict[str, Tensor]()
         theta, places = ols.solve(names), ols.layout.only(names).effects
         for name in bent:
             effect, sd = effects[name], effects[name].prior_sd()
@@ -360,9 +390,9 @@ def relinearised(study: Study, names: Sequence[str]) -> Study:
     return best
 
 
-# If calibration leaves less than this share of an effect, its overlap with other effects is not
-# computed: it would be a quotient of two rounding errors. Chosen.
-_NOTHING_LEFT = 0.005
+LEAST_LEFT = 1e-3
+"""If calibration leaves less than this share of an effect, nothing is said of what is left: it is
+rounding error. Chosen."""
 
 
 def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float:
@@ -423,7 +453,7 @@ def absorption_table(study: Study) -> np.ndarray:
     for row, name in enumerate(names):
         own = table[row, 0] = absorbed_share(study, name)
         for column, other in enumerate(names, start=1):
-            if other != name and 1 - own > _NOTHING_LEFT:
+            if other != name and 1 - own > LEAST_LEFT:
                 table[row, column] = (absorbed_share(study, name, [other]) - own) / (1 - own)
     return table
 
@@ -489,7 +519,7 @@ def absorbed_by_planes(study: Study, name: str) -> float:
     model, everything = study.fit.model, torch.arange(study.sums.layout.base)
     planes = (everything >= model.num_hand_eye) & (everything < model.num_geometry)
     measured = _left(study, name, everything[~planes])
-    if measured <= _NOTHING_LEFT * signal(study, name):
+    if measured <= LEAST_LEFT * signal(study, name):
         return 0.0
     return 1.0 - _left(study, name, everything) / measured
 
