@@ -17,11 +17,11 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
 from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.given import (
-    GivenSimulator,
     frames_of,
     open_simulator,
     refuse_mistaken_geometry,
     rendered_error,
+    simulated_error,
 )
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
@@ -97,8 +97,8 @@ def rendered(
 def test_rendered_frames_of_the_built_in_simulator_are_the_simulator_itself(
     nothing_missing: Recording, options: SimulatorOptions, rendered: Render
 ) -> None:
-    one = prepare(nothing_missing, OPTIONS, GivenSimulator(options))
-    other = prepare(nothing_missing, OPTIONS, GivenSimulator(frames=rendered()))
+    one = prepare(nothing_missing, OPTIONS, options)
+    other = prepare(nothing_missing, OPTIONS, rendered())
     assert one.as_given is not None
     assert other.as_given is not None
     assert torch.allclose(one.as_given, other.as_given, atol=ROUNDING)
@@ -125,7 +125,7 @@ def test_a_function_gives_what_its_frames_give(
     returned = {"depth": frames.depth, "tool_from_camera": pose}
     function = open_simulator(lambda _: returned, observations.recording)
     assert function is not None
-    ours = function.simulate(observations, OPTIONS)
+    ours = simulated_error(function, observations, OPTIONS)
     theirs = rendered_error(rendered(), observations, OPTIONS)
     assert torch.allclose(ours.error, theirs.error, atol=ROUNDING, equal_nan=True)
 
@@ -152,7 +152,7 @@ def test_the_noise_of_dark_pixels_of_camera_and_renders_is_that_of_their_differe
     sd = 3e-3 * np.clip(bright / np.maximum(frames.amplitude, 1.0), 1.0, 2.0)
     drawn = generator.standard_normal(frames.depth.shape) * sd
     noisy = rendered(Frames(frames.depth + drawn.astype(np.float32), frames.amplitude))
-    study = prepare(nothing_missing, OPTIONS, GivenSimulator(frames=noisy)).study
+    study = prepare(nothing_missing, OPTIONS, noisy).study
     fit, amplitude = study.fit, study.inputs.amplitude
     assert amplitude is not None
     darkest = amplitude < amplitude.quantile(0.05)
@@ -165,7 +165,7 @@ def test_a_pixel_that_the_simulator_does_not_see_is_left_out(
 ) -> None:
     depth = frames.depth.copy()
     depth[:, :6] = np.nan
-    holes = GivenSimulator(frames=rendered(replace(frames, depth=depth)))
+    holes = rendered(replace(frames, depth=depth))
     prepared = prepare(nothing_missing, OPTIONS, holes)
     rows = prepared.study.observations.pixel // nothing_missing.camera.width
     assert int(rows.min()) == 6
@@ -246,7 +246,7 @@ def test_a_fixed_hand_eye_transform_is_that_of_the_simulator(
 ) -> None:
     # It was the recording's guess, which the simulator does not share.
     fixed = OPTIONS.model_copy(update={"hand_eye": "fixed"})
-    prepared = prepare(nothing_missing, fixed, GivenSimulator(options))
+    prepared = prepare(nothing_missing, fixed, options)
     assert torch.equal(prepared.study.fit.tool_from_camera, options.hand_eye.tool_from_camera())
     assert float(prepared.study.fit.residual.abs().median()) < 5e-3
 
@@ -258,7 +258,7 @@ def test_the_gap_as_given_is_that_of_the_simulators_own_parameters(
     without = options.sensor.model_copy(update={"delays": type(options.sensor.delays)()})
     ideal = options.model_copy(update={"sensor": without})
     found = diagnose(nothing_missing, ideal, OPTIONS)
-    error = GivenSimulator(options).simulate(observations, OPTIONS).error
+    error = simulated_error(options, observations, OPTIONS).error
     truth = float(error.square().mean().sqrt())
     assert truth > 0.01
     assert found.gap.as_given is not None
@@ -280,7 +280,7 @@ def test_what_a_simulator_does_elsewhere_is_carried_to_the_recording(
     elsewhere = diagnosed_recordings.recorded(tmp_path / "sim", 931, noise=False)
     exact = options.hand_eye.tool_from_camera().numpy()
     simulated = rendered_error(replace(elsewhere, tool_from_camera=exact), observations, OPTIONS)
-    truth = GivenSimulator(options).simulate(observations, OPTIONS).error
+    truth = simulated_error(options, observations, OPTIONS).error
     known = simulated.error.isfinite()
     assert float(known.double().mean()) > 0.9
     off = (simulated.error - truth)[known]

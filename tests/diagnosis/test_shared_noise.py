@@ -50,7 +50,7 @@ def test_what_a_filter_makes_neighbours_share_is_measured_and_is_no_structure(
     assert shared.from_repeats == (changes is REPEATED)
     assert shared.share["squares"] == pytest.approx(_shared_in_squares(), rel=0.2)
     left = coherence(study, study.residual_of(()))
-    assert abs(left.within) < 4 * left.within_error
+    assert abs(left.within) < 4 * max(study.fit.shared.error.values()) * SIGMA**2
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
 
@@ -115,7 +115,7 @@ def test_repeats_show_a_filter_where_a_recording_is_thinned_out(tmp_path: Path) 
     assert study.fit.shared.from_repeats
     assert study.fit.shared.share["squares"] > 0.1
     left = coherence(study, study.residual_of(()))
-    assert abs(left.within) < 4 * left.within_error
+    assert abs(left.within) < 4 * max(study.fit.shared.error.values()) * SIGMA**2
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
 

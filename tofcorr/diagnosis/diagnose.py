@@ -26,7 +26,12 @@ from tofcorr.diagnosis.findings.outliers import (
     refuse_impossible_gap,
 )
 from tofcorr.diagnosis.findings.shares import attribute, explained_squares, parts_of
-from tofcorr.diagnosis.given import GivenSimulator, Simulator, open_simulator
+from tofcorr.diagnosis.given import (
+    OpenSimulator,
+    Simulator,
+    open_simulator,
+    simulated_error,
+)
 from tofcorr.diagnosis.next.advice import minimum_detectable, next_recording
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult, write_report
@@ -69,6 +74,7 @@ from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
+from tofcorr.simulation.options import SimulatorOptions
 
 
 def diagnose(
@@ -149,7 +155,7 @@ class Prepared:
 
 
 def prepare(
-    recording: Recording, options: DiagnosisOptions, simulator: GivenSimulator | None = None
+    recording: Recording, options: DiagnosisOptions, simulator: OpenSimulator | None = None
 ) -> Prepared:
     """Read the recording, fit the base model and compute all sums.
 
@@ -199,14 +205,14 @@ def prepare(
 
 
 def _both_known(
-    observations: Observations, simulator: GivenSimulator, options: DiagnosisOptions
+    observations: Observations, simulator: OpenSimulator, options: DiagnosisOptions
 ) -> tuple[Observations, SimulatorError, list[str]]:
     """Return the pixels for which a simulator has a distance, its error there, and warnings.
 
     With fewer than a tenth of the pixels the comparison would be about another recording; a
     thousandth without a distance is worth a warning.
     """
-    error = simulator.simulate(observations, options)
+    error = simulated_error(simulator, observations, options)
     limits = list(error.limits)
     known = error.error.isfinite()
     share = float(known.double().mean())
@@ -246,7 +252,7 @@ def _with_base_pattern(study: Study) -> Study:
 
 
 def conclude(
-    prepared: Prepared, simulator: GivenSimulator | None, begin: Callable[[str], object]
+    prepared: Prepared, simulator: OpenSimulator | None, begin: Callable[[str], object]
 ) -> DiagnosisResult:
     """Return all findings; their verdict is that of the gap, without doubts about the recording.
 
@@ -261,7 +267,8 @@ def conclude(
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = resampled(study.observations.num_units, options.bootstraps, generator)
     named = name_effects(study)
-    given = None if simulator is None else simulator.options
+    given = simulator if isinstance(simulator, SimulatorOptions) else None
+    frames = simulator if isinstance(simulator, Recording) else None
     found = Evidence(study=study, named=named, given=given)
 
     begin("measuring the gap")
@@ -281,7 +288,6 @@ def conclude(
         transfer = measure_transfer(found, generator, resamples)
         degraded = degraded_stage(found, gap.floor, resamples)
         closure = check_in_simulator(found)
-    frames = None if simulator is None else simulator.frames
     if given is not None:
         frames = noisy_frames(recording, given, options.seed + 3)
     observables = Observables(recording, frames, seed=options.seed + 3, level=options.tests.level)
@@ -298,7 +304,7 @@ def conclude(
         verdict=write_verdict(named, gap, remainder, shares),
         causes=list_causes(found, shares),
         remarks=list_remarks(found, gap, remainder, detectable),
-        simulator_kind="fitted" if simulator is None else simulator.kind,
+        simulator_kind="fitted" if simulator is None else "given" if given else "rendered",
         stages=stages,
         shares=shares,
         warnings=tuple(warnings),

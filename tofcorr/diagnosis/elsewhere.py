@@ -34,7 +34,7 @@ from tofcorr.diagnosis.sums.study import (
     relinearised,
     with_poses_reestimated,
 )
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.error_terms.base import Interval
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.effects.base import EffectInputs
 
@@ -48,15 +48,10 @@ def true_distance(frames: Observations) -> Tensor:
     recording = frames.recording
     if recording.true_depth is None:
         return predicted_distance(frames, torch.from_numpy(recording.tool_from_camera))
-    depth = torch.full_like(frames.measured, torch.nan)
-    for frame, (start, end) in enumerate(frames.frame_ends):
-        image = recording.read("true_depth", np.array([frame]))
-        assert image is not None
-        depth[start:end] = torch.from_numpy(image).double().flatten()[frames.pixel[start:end]]
+    images = recording.read("true_depth", np.arange(recording.num_frames))
+    depth = torch.from_numpy(images).flatten(1)[frames.frame, frames.pixel].double()
     depth = torch.where(depth > 0, depth, torch.nan)
-    if recording.depth_kind == "radial":
-        return depth
-    return depth / ray_directions(recording.camera).reshape(-1, 3)[frames.pixel, 2]
+    return depth if recording.depth_kind == "radial" else depth / frames.rays[:, 2]
 
 
 def simulated_elsewhere(
@@ -110,12 +105,19 @@ def simulated_elsewhere(
             f"{', '.join(dict.fromkeys(lacking))}; whether the simulator has these already cannot "
             "be told."
         )
-    ranges = {"distance in metres": (here.radial_distance, there.radial_distance)}
-    if real.amplitude is not None and frames.amplitude is not None:
-        ranges["amplitude"] = real.amplitude, frames.amplitude
-    for name, values in ranges.items():
-        beyond, words = _beyond(name, *values)
-        outside, warnings = outside | beyond, [*warnings, *words]
+    seen = fit.model.domain
+    ranges = (
+        ("distance in metres", here.radial_distance, seen.radial_distance),
+        (
+            "amplitude",
+            real.amplitude,
+            seen.amplitude,
+        ),
+    )
+    for name, values, interval in ranges:
+        if values is not None and interval is not None:
+            beyond, words = _beyond(name, values, interval)
+            outside, warnings = outside | beyond, [*warnings, *words]
     first = (
         f"The simulator saw other poses: its error was fitted to its own {frames.num_frames} "
         f"frames, to {1000 * misfit:.1f} mm on held-out ones, and carried to the recording's "
@@ -156,23 +158,22 @@ def _amplitude_scale(
     return ratio if max(ratio, 1 / max(ratio, TINY)) > 1.5 else 1.0
 
 
-def _beyond(name: str, real: Tensor, simulated: Tensor) -> tuple[Tensor, list[str]]:
+def _beyond(name: str, real: Tensor, simulated: Interval) -> tuple[Tensor, list[str]]:
     """Return which pixels lie beyond the simulator's range of a variable, and a warning.
 
     A range counts as covered by a twentieth beyond its ends: a low polynomial hardly leaves its
-    course there. A share of 0.1 % at each end may be gross errors.
+    course there. A thousandth of the pixels may be gross errors.
 
     Args:
         name: Of the variable, for the warning.
         real: Values of the recording, shape (M,).
-        simulated: Values of the simulator's frames.
+        simulated: Range of the simulator's frames.
     """
-    outside = 1 / 1000
-    low, high = np.quantile(simulated.numpy(), (outside, 1 - outside), method="nearest")
+    low, high = simulated
     reach = (high - low) / 20
     beyond = (real < low - reach) | (real > high + reach)
     share = float(beyond.double().mean())
-    if share <= outside:
+    if 1000 * share <= 1:
         return beyond, []
     return beyond, [
         f"{100 * share:.1f} % of the recording's pixels lie beyond the simulator's range of "

@@ -45,43 +45,31 @@ SimulatorKind = Literal["given", "rendered", "fitted"]
 named, so that a simulator is fitted to the recording."""
 
 
-class GivenSimulator:
-    """A simulator that a user named.
+OpenSimulator = SimulatorOptions | Recording
+"""Options of the built-in simulator, or the frames that another one rendered; their hand-eye
+transform and planes are exact."""
 
-    Args:
-        options: Of the built-in simulator; None where another one rendered frames.
-        frames: These frames; their hand-eye transform and planes are exact.
+
+def simulated_error(
+    simulator: OpenSimulator, observations: Observations, options: DiagnosisOptions
+) -> SimulatorError:
+    """Return the error that a simulator makes in the chosen pixels of a recording.
+
+    Raises:
+        CalibrationDataError: The simulator cannot be compared with the recording.
     """
-
-    def __init__(
-        self, options: SimulatorOptions | None = None, frames: Recording | None = None
-    ) -> None:
-        self.options, self.frames = options, frames
-
-    @property
-    def kind(self) -> SimulatorKind:
-        """What `diagnosis.json` calls it."""
-        return "rendered" if self.options is None else "given"
-
-    def simulate(self, observations: Observations, options: DiagnosisOptions) -> SimulatorError:
-        """Return the error that the simulator makes in the chosen pixels of a recording.
-
-        Raises:
-            CalibrationDataError: The simulator cannot be compared with the recording.
-        """
-        if self.options is None:
-            assert self.frames is not None
-            return rendered_error(self.frames, observations, options)
-        pose = default_hand_eye(self.options, observations.recording)
-        distance = twin_distance(observations, self.options, pose)
-        return SimulatorError.exact(distance - predicted_distance(observations, pose), pose)
+    if isinstance(simulator, Recording):
+        return rendered_error(simulator, observations, options)
+    pose = default_hand_eye(simulator, observations.recording)
+    distance = twin_distance(observations, simulator, pose)
+    return SimulatorError.exact(distance - predicted_distance(observations, pose), pose)
 
 
 Simulator = SimulatorOptions | Mapping[str, Any] | Path | str | Recording | Callable[..., Any]
 """All that `diagnose` accepts as a simulator."""
 
 
-def open_simulator(sim: Simulator | None, recording: Recording) -> GivenSimulator | None:
+def open_simulator(sim: Simulator | None, recording: Recording) -> OpenSimulator | None:
     """Return the simulator that `sim` names; None for None.
 
     Args:
@@ -99,23 +87,23 @@ def open_simulator(sim: Simulator | None, recording: Recording) -> GivenSimulato
     if sim is None:
         return None
     if isinstance(sim, Recording):
-        return GivenSimulator(frames=sim)
+        return sim
     if isinstance(sim, str | Path) and Path(sim).is_dir():
         if not (Path(sim) / HEADER_FILE).exists():
             raise ConfigError(
                 f"{sim}: a simulator is a YAML file, the name of a shipped configuration, or the "
                 f"folder of a recording; this folder has no {HEADER_FILE}."
             )
-        return GivenSimulator(frames=Recording.open(sim))
+        return Recording.open(sim)
     if callable(sim):
-        return GivenSimulator(frames=frames_of(sim(recording), recording))
+        return frames_of(sim(recording), recording)
     if not isinstance(sim, SimulatorOptions | Mapping | str | Path):
         raise ConfigError(
             "sim: expected a shipped name, a file, options, a recording or a function, got "
             f"{type(sim).__name__}. Frames in memory are handed over by a function: "
             "sim=lambda recording: frames."
         )
-    return GivenSimulator(resolve_options(SimulatorOptions, sim))
+    return resolve_options(SimulatorOptions, sim)
 
 
 def frames_of(returned: Any, recording: Recording) -> Recording:  # noqa: ANN401 - checked here

@@ -51,7 +51,6 @@ class Coherence:
     Attributes:
         within: Inside images, without each pose's offset and tilts; the largest over the shapes of
             tiles.
-        within_error: Standard error of `within`, over frames.
         between: Of the offsets and tilts of poses.
         fixed: Of what is the same in every image; `within` contains part of it too.
         form: Shape of the tiles with the largest value: `squares`, `rows` or `columns`.
@@ -59,7 +58,6 @@ class Coherence:
     """
 
     within: float
-    within_error: float
     between: float
     fixed: float
     form: str
@@ -80,19 +78,14 @@ def coherence_inside(study: Study, inside: Tensor, between: float) -> Coherence:
     """Measure the structure of a residual, from what `without_pose` returns of it."""
     known, noise, found = study.fit.shared, study.fit.floor**2, []
     for form, cells in small_tiles(study.observations).items():
-        mean, error = _shared(study, inside, cells)
-        if known.share[form]:
-            mean -= known.share[form] * noise
-            error = float(np.hypot(error, known.error[form] * noise))
-        found.append((mean, error, form))
-    within, error, form = max(found)
+        found.append((_shared(study, inside, cells) - known.share[form] * noise, form))
+    within, form = max(found)
     # What is the same in every image, from products between poses.
     pixel, share = study.observations.pixel.unique(return_inverse=True)[1], study.fit.share
     sums = _per_cell(study.unit_of_pixel, pixel, share * inside, share)
     products, pairs = ((own.sum(0) ** 2 - (own**2).sum(0)).sum() for own in sums)
     return Coherence(
         within=within,
-        within_error=error,
         between=between,
         fixed=float(products / pairs.clamp(min=TINY)),
         form=form,
@@ -108,16 +101,13 @@ def _per_cell(group: Tensor, cells: Tensor, *values: Tensor) -> tuple[Tensor, ..
     return tuple(zeros.index_add(0, place, own).reshape(groups, size) for own in values)
 
 
-def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float]:
-    """Return the mean product of different pixels in a tile, and its standard error, m^2."""
+def _shared(study: Study, residual: Tensor, cells: Tensor) -> float:
+    """Return the mean product of different pixels of an image in a tile, m^2."""
     share, cells = study.fit.share, cells.unique(return_inverse=True)[1]
-    own = share * residual
-    sums = _per_cell(study.observations.frame, cells, own, own**2, share, share**2)
-    total, squares, weight, weight_squares = sums
-    products, pairs = (total**2 - squares).sum(1), (weight**2 - weight_squares).sum(1)
-    whole = pairs.sum().clamp(min=TINY)
-    mean = float(products.sum() / whole)
-    return mean, float((products - mean * pairs).square().sum().sqrt() / whole)
+    values = share * residual, share
+    sums = zip(values, _per_cell(study.observations.frame, cells, *values), strict=True)
+    products, pairs = (total.square().sum() - own.square().sum() for own, total in sums)
+    return float(products / pairs.clamp(min=TINY))
 
 
 def without_pose(study: Study, residual: Tensor, *, ridge: float = 1e-3) -> tuple[Tensor, float]:

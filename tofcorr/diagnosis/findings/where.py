@@ -231,8 +231,13 @@ def find_where(
     binned: Sequence[Binned],
     chosen: Sequence[str] | None = (),
     residual: Tensor | None = None,
+    *,
+    least_left: float = 0.1,
+    rounding: float = 1e-9,
 ) -> Stage:
     """Test all covariates and the image map for a bias; return the stage with what was found.
+
+    All bins that four poses show are compared with their maximum under flips.
 
     Args:
         study: The recording.
@@ -240,6 +245,11 @@ def find_where(
         binned: The covariates in bins.
         chosen: Effects of the model whose residual is tested; None: `residual` is, of no fit.
         residual: Of what was not fitted, shape (M,), metres.
+        least_left: Least standard deviation of a sum that the model was fitted to, over that of
+            residuals that it was not. Chosen: what the model absorbs so far shows no bias, and how
+            far is known to 2 %.
+        rounding: Relative difference of two statistics that counts as none: a bin of few poses has
+            flips that give what was observed. Chosen, far above the rounding of sums.
     """
     if residual is None:
         residual = left_out_residual(study, chosen or ())
@@ -269,34 +279,7 @@ def find_where(
         parts.append((own, flips(own, place, along), counts))
     sums, total, counts = (torch.cat(own) for own in zip(*parts, strict=True))
     offsets = sums[-1] / counts[-1].clamp(min=TINY)
-    return _assembled(stage, sums[:-1], total[:-1], counts[:-1], regions, offsets)
-
-
-def _assembled(
-    stage: Stage,
-    sums: Tensor,
-    total: Tensor,
-    counts: Tensor,
-    regions: Sequence[Region],
-    offsets: Tensor,
-    least_left: float = 0.1,
-    rounding: float = 1e-9,
-) -> Stage:
-    """Compare all bins that four poses show with their maximum under flips.
-
-    Args:
-        stage: Which stage, and the gap there.
-        sums: Weighted residuals of every bin and pose, shape (R, U).
-        total: Observed, then of every flip, shape (R, 1 + B).
-        counts: Sums of the weights, shape (R, U).
-        regions: All bins but the image's, without their bias.
-        offsets: Mean residual of each pose, shape (U,), metres.
-        least_left: Least standard deviation of a sum that the model was fitted to, over that of
-            residuals that it was not. Chosen: what the model absorbs so far shows no bias, and how
-            far is known to 2 %.
-        rounding: Relative difference of two statistics that counts as none: a bin of few poses has
-            flips that give what was observed. Chosen, far above the rounding of sums.
-    """
+    sums, total, counts = sums[:-1], total[:-1], counts[:-1]
     spread = sums.square().sum(1).sqrt()
     enough = ((counts > 0).sum(1) >= min(4, sums.shape[1])) & (spread > 0)
     spread = torch.maximum(total[:, 1:].square().mean(1).sqrt(), least_left * spread)

@@ -205,7 +205,7 @@ def _tables(found: Evidence) -> tuple[MeasuredErrorOptions, list[Numbered]]:
     already = MeasuredErrorOptions() if given is None else given.sensor.delays.measured
     terms: list[Any] = model.terms
     counts = len(model.error_model.signal_terms), len(model.error_model.pixel_terms)
-    reads = [_variable_of(term, observations) for term in terms[: counts[0]]]
+    reads = [*map(_variable_of, terms[: counts[0]])]
     reads += ["pixel"] * counts[1] + [None] * (len(terms) - sum(counts))
     variable = next((one for one in reads if one in ("amplitude", "normalised_amplitude")), None)
     if already.amplitude is not None:
@@ -263,22 +263,13 @@ def _dense_where_dark(values: Tensor) -> Tensor:
     return low + reach * torch.linspace(0.0, 1.0, 2 * _LEAST_KNOTS, dtype=torch.float64) ** 2
 
 
-def _variable_of(term: SignalTerm, observations: Observations) -> str | None:
+def _variable_of(term: SignalTerm) -> str | None:
     """Return the one variable that a term depends on; None: it depends on two."""
     if not term.needs_amplitude:
         return "distance"
-    if observations.amplitude is None:
+    if len(term.axes() or ()) > 1:
         return None
-    low, high = float(observations.measured.min()), float(observations.measured.max())
-    dark, bright = float(observations.amplitude.min()), float(observations.amplitude.max())
-    amplitude = torch.linspace(dark, bright, 9, dtype=torch.float64)
-    near, far = torch.full_like(amplitude, low), torch.full_like(amplitude, high)
-    if torch.equal(term.basis(near, amplitude), term.basis(far, amplitude)):
-        return "amplitude"
-    same_normalised = amplitude * (low / high) ** 2
-    if torch.allclose(term.basis(near, amplitude), term.basis(far, same_normalised)):
-        return "normalised_amplitude"
-    return None
+    return "normalised_amplitude" if term.uses_normalised_amplitude else "amplitude"
 
 
 def _plain(study: Study) -> SimulatorOptions:
@@ -354,22 +345,31 @@ def twin_distance(
     Returns:
         NaN in frames left out and where the simulated camera has no distance.
     """
-    recording = observations.recording
     measured = torch.full_like(observations.measured, torch.nan)
+    for frame, image in twin_images(observations, simulator, tool_from_camera, generator, frames):
+        start, end = observations.frame_ends[frame]
+        measured[start:end] = image.reshape(-1)[observations.pixel[start:end]]
+    return measured
+
+
+def twin_images(
+    observations: Observations,
+    simulator: SimulatorOptions,
+    tool_from_camera: Tensor,
+    generator: torch.Generator | None,
+    frames: list[int] | None,
+) -> Iterator[tuple[int, Tensor]]:
+    """Yield the number of each frame, and its distances (H, W), metres, as `twin_distance` does."""
     chosen = list(range(observations.num_frames)) if frames is None else frames
     states = twin_frames(
         simulator,
-        recording,
+        observations.recording,
         generator,
         tool_from_camera=tool_from_camera,
         reflectivity="pattern" if observations.amplitude is None else "from_recording",
         indices=chosen,
     )
-    for frame, state in zip(chosen, states, strict=True):
-        start, end = observations.frame_ends[frame]
-        pixels = observations.pixel[start:end]
-        measured[start:end] = state.measured_distance.reshape(-1)[pixels]
-    return measured
+    return ((frame, one.measured_distance) for frame, one in zip(chosen, states, strict=True))
 
 
 def whole_patterns(found: Evidence) -> dict[str, Tensor]:
@@ -399,23 +399,16 @@ def _of_all_pixels(found: Evidence, effect: MapEffect) -> Tensor:
     others = replace(found, named=replace(named, names=names))
     spread = FittedMap(study, effect, study.residual_of(named.columns)).prior_sd
     frames, usable = simulated_frames(observations.recording), observations.usable
-    weights = torch.zeros(observations.num_frames, dtype=torch.float64)
-    weights = weights.index_add(0, observations.frame, study.fit.weight)
-    weights = weights / torch.bincount(observations.frame, minlength=len(weights)).clamp(min=1)
-    states = twin_frames(
-        others.simulator,
-        observations.recording,
-        tool_from_camera=others.tool_from_camera,
-        reflectivity="pattern" if observations.amplitude is None else "from_recording",
-        indices=frames,
-    )
+    seen, count = observations.frame, observations.num_frames
+    weights = torch.bincount(seen, study.fit.weight, count)
+    weights = weights / torch.bincount(seen, minlength=count).clamp(min=1)
+    pose = others.tool_from_camera
     x, y, _ = ray_directions(camera).reshape(-1, 3).T
     surface = torch.stack([torch.ones_like(x), x, y], dim=1)
     cells = effect.cells_of(torch.arange(camera.height * camera.width))
     sums, total = torch.zeros(2, len(effect.coefficients), dtype=torch.float64)
-    for frame, state in zip(frames, states, strict=True):
-        measured = observations.distance_images[frame].double()
-        left = (measured - state.measured_distance).flatten()
+    for frame, expected in twin_images(observations, others.simulator, pose, None, frames):
+        left = (observations.distance_images[frame].double() - expected).flatten()
         used = usable[frame].flatten() & left.isfinite()
         if not bool(used.any()):
             continue

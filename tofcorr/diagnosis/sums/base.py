@@ -17,6 +17,7 @@ images and neighbours share noise, effects that mix neighbouring pixels of measu
 explain the noise of the very pixel whose error is to be explained: they look at images without it.
 """
 
+from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -56,8 +57,8 @@ from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.geometry import se3
-from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
+from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from, resolved_planes
+from tofcorr.plausibility.look import Look
 from tofcorr.simulation.effects.base import EffectInputs
 
 
@@ -310,31 +311,6 @@ class SimulatorError:
         return observations.measured - predicted - self.error
 
 
-def closed_form(observations: Observations, *, least_singular_value: float = 0.2) -> list[Tensor]:
-    """Solve n . (R D v + t) + d = 0 for the entries of R and t, then make R a rotation.
-
-    It serves as a start only, because its regressors contain the measured distance.
-
-    Args:
-        observations: The pixels.
-        least_singular_value: The closed form is no start if a singular value of its matrix is below
-            this. A rotation has only ones; chosen with room for noise.
-    """
-    facts, frame = observations.facts, observations.frame
-    points = observations.rays * observations.measured[:, None]
-    normal, offset = plane_in_frame(facts.normal_world, facts.offset, facts.world_from_tool)
-    normal, offset = normal[frame], offset[frame]
-    design = torch.cat([(normal[:, :, None] * points[:, None, :]).flatten(1), normal], dim=1)
-    solved = torch.linalg.lstsq(design, -offset[:, None], driver="gelsd").solution[:, 0]
-    u, values, vt = torch.linalg.svd(solved[:9].reshape(3, 3))
-    if not bool(values.isfinite().all()) or float(values[-1]) < least_singular_value:
-        return []
-    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))]).double()) @ vt
-    height = offset + (normal * (points @ rotation.T)).sum(1)
-    shift = torch.linalg.lstsq(normal, -height[:, None], driver="gelsd").solution[:, 0]
-    return [se3.assemble(rotation, shift)]
-
-
 # Pixels of all but the last steps. Chosen for speed: so many determine a model of tens of columns
 # far better than its robust weights need.
 _COARSE_PIXELS = 20_000
@@ -455,14 +431,8 @@ def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple
         known: Error that is known already, shape (M,), metres.
         guesses: Hand-eye transforms to start from; the first is the one to hold where none is free.
     """
-    starts = guesses[:1]
-    if model.hand_eye_free:
-        # The last guess may be turned about the optical axis by one, two or three quarters.
-        quarter = torch.tensor([0, 0, 0, 0, 0, torch.pi / 2], dtype=torch.float64)
-        turned = [guesses[-1] @ se3.exp(number * quarter) for number in (1, 2, 3)]
-        starts = [*guesses, *closed_form(model.observations), *turned]
     best, best_loss = (model, guesses[0]), float("inf")
-    for start in starts if model.num_geometry else []:
+    for start in _starts(model, guesses):
         found, pose, coefficients = _descend(model, known, start, 12, None)
         residual = found.residual(pose, coefficients) - known
         loss = float(residual.abs().nan_to_num(1000.0).clamp(max=1.0).mean())
@@ -472,6 +442,21 @@ def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple
         if best_loss < 0.015:
             break
     return best
+
+
+def _starts(model: BaseModel, guesses: list[Tensor]) -> Iterator[Tensor]:
+    """Yield the guesses, then the alignment of frames and planes that an inspection finds.
+
+    Where no hand-eye transform is free, the first is held, and is a start only of walls.
+    """
+    if not model.hand_eye_free:
+        yield from guesses[:1] if model.num_geometry else []
+        return
+    yield from guesses
+    recording = model.observations.recording
+    aligned = Look(Dataset((recording,)), resolved_planes("auto", [recording])).as_given
+    if aligned is not None:
+        yield torch.from_numpy(aligned.hand_eye)
 
 
 def _descend(

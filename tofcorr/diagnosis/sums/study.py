@@ -484,16 +484,18 @@ def without_absorbed(
     if not study.observations.num_walls:
         return study, []
     shares = {name: absorbed_by_planes(study, name) for name in study.candidates.effects}
-    hidden = [name for name, share in shares.items() if share > not_judged]
+    hidden = {n: [MEASURED_PLANES.words] for n, share in shares.items() if share > not_judged}
     if hidden:
-        # Drawn again from the same seed.
-        options = study.options
-        fewer = options.model_copy(update={"leave_out": (*options.leave_out, *hidden)})
-        generator = torch.Generator().manual_seed(options.seed)
-        again = build_study(fewer, study.observations, study.fit, study.inputs, generator)
-        wants = {name: [MEASURED_PLANES.words] for name in hidden}
-        candidates = replace(again.candidates, missing={**again.candidates.missing, **wants})
-        study = replace(again, options=options, candidates=candidates)
+        known = study.candidates
+        effects = {name: effect for name, effect in known.effects.items() if name not in hidden}
+        missing = {**known.missing, **hidden}
+        kept = [*effects, *known.probes]
+        study = replace(
+            study,
+            candidates=replace(known, effects=effects, missing=missing),
+            columns={name: study.columns[name] for name in (BASE, *kept)},
+            sums=study.sums.of(kept).with_pose_uncertainty(),
+        )
     partly = [
         f"{name} ({100 * share:.0f} %)"
         for name, share in shares.items()
