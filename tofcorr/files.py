@@ -4,6 +4,7 @@ What is being written has a temporary name that is known again, is locked while 
 removed however its block ends. An archive carries a digest: a change of any byte is noticed.
 """
 
+import errno
 import io
 import json
 import logging
@@ -11,6 +12,7 @@ import lzma
 import os
 import re
 import shutil
+import stat
 import tempfile
 import uuid
 import zipfile
@@ -22,7 +24,7 @@ from hashlib import sha256
 from pathlib import Path
 from pickle import UnpicklingError
 from tokenize import TokenError
-from typing import Any
+from typing import Any, BinaryIO
 
 import click
 
@@ -304,9 +306,38 @@ UNREADABLE = (
 # leaves the memory of its numbers as it was; zipfile reads it.
 _FOLDER = 0x10
 
-_MOST_BYTES = 2_000_000_000
-"""Most bytes of all records, unpacked. Chosen: a small archive can be made to unpack to any size; a
-fixed pattern of a camera of 16 megapixels takes 134 MB."""
+_MOST_BYTES = 500_000_000
+"""Most bytes of a file that is read whole, and of what an archive unpacks to. Chosen: a small
+archive can be made to unpack to any size; a table for a camera of 16 megapixels takes 268 MB."""
+
+
+def open_regular(path: Path | str, most_bytes: float = _MOST_BYTES) -> BinaryIO:
+    """Open a file to be read, unless it might never end.
+
+    A pipe waits until somebody writes to it, and a device such as /dev/zero has no end.
+
+    Args:
+        path: The file, or a link to it.
+        most_bytes: How large it may be.
+
+    Raises:
+        OSError: There is no such file, it is a pipe, a device or a folder, or it is larger.
+    """
+
+    def opened(name: str, flags: int) -> int:
+        return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+
+    file = open(path, "rb", opener=opened)  # noqa: SIM115 - the caller closes it.
+    status = os.fstat(file.fileno())
+    wrong = {
+        "it is no regular file": not stat.S_ISREG(status.st_mode),
+        f"it is larger than {most_bytes / 1e6:.0f} MB": status.st_size > most_bytes,
+    }
+    for reason, holds in wrong.items():
+        if holds:
+            file.close()
+            raise OSError(errno.EINVAL, reason)
+    return file
 
 
 def sealed(content: io.BytesIO) -> bytes:
@@ -323,7 +354,7 @@ def sealed(content: io.BytesIO) -> bytes:
     return content.getvalue()
 
 
-def refuse_damaged(path: Path, what: str) -> None:
+def refuse_damaged(path: Path, what: str, content: bytes | None = None) -> None:
     """Refuse an archive whose content is not what was written.
 
     Every record is compared with its own checksum. An archive with a seal is also compared with
@@ -332,12 +363,17 @@ def refuse_damaged(path: Path, what: str) -> None:
     Args:
         path: The file.
         what: What it should be, for the message.
+        content: Of the archive, if it stands inside the file.
 
     Raises:
         CalibrationDataError: It is damaged, or was changed after it was written.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with (
+            open_regular(path) if content is None else io.BytesIO(content) as file,
+            zipfile.ZipFile(file) as archive,
+        ):
+            refuse_bomb(archive)
             sealed = [name for name in archive.namelist() if name.endswith(_RECORD)]
             found = _digest(archive)
             stored = json.loads(archive.read(sealed[0]))["sha256"] if sealed else found
@@ -345,19 +381,26 @@ def refuse_damaged(path: Path, what: str) -> None:
         raise CalibrationDataError(f"{path}: there is no such file; expected {what}.") from None
     except IsADirectoryError:
         raise CalibrationDataError(f"{path}: is a folder; expected {what}, a file.") from None
+    except OSError as error:
+        why = error.strerror or error
+        raise CalibrationDataError(f"{path}: cannot be read ({why}); expected {what}.") from None
     except UNREADABLE:
-        if not zipfile.is_zipfile(path):
+        if not zipfile.is_zipfile(path if content is None else io.BytesIO(content)):
             raise CalibrationDataError(f"{path}: is not {what}, or is cut short.") from None
         raise CalibrationDataError(f"{path}: is damaged; expected {what}.") from None
     if stored != found or len(sealed) > 1:
         raise CalibrationDataError(f"{path}: was changed after it was written; expected {what}.")
 
 
+def refuse_bomb(archive: zipfile.ZipFile) -> None:
+    """Raise ValueError where an archive unpacks to more than any calibration holds."""
+    if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+        raise ValueError("it unpacks to too much")
+
+
 def _digest(archive: zipfile.ZipFile) -> str:
     """Return the digest of all records but the seal; reading compares their checksums."""
     digest = sha256()
-    if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
-        raise ValueError("it unpacks to too much")
     if any(entry.external_attr & _FOLDER for entry in archive.infolist()):
         raise ValueError("a record is marked as a folder")
     names = archive.namelist()

@@ -15,6 +15,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, ValidationError
 
 from tofcorr.errors import ConfigError, TofcorrError
+from tofcorr.files import open_regular
 
 LARGEST_NUMBER = 1e12
 """Largest number read from a file, in the file's own unit. Chosen: a hundred times the fastest
@@ -209,16 +210,13 @@ def read_text(
         TofcorrError: Of kind `kind`: the file is missing, unreadable, too large or not UTF-8.
     """
     try:
-        with path.open("rb") as file:
-            content = file.read(most_bytes + 1)
-        if len(content) > most_bytes:
-            raise kind(
-                f"{path}: larger than {most_bytes // 10**6} MB, the limit of such a file here."
-            )
-        return content.decode("utf-8")
+        with open_regular(path, most_bytes) as file:
+            return file.read().decode("utf-8")
     except FileNotFoundError:
         raise kind(f"{path}: there is no such file.") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise kind(f"{path}: cannot be read ({error.strerror or error}).") from None
+    except UnicodeDecodeError as error:
         raise kind(f"{path}: cannot be read as text ({error}).") from None
 
 

@@ -17,7 +17,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_corrected
 from tofcorr.geometry.camera import CameraIntrinsics
 
-CORRECT = ("correct", "--model")
+CORRECT = ("correct", "--trust-model", "--model")
 ERROR = 0.25
 FARTHEST = 2.0
 

@@ -1,8 +1,11 @@
 """Damaged files of other programs end in one sentence, never in a traceback."""
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -62,3 +65,12 @@ def test_a_damaged_file_is_read_or_refused(
 @pytest.mark.parametrize("examples", [20, MANY])
 def test_a_damaged_bag_is_read_or_refused(bag: fuzz.Target, examples: int, tmp_path: Path) -> None:
     refused_in_words(bag, tmp_path, examples)
+
+
+def test_an_image_of_too_many_pixels_is_refused(tmp_path: Path) -> None:
+    """A process of its own: OpenCV reads the limit when it is imported."""
+    cv2.imwrite(str(tmp_path / "image.png"), np.zeros((12_000, 12_000), np.uint8))
+    code = "import sys; from pathlib import Path; from tofcorr.importing.images import read_array; "
+    given = [sys.executable, "-c", code + "read_array(Path(sys.argv[1]))", tmp_path / "image.png"]
+    told = subprocess.run(given, capture_output=True, text=True, check=False)
+    assert "image.png is not a readable image" in told.stderr

@@ -25,9 +25,12 @@ _FORMATS = " ".join(f"{one.name} ({one.ending}): {one.summary}." for one in FORM
 @click.command()
 @option("--model", "The corrector.ts of a run.", required=True, type=FOLDER)
 @recording_option("Folder of the recording to correct.")
+@option("--trust-model", "Run the code of a model that holds no calibration.", is_flag=True)
 @option("--out", "Folder of the corrected recording, made anew.", type=NewPath())
 @option("--ply", _CLOUDS, type=NewPath())
-def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Path | None) -> None:
+def correct_command(
+    model: Path, recording_path: Path, trust_model: bool, out: Path | None, ply: Path | None
+) -> None:
     """Write a recording anew with corrected depth, its point clouds, or both.
 
     The rows, the camera and the amplitude stay as they are; depth is NaN where there was no
@@ -45,7 +48,7 @@ def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Pa
         raise click.UsageError("--out and --ply name the same folder; choose another for one.")
     # Contents are checked as the frames pass by; the recording may be larger than memory.
     recording = Recording.open(recording_path, check_contents=False)
-    corrector, metadata = load_corrector(model)
+    corrector, metadata = load_corrector(model, trusted=trust_model)
     _refuse_another_camera(metadata, recording, model)
     if out is not None:
         with _refused_by(model):
@@ -68,7 +71,7 @@ def _refused_by(model: Path) -> Iterator[None]:
 
     try:
         yield
-    except (RuntimeError, torch.jit.Error) as error:
+    except (RuntimeError, ValueError, torch.jit.Error) as error:
         # TorchScript puts the message behind its traceback, after such as builtins.ValueError.
         last = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
         said = re.sub(r"^[A-Za-z_][\w.]*: ", "", last)

@@ -53,6 +53,19 @@ def group() -> None:
     """Correct time-of-flight depth, and find out why a simulator disagrees with it."""
 
 
+def _open_closed_streams() -> None:
+    """Send what is said nowhere if the caller closed standard output or error.
+
+    Otherwise the next file that is opened takes the stream's number, and gets what is said.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
+
+
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")
 _TOLD_TO_END = threading.Event()
 
@@ -60,6 +73,7 @@ _TOLD_TO_END = threading.Event()
 def main() -> None:
     """Run the command line; exit with 2 and one message on anything the user can mend."""
     _TOLD_TO_END.clear()
+    _open_closed_streams()
     try:
         # Being told to end is handled as Ctrl-C is: what was begun is removed.
         signal.signal(signal.SIGTERM, _stop)

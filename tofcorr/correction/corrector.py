@@ -505,10 +505,11 @@ class RuntimeSigma(nn.Module):
 
 
 def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> None:
-    """Refuse all but a frame, or a batch of frames, of the camera in float32.
+    """Refuse all but a frame, or a batch of frames, of the camera in float32, without gradients.
 
     Raises:
-        ValueError: Shape or dtype differ (`torch.jit.Error` once scripted).
+        ValueError: Shape or dtype differ, or a gradient is asked for (`torch.jit.Error` once
+            scripted).
     """
     if depth.dim() not in (2, 3) or list(depth.shape[-2:]) != [height, width]:
         raise ValueError(
@@ -523,6 +524,11 @@ def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> N
         raise ValueError(
             f"depth and amplitude: expected float32, got {_numbers(depth)} and "
             f"{_numbers(amplitude)}. Convert depth to metres and both to float32."
+        )
+    if torch.is_grad_enabled() and (depth.requires_grad or amplitude.requires_grad):
+        raise ValueError(
+            "a corrector writes in place and gives no gradients: call it under torch.no_grad(), or "
+            "use tofcorr.DepthCorrection, which is differentiable."
         )
 
 

@@ -2,19 +2,24 @@
 
 import json
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
 from pydantic import BeforeValidator, ConfigDict
-from torch.jit import ScriptModule
+from torch import nn
 
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.state import STATE_FILE, load_calibration
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import DepthKind, Distortion, PinholeMatrix
 from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size, not_a_truth_value
 
 _WHAT = "the corrector.ts of a run"
+EMBEDDED = "extra/calibration.pt"
+"""Where a TorchScript file holds its calibration."""
 _Range = tuple[FiniteNumber, FiniteNumber]
 
 
@@ -71,19 +76,37 @@ class LutMetadata(CorrectorMetadata):
     lut: LutMark
 
 
-def load_corrector(path: Path) -> tuple[ScriptModule, CorrectorMetadata]:
+def load_corrector(path: Path, *, trusted: bool = False) -> tuple[nn.Module, CorrectorMetadata]:
     """Load a corrector for the CPU, and what it says of itself.
 
+    A TorchScript file is a program: torch runs what stands in it as soon as it is loaded. It is
+    built anew here from the calibration that the file holds beside its code, or that stands beside
+    the file in the folder of a run.
+
+    Args:
+        path: The file.
+        trusted: Whether the code of a file that holds no calibration may be run.
+
     Raises:
-        CalibrationDataError: The file is missing, damaged, or no corrector.
+        CalibrationDataError: The file is missing, damaged, or no corrector; or it holds code alone
+            and is not trusted.
     """
     refuse_damaged(path, _WHAT)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)
-            corrector = torch.jit.load(str(path), map_location="cpu").eval()
-    except (RuntimeError, ValueError, OSError, EOFError):
-        raise CalibrationDataError(f"{path}: not a TorchScript module; expected {_WHAT}.") from None
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+        inside = [archive.read(name) for name in names if name.endswith(EMBEDDED)]
+    if inside:
+        corrector: nn.Module = DepthCorrector.from_state(load_calibration(path, inside[0]))
+    elif path.with_name(STATE_FILE).exists():
+        corrector = DepthCorrector.from_state(load_calibration(path.with_name(STATE_FILE)))
+    elif trusted or not any("/code/" in name for name in names):
+        corrector = _run(path)
+    else:
+        raise CalibrationDataError(
+            f"{path}: holds a program and no calibration, as files of version 0.1 and of other "
+            "programs do; loading it would run it. Export the run again, or say --trust-model if "
+            "you know who wrote it."
+        )
     try:
         metadata = json.loads(corrector.metadata())
     except (AttributeError, TypeError, ValueError, RuntimeError, RecursionError):
@@ -92,3 +115,13 @@ def load_corrector(path: Path) -> tuple[ScriptModule, CorrectorMetadata]:
         raise CalibrationDataError(f"{path}: without a corrector's metadata; expected {_WHAT}.")
     known = CorrectorMetadata.from_mapping(metadata, f"{path}, metadata", CalibrationDataError)
     return corrector, known
+
+
+def _run(path: Path) -> nn.Module:
+    """Load a TorchScript file, which runs its code."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return torch.jit.load(str(path), map_location="cpu").eval()
+    except (RuntimeError, ValueError, OSError, EOFError):
+        raise CalibrationDataError(f"{path}: not a TorchScript module; expected {_WHAT}.") from None

@@ -3,6 +3,7 @@
 import io
 import math
 import platform
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -16,7 +17,7 @@ from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError, TofcorrError
-from tofcorr.files import UNREADABLE, refuse_damaged, sealed, staged_file
+from tofcorr.files import UNREADABLE, open_regular, refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
 from tofcorr.options import (
     LARGEST_NUMBER,
@@ -248,19 +249,44 @@ def save_calibration(path: Path | str, state: CalibrationState) -> None:
     save_values(path, _FORMAT, state.model_dump(), CalibrationDataError)
 
 
-def load_calibration(path: Path | str) -> CalibrationState:
+def load_calibration(path: Path | str, content: bytes | None = None) -> CalibrationState:
     """Read a calibration that `save_calibration` wrote.
+
+    Args:
+        path: The file.
+        content: Of the calibration, if it stands inside the file.
 
     Raises:
         CalibrationDataError: There is no such file, or it is not a calibration.
     """
     path = Path(path)
-    refuse_damaged(path, _WHAT)
-    values = read_values(path, _FORMAT)
+    refuse_damaged(path, _WHAT, content)
+    values = read_values(path, _FORMAT, content)
     if values is None:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
     with refused_in_words(CalibrationState, str(path), CalibrationDataError):
         return CalibrationState.model_validate(values)
+
+
+def _tensors(values: object) -> Iterator[Tensor]:
+    """Yield the dense tensors of plain values, nested as they are."""
+    if isinstance(values, Tensor) and values.layout == torch.strided:
+        yield values
+    elif isinstance(values, Mapping | list | tuple):
+        for value in values.values() if isinstance(values, Mapping) else values:
+            yield from _tensors(value)
+
+
+def values_of(form: str, values: dict[str, Any]) -> bytes:
+    """Return plain values and tensors as the sealed content of a file for `read_values`."""
+    content = io.BytesIO()
+    torch.save({"format": form, "version": 1, **values}, content)
+    return sealed(content)
+
+
+def calibration_bytes(state: CalibrationState) -> bytes:
+    """Return a calibration as `save_calibration` writes it."""
+    return values_of(_FORMAT, state.model_dump())
 
 
 def save_values(
@@ -271,23 +297,25 @@ def save_values(
     Raises:
         TofcorrError: Of kind `kind`: the file cannot be written.
     """
-    content = io.BytesIO()
-    torch.save({"format": form, "version": 1, **values}, content)
     with staged_file(path, kind) as part:
-        part.write_bytes(sealed(content))
+        part.write_bytes(values_of(form, values))
 
 
-def read_values(path: Path, form: str) -> dict[str, Any] | None:
+def read_values(path: Path, form: str, content: bytes | None = None) -> dict[str, Any] | None:
     """Return the values of a file that `save_values` wrote; None: of another format.
+
+    No code of the file is run, and no tensor is larger than its numbers in the file.
 
     Raises:
         CalibrationDataError: It has another version.
     """
     try:
-        values = torch.load(path, map_location="cpu", weights_only=True)
+        with open_regular(path) if content is None else io.BytesIO(content) as file:
+            values = torch.load(file, map_location="cpu", weights_only=True)
+        expanded = any(one.nbytes > one.untyped_storage().nbytes() for one in _tensors(values))
     except UNREADABLE:
         return None
-    if not isinstance(values, dict) or str(values.get("format")) != form:
+    if expanded or not isinstance(values, dict) or str(values.get("format")) != form:
         return None
     found = one_line(str(values.get("version")))
     if found != "1":

@@ -1,5 +1,6 @@
 """The `.npy` files of a recording: which there are, read in chunks, checked, and written."""
 
+import io
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import UNREADABLE
+from tofcorr.files import UNREADABLE, open_regular
 from tofcorr.options import LARGEST_NUMBER
 
 # Size of a chunk of frames, bytes. Set by hand: large enough for fast reads, small for any memory.
@@ -105,14 +106,17 @@ def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
             type, order or shape.
     """
     try:
-        with warnings.catch_warnings():
+        with open_regular(path, inf) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy warns of headers written by Python 2.
             array = np.lib.format.open_memmap(path, mode="r")
+            longer = file.seek(0, io.SEEK_END) - array.offset - array.nbytes
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
     except UNREADABLE as error:
         reason = " ".join(str(error).split())[:200]
         raise CalibrationDataError(f"{path}: not a readable .npy file ({reason}).") from None
+    if longer:
+        raise CalibrationDataError(f"{path}: {longer} bytes stand behind the array; write it anew.")
     if array.dtype != np.dtype(dtype):
         raise CalibrationDataError(f"{path}: expected {np.dtype(dtype)}, got {array.dtype}.")
     if array.ndim != len(frame_shape) + 1 or array.shape[1:] != frame_shape:

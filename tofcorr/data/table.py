@@ -14,6 +14,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions, Value, condition
 from tofcorr.data.arrays import LARGEST_DISTANCE
 from tofcorr.errors import CalibrationDataError, is_control
+from tofcorr.files import open_regular
 from tofcorr.geometry import se3
 from tofcorr.geometry.se3 import UNIT_LENGTH_TOLERANCE
 from tofcorr.options import LARGEST_NUMBER, SMALLEST_POSITIVE
@@ -169,8 +170,9 @@ def _cell(row: FrameRow, name: str) -> int | str | float | None:
 def _read_cells(path: Path) -> dict[str, list[str]]:
     """Read the file into columns of text; blank lines are skipped."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = [line for line in csv.reader(file) if line]
+        with open_regular(path) as file:
+            text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+            lines = [line for line in csv.reader(text) if line]
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:

@@ -1,5 +1,6 @@
 """Depth, amplitude and grey images in files: found by name, decoded, and turned into metres."""
 
+import math
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -12,6 +13,7 @@ import numpy as np
 from pydantic import PositiveFloat
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files import open_regular
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.numbers import load_numbers
 from tofcorr.importing.pose_track import LEAST_SECONDS, in_seconds
@@ -174,9 +176,11 @@ def read_image(path: Path) -> np.ndarray:
         RefusedViewError: The file cannot be read, or is no image.
     """
     try:
-        image = decoded(path.read_bytes())
+        with open_regular(path) as file:
+            image = decoded(file.read())
     except OSError as error:
-        raise RefusedViewError(f"{path.name} cannot be read ({error.strerror})") from None
+        reason = error.strerror or error
+        raise RefusedViewError(f"{path.name} cannot be read ({reason})") from None
     if image is None:
         raise RefusedViewError(f"{path.name} is not a readable image; is it truncated?")
     return image
@@ -205,7 +209,7 @@ def _exr(path: Path) -> np.ndarray:
     except ImportError:
         raise RefusedViewError(f"{path} needs OpenEXR: pip install 'tofcorr[exr]'") from None
     try:
-        with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+        with open_regular(path), OpenEXR.File(os.fspath(path), separate_channels=True) as file:
             channels = file.channels()
             names = list(channels)
             of_depth = [n for n in names if re.search(r"depth\.[zv]$", n, re.IGNORECASE)]
@@ -227,7 +231,7 @@ def opened_hdf5(path: Path) -> Iterator[Any]:
     except ImportError:
         raise RefusedViewError(f"{path} needs h5py: pip install 'tofcorr[hdf5]'") from None
     try:
-        with h5py.File(path, "r") as file:
+        with open_regular(path, math.inf), h5py.File(path, "r") as file:
             yield file
     except (OSError, RuntimeError, KeyError, TypeError) as error:
         raise RefusedViewError(f"{path}: not a readable HDF5 file ({error})") from None

@@ -3,6 +3,7 @@
 import re
 import reprlib
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from tofcorr import options
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import UNREADABLE
+from tofcorr.files import UNREADABLE, open_regular
 from tofcorr.options import one_line
 
 _LARGEST = 2**28
@@ -71,7 +72,8 @@ def load_numbers(path: Path, refused: Callable[[str], Exception]) -> np.ndarray:
     """
     try:
         # Mapped, a header that promises more than the file holds is refused before memory is taken.
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        with open_regular(path, inf):
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
     except UNREADABLE as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
         raise refused(f"not a readable NPY array ({first[:150]})") from None

@@ -101,6 +101,7 @@ REFUSED: dict[str, tuple[Callable[[Tensor, Tensor], Frames], str]] = {
     "one row": (lambda d, a: (d[0, 0], a[0, 0]), r"expected shape \(5, 7\)"),
     "other amplitude": (lambda d, a: (d, a[0]), "expected depth's shape"),
     "float64": (lambda d, a: (d.double(), a), "expected float32, got float64 and float32"),
+    "gradients": (lambda d, a: (d.clone().requires_grad_(), a), "under torch.no_grad"),
     "uint16": (lambda d, a: ((1e3 * d).to(torch.uint16), a), "expected float32, got uint16 and"),
 }
 

@@ -2,13 +2,14 @@
 
 import io
 import warnings
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import torch
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.state import CalibrationState
+from tofcorr.correction.metadata import EMBEDDED
+from tofcorr.correction.state import CalibrationState, calibration_bytes
 from tofcorr.files import sealed, staged_file
 
 
@@ -31,7 +32,9 @@ def export_torchscript(
             # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
             warnings.filterwarnings("ignore", message=".*torch.jit")
             content = io.BytesIO()
-            torch.jit.save(torch.jit.script(corrector), content)
+            # Beside the code: `tofcorr correct` builds the corrector from it and runs no code.
+            own = {PurePath(EMBEDDED).name: calibration_bytes(reference)}
+            torch.jit.save(torch.jit.script(corrector), content, _extra_files=own)
             part.write_bytes(sealed(content))
             loaded = torch.jit.load(str(part))
         require_parity(loaded, reference)

@@ -3,6 +3,7 @@
 Everything that the package `rosbags` raises on a damaged file becomes one sentence.
 """
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 
 from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
+from tofcorr.files import open_regular
 from tofcorr.geometry import se3
 from tofcorr.importing.images import DepthCoding, DepthImage, coded_image, decoded
 from tofcorr.importing.intrinsics import (
@@ -99,6 +101,8 @@ def _opened(path: Path) -> Iterator[Bag]:
     except ImportError:
         raise CalibrationDataError(f"{path} needs rosbags: pip install 'tofcorr[rosbag]'") from None
     with damage_reported(path):
+        for file in path.iterdir() if path.is_dir() else [path]:
+            open_regular(file, math.inf).close()
         # The message types of bags that do not hold their own.
         default = get_typestore(Stores.ROS2_HUMBLE)
         reader = highlevel.AnyReader([path], default_typestore=default)
