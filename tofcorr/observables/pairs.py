@@ -156,11 +156,12 @@ class PoseSums:
         """
         count = len(self.total[sides[0]])
         values, shares = np.zeros((2, count))
-        changes = [(k, np.broadcast_to(each, count)) for k, each in enumerate(self.left_out)]
+        # Poses of the other recording may be more or fewer.
+        changes = {side: np.broadcast_to(self.left_out[side], count) for side in sides}
         for pose in range(count):
             rest = np.delete(np.arange(count), pose)
             means = self.means(*(rest if side in sides else slice(None) for side in (0, 1)))
-            changed = [np.exp(change[pose]) if k in sides else 1.0 for k, change in changes]
+            changed = [np.exp(changes[k][pose]) if k in sides else 1.0 for k in (0, 1)]
             values[pose] = statistic(means[0] * changed[0], means[1] * changed[1])
         for side in sides:
             own = self.total[side].sum(1).clip(min=0)
