@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import diagnosed_recordings
+import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
@@ -68,6 +69,17 @@ def test_the_findings_have_the_keys_agreed_and_name_the_cause(report: Path) -> N
 def test_a_contradiction_is_seen(report: Path, changed: dict[str, object], law: str) -> None:
     found = json.loads((report / "diagnosis.json").read_text())
     assert law in contradictions(found | changed)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_infinite_amplitudes_are_pixels_that_are_not_used(tmp_path: Path) -> None:
+    """In every second pixel of all images: a traceback, since columns were not finite."""
+    diagnosed_recordings.recorded(tmp_path / "one", 33)
+    amplitude = np.load(tmp_path / "one" / "amplitude.npy")
+    amplitude.reshape(-1)[::2] = np.inf
+    np.save(tmp_path / "one" / "amplitude.npy", amplitude)
+    diagnose(tmp_path / "one", config={"page": False, "bootstraps": 19}, out=tmp_path / "report")
+    assert not contradictions(json.loads((tmp_path / "report" / "diagnosis.json").read_text()))
 
 
 def test_the_page_needs_nothing_else(report: Path) -> None:

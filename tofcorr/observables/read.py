@@ -159,6 +159,7 @@ class _PoseImages:
             if recording.saturation_amplitude is not None:
                 full = self.amplitude >= recording.saturation_amplitude
                 self.saturated = self.on_target & full
+            self.amplitude[~np.isfinite(self.amplitude)] = np.nan
         self.missing = self.on_target & ~(np.isfinite(distance) & (np.nan_to_num(distance) > 0))
         usable = np.where(valid[cut], distance, np.nan)
         mean = known_mean(usable)

@@ -191,7 +191,8 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         everywhere = batch.radial_distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
         distances.append(everywhere)
         if batch.amplitude is not None:
-            images.append(torch.where(everywhere > 0, batch.amplitude, 0.0))
+            known = batch.amplitude.nan_to_num(0.0, 0.0, 0.0)
+            images.append(torch.where(everywhere > 0, known, 0.0))
         mask = recording.read("mask", batch.indices.numpy())
         masks.append(torch.ones_like(batch.valid) if mask is None else torch.from_numpy(mask) > 0)
         most = max(most, int(batch.valid.flatten(1).sum(1).max()))
