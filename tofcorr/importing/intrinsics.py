@@ -1,7 +1,6 @@
 """Camera intrinsics as files and users give them, before the size of the images is known.
 
-Files of many programs are read into the keys of `recording.yaml`: `_kalibr` finds the camera where
-Kalibr has put it, `_file_storage` reads OpenCV's own format.
+Every program has its own keys for the same few numbers; `_file_storage` reads OpenCV's own format.
 """
 
 import re
@@ -17,14 +16,15 @@ from tofcorr.geometry.camera import CameraIntrinsics, Matrix3
 from tofcorr.importing.numbers import any_numbers, finite_numbers
 from tofcorr.options import is_shipped_name, one_line, parse_yaml, read_text, shipped_file
 
-# Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
+# Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts;
+# Kalibr, whose pinhole-radtan is OpenCV's model.
 _MATRIX_KEYS = ("K", "matrix", "camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx")
 _DISTORTION_KEYS = (
     *("distortion", "D", "distortion_coefficients", "distortionCoefficients"),
-    *("Distortion_Coefficients", "distCoeffs", "dist_coeffs", "dist"),
+    *("Distortion_Coefficients", "distCoeffs", "dist_coeffs", "dist", "distortion_coeffs"),
 )
 _SIZE_KEYS = (("width", "height"), ("image_width", "image_height"), ("image_Width", "image_Height"))
-_MODELS = ("plumb_bob", "rational_polynomial", "opencv", "none", "pinhole")
+_MODELS = ("plumb_bob", "rational_polynomial", "opencv", "none", "pinhole", "radtan")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,27 +121,35 @@ def intrinsics_from_mapping(
     Raises:
         CalibrationDataError: There is no matrix, or another distortion model.
     """
-    found = _kalibr(values, source, camera)
-    below = values.get("camera")
-    values = found or (below if isinstance(below, Mapping) else values)
-    model = values.get("distortion_model")
-    if isinstance(model, str) and model.lower() not in _MODELS:
-        known = "expected OpenCV's plumb_bob or rational_polynomial"
-        raise CalibrationDataError(f"{source}: '{one_line(model)}' is not supported; {known}.")
-    sides = [
-        float(_numbers(values[key], f"{source}: '{key}'", (1,))[0])
-        for keys in _SIZE_KEYS
-        for key in keys
-        if set(keys) <= values.keys()
-    ]
+    values = _of_camera(values, source, camera)
+    for model in (values.get("camera_model"), values.get("distortion_model")):
+        if isinstance(model, str) and model.lower() not in _MODELS:
+            known = "expected a pinhole with OpenCV's plumb_bob (radtan) or rational_polynomial"
+            raise CalibrationDataError(f"{source}: '{one_line(model)}' is not supported; {known}.")
+    size = next((keys for keys in _SIZE_KEYS if set(keys) <= values.keys()), ())
+    given = [values[key] for key in size] or values.get("resolution", [])
+    distortion = _first(values, _DISTORTION_KEYS, [])
     return GivenIntrinsics(
         matrix=_matrix(values, source),
-        distortion=tuple(
-            _numbers(_first(values, _DISTORTION_KEYS, []), f"{source}: the distortion")
-        ),
-        size=(int(sides[0]), int(sides[1])) if sides else None,
+        distortion=tuple(_numbers(distortion, f"{source}: the distortion")),
+        size=tuple(map(int, _numbers(given, f"{source}: the size", (0, 2)))) or None,  # type: ignore[arg-type]
         source=source,
     )
+
+
+def _of_camera(values: Mapping[str, Any], source: str, camera: str | None) -> Mapping[str, Any]:
+    """Return what a file says of one camera: at the top, below `camera`, or below its name."""
+    below, single = values.get("camera"), {"intrinsics", "camera_model"}
+    named = {k: v for k, v in values.items() if isinstance(v, Mapping) and single <= v.keys()}
+    if not named:
+        return below if isinstance(below, Mapping) else values
+    if camera is None and len(named) == 1:
+        (camera,) = named
+    if camera not in named:
+        listed = ", ".join(f"{name} ({one.get('rostopic', '?')})" for name, one in named.items())
+        first = one_line(str(next(iter(named))))
+        raise CalibrationDataError(f"{source} holds {one_line(listed)}. Name one: 'FILE#{first}'.")
+    return named[camera]
 
 
 def _matrix(values: Mapping[str, Any], source: str) -> Matrix3:
@@ -149,10 +157,11 @@ def _matrix(values: Mapping[str, Any], source: str) -> Matrix3:
     if given is not None:
         a, b, c, d, e, f, g, h, i = _numbers(given, f"{source}: the camera matrix", (9,))
         return (a, b, c), (d, e, f), (g, h, i)
-    if not {"fx", "fy", "cx", "cy"} <= values.keys():
+    four = [values.get(name) for name in ("fx", "fy", "cx", "cy")]
+    if None in four and "intrinsics" not in values:
         keys = one_line(", ".join(f"'{key}'" for key in list(values)[:8])) or "none"
         raise CalibrationDataError(f"{source}: no camera matrix (K or fx, fy, cx, cy), got {keys}.")
-    return _pinhole(*_numbers([values[k] for k in ("fx", "fy", "cx", "cy")], source, (4,)))
+    return _pinhole(*_numbers(values.get("intrinsics", four), f"{source}: the intrinsics", (4,)))
 
 
 def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Matrix3:
@@ -190,65 +199,27 @@ def _file_storage(text: str, source: str) -> Any:  # noqa: ANN401 - as YAML has 
         Keys and values of YAML, XML or JSON; a matrix as its `rows`, `cols` and `data`.
 
     Raises:
-        CalibrationDataError: It is none of them, or a matrix has another number of entries than
-            rows and columns.
+        CalibrationDataError: It is none of them.
     """
-    try:
-        if text.lstrip().startswith("<"):
-            values = _xml(text)
-        else:  # JSON is YAML too; OpenCV's first line and its tags are not.
-            plain = re.sub(r"\A%YAML[: ][^\n]*|!!opencv-[a-z-]+", "", text)
-            values = parse_yaml(plain, source)
-    except (ElementTree.ParseError, ValueError) as error:
-        reason = one_line(str(error).removeprefix(f"{source}: "))
-        raise CalibrationDataError(f"{source}: not a readable OpenCV file ({reason}).") from None
-    for key, value in values.items() if isinstance(values, Mapping) else ():
-        if not isinstance(value, Mapping) or "data" not in value:
-            continue
-        count = len(value["data"]) if isinstance(value["data"], list) else "no list"
-        rows, columns = (one_line(str(value.get(name))) for name in ("rows", "cols"))
-        sides = any_numbers([rows, columns])
-        if not sides.size or count != sides.prod():
-            got = f"got {count} for {rows} x {columns}"
-            raise CalibrationDataError(f"{source}: '{key}' must have rows x cols numbers, {got}.")
-    return values
+    if text.lstrip().startswith("<"):
+        return _xml(text, source)
+    # JSON is YAML too; OpenCV's first line and its tags are not.
+    plain = re.sub(r"\A%YAML[: ][^\n]*|!!opencv-[a-z-]+", "", text)
+    return parse_yaml(plain, source, CalibrationDataError)
 
 
-def _xml(text: str) -> dict[str, Any]:
+def _xml(text: str, source: str) -> dict[str, Any]:
     """Return the elements of an XML text by their names: text, or what a matrix consists of."""
     if "<!" in text.replace("<!--", ""):
-        raise ValueError("it declares entities or a document type, which OpenCV's files never do")
+        raise CalibrationDataError(f"{source}: declares entities, which OpenCV's files never do.")
+    try:
+        elements = list(ElementTree.fromstring(text))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise CalibrationDataError(f"{source}: not a readable OpenCV file ({error}).") from None
     found: dict[str, Any] = {}
-    for element in ElementTree.fromstring(text):
+    for element in elements:
         parts = {one.tag: (one.text or "").strip() for one in element}
         found[element.tag] = (element.text or "").strip().strip('"')
         if "data" in parts:
             found[element.tag] = parts | {"data": parts["data"].split()}
-    return found
-
-
-def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[str, Any] | None:
-    """Read one camera of Kalibr's camchain: pinhole with radtan, which is OpenCV's model."""
-    cameras = {
-        name: entry
-        for name, entry in values.items()
-        if isinstance(entry, Mapping) and "camera_model" in entry and "intrinsics" in entry
-    }
-    if not cameras:
-        return None
-    if camera not in cameras and not (camera is None and len(cameras) == 1):
-        listed = ", ".join(f"{name} ({one.get('rostopic', '?')})" for name, one in cameras.items())
-        first = one_line(str(next(iter(cameras))))
-        raise CalibrationDataError(f"{source} holds {one_line(listed)}. Name one: 'FILE#{first}'.")
-    entry = cameras[camera] if camera in cameras else next(iter(cameras.values()))
-    models = str(entry["camera_model"]), str(entry.get("distortion_model", "none"))
-    if models not in (("pinhole", "radtan"), ("pinhole", "none")):
-        said = one_line("', '".join(models))
-        raise CalibrationDataError(f"{source}: '{said}' is not supported; take pinhole-radtan.")
-    fx, fy, cx, cy = _numbers(entry["intrinsics"], f"{source}: 'intrinsics'", (4,))
-    found = {"K": _pinhole(fx, fy, cx, cy), "distortion": entry.get("distortion_coeffs", [])}
-    if "resolution" in entry:
-        found["width"], found["height"] = _numbers(
-            entry["resolution"], f"{source}: 'resolution'", (2,)
-        )
     return found
