@@ -43,25 +43,11 @@ _LAG_OF_STOPS = 0.02
 the lag: an exposure and the jitter of a time stamp. A refined lag that differs by more from the
 first changes which images are at rest."""
 
-_NEAREST, _FARTHEST = 0.03, 50.0
-"""Metres: nearer even single-pixel sensors give no distance, but depth in kilometres, or a unit
-given twice, does; farther no time-of-flight camera on a robot sees, nor does an arm reach: 0.05 m
-read as millimetres is 50."""
-
-_SUSPICIOUS_MM = 20.0
-"""Misfit from which a mistake is suspected, millimetres: twice what an uncalibrated camera
-leaves."""
-
-_OF_POSES = {
-    "inverted": "their inverses: exchange --base-frame and --tool-frame, or change --eye-to-hand?",
-    "quaternions": "quaternions read as w x y z: write them as x y z w, or in a CSV with a header.",
-    "rotations": "rotations inverted and translations as they are: of matrices by columns?",
-}
-"""What undoes usual mistakes in poses, and advice."""
-
-_SHIFTS = 1, -1, 2, -2, 3, -3
-"""By how many poses a list may be shifted, the likely ones first. Each costs a search for walls,
-and more than three images are rarely dropped in a row."""
+_OF_POSES = (
+    *("in millimetres", "inverted", "quaternions", "rotations"),
+    *("shifted +1", "shifted -1", "shifted +2", "shifted -2"),
+)
+"""Usual mistakes in poses, the likely ones first. Each costs a search for walls."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,8 +108,7 @@ class PosedImport:
         """Read all images once or twice, and find out everything but the frames themselves."""
         source, options = self._source, self._options
         sieve.refused |= source.refused
-        self._readable, median, change = self._images.look(sieve)
-        _refuse_impossible_depth(median, source.origin)
+        self._readable, change = self._images.look(sieve)
         # How much each readable image differs from the one before, where both have times.
         self._changes = None
         listed = self._track.lists_stops(options.pose_tolerance_s)
@@ -131,7 +116,7 @@ class PosedImport:
             self._changes = self._times[self._readable], change[self._readable][1:]
         lag = self._first_lag()
         chosen = self._choose(lag)
-        _refuse_impossible_poses(chosen.world_from_tool, self._track.source)
+        _refuse_equal_poses(chosen.world_from_tool, self._track.source)
         found, warnings = self._walls(chosen)
         if lag is not None and options.lag_s == "auto":
             refined = self._refined(lag, chosen.moving, found)
@@ -249,43 +234,41 @@ class PosedImport:
         """
         origin, farthest = self._source.origin, FoundWalls.OFF_WALL_MM
         before = farthest if given is None else given.misfit_mm
-        if before <= _SUSPICIOUS_MM or self._source.targets is not None:
+        if before <= FoundWalls.SUSPICIOUS_MM or self._source.targets is not None:
             return []
-        if given is not None and self._changes is None:
-            self._refuse_shifted_part(chosen, given)
         left = {}
         for said, misfit in self._mistakes_undone(chosen):
             left[said] = misfit
-            if misfit <= FAR_BETTER * _SUSPICIOUS_MM:
+            if misfit <= FAR_BETTER * FoundWalls.SUSPICIOUS_MM:
                 break
         best = min(left, key=left.__getitem__)
         if left[best] <= FAR_BETTER * before:
             said = f"{origin}: Walls are off by {before:.0f} mm as given"
-            raise CalibrationDataError(f"{said} and by {left[best]:.0f} mm with {best}")
+            raise CalibrationDataError(f"{said}, and by {left[best]:.0f} mm if {best}")
         if given is None:
             return []
         seeing = f"{len(np.unique(given.image))} of {len(chosen.images)} images show a wall"
-        off = f"planes are off by {before:.0f} mm, up to {_SUSPICIOUS_MM:.0f} are expected"
+        off = (
+            f"planes are off by {before:.0f} mm, up to {FoundWalls.SUSPICIOUS_MM:.0f} are expected"
+        )
         return [f"{seeing}, and {off}. Do images and poses belong together?"]
 
     def _mistakes_undone(self, chosen: Chosen) -> Iterator[tuple[str, float]]:
-        """Yield what undoes each usual mistake, with advice, and the misfit that it leaves."""
-        for name, said in _OF_POSES.items():
-            yield said, self._misfit(chosen, IN_POSES[name].undo)
-        for shift in _SHIFTS if self._changes is None else ():
-            said = f"the poses shifted by {shift:+d}: was an image or a pose dropped?"
-            yield said, self._misfit(chosen, partial(np.roll, shift=shift, axis=0))
-        said = "the columns mirrored: does the camera's driver flip its images? Turn that off."
-        mirrored = IN_IMAGES["mirrored"].undo
-        yield said, self._misfit(chosen, depth=lambda image: mirrored(image.depth))
-        for factor in (1 / 10, 10):
-            said = f"all distances multiplied by {factor:g}: is --depth-unit-mm right?"
+        """Yield each usual mistake, with advice, and the misfit that it leaves when undone."""
+        listed = [IN_POSES[name] for name in _OF_POSES]
+        for cause, advice, undo in listed if self._changes is None else listed[:4]:
+            yield f"{cause}: {advice}.", self._misfit(chosen, undo)
+        cause, advice, mirrored = IN_IMAGES["mirrored"]
+        left = self._misfit(chosen, depth=lambda image: mirrored(image.depth))
+        yield f"{cause}: {advice}.", left
+        for factor in (1 / 1000, 1 / 10, 10, 1000):
+            said = f"all distances are multiplied by {factor:g}: is --depth-unit-mm right?"
             yield said, self._misfit(chosen, depth=lambda image, k=factor: k * image.depth)
         if self._images.read(int(chosen.images[0])).amplitude is not None:
-            said = "depth and amplitude exchanged: swap --depth and --amplitude."
+            said = "depth and amplitude are exchanged: swap --depth and --amplitude."
             yield said, self._misfit(chosen, depth=_amplitudes)
         for late in far_lags(self._track, *self._changes) if self._changes else ():
-            said = f"images {abs(late):.1f} s {'late' if late > 0 else 'early'}"
+            said = f"images are {abs(late):.1f} s {'late' if late > 0 else 'early'}"
             with suppress(CalibrationDataError):
                 left = self._misfit(self._choose(Lag(seconds=late)))
                 yield f"{said}: add --time-offset-s {-late:.1f}.", left
@@ -311,43 +294,6 @@ class PosedImport:
             return self._walls_of(seen, images, undone_poses).misfit_mm
         except CalibrationDataError:
             return FoundWalls.OFF_WALL_MM
-
-    def _refuse_shifted_part(self, chosen: Chosen, found: FoundWalls, near: float = 0.03) -> None:
-        """Refuse a part of the images whose poses are shifted.
-
-        Where one image or pose was dropped in the middle of a list, the first part is paired
-        rightly and shows the walls; the rest lies on them with the poses shifted.
-
-        Args:
-            chosen: The images used, with poses.
-            found: The walls, and the hand-eye transform that goes with them.
-            near: Metres within which a plane lies on a wall: three times a typical error, and far
-                below the way from stop to stop.
-
-        Raises:
-            CalibrationDataError: There is such a part.
-        """
-        planes = [self._images.planes(k) for k in chosen.images.tolist()]
-        hand_eye = exact(torch.from_numpy(found.tool_from_camera))
-        walls = torch.from_numpy(found.walls)
-
-        def on_walls(poses: np.ndarray) -> np.ndarray:
-            """Return which images have most of their planes on a wall, shape (N,)."""
-            seen = seen_planes(planes, torch.from_numpy(np.array(poses)), 1)
-            close = distances(*seen.in_world(hand_eye), walls).min(dim=1).values < near
-            return np.bincount(seen.image.numpy(), 2.0 * close.numpy() - 1, len(planes)) > 0
-
-        poses = chosen.world_from_tool
-        seeing = np.array([bool(own) for own in planes])
-        off = seeing & ~on_walls(poses)
-        for shift in _SHIFTS:
-            fits = off & on_walls(np.roll(poses, shift, axis=0))
-            # Fewer fit by chance; some show only walls that the rightly paired part did not.
-            if fits.sum() >= max(4, off.sum() / 2):
-                first, last = (self._source.names[k] for k in chosen.images[fits][[0, -1]])
-                which = f"{fits.sum()} of {seeing.sum()} images, '{first}' to '{last}'"
-                said = f"{which}, lie on the walls with the poses shifted by {shift:+d}"
-                raise CalibrationDataError(f"{self._source.origin}: {said}: was an image dropped?")
 
     def _refined(self, lag: Lag, moving: np.ndarray, found: FoundWalls) -> Lag:
         """Refine the lag on images that were taken while the tool moved, 200 of them.
@@ -435,45 +381,21 @@ class PosedImport:
                 yield row, image.depth, image.amplitude, mask
 
 
-def _refuse_impossible_depth(median_depth: np.ndarray, origin: str) -> None:
-    """Refuse depth that is not in metres.
-
-    Args:
-        median_depth: Median of each image, shape (I,), as metres; NaN without returns.
-        origin: For the message.
-
-    Raises:
-        CalibrationDataError: No image has a return, or the typical depth is impossible.
-    """
-    if not np.isfinite(median_depth).any():
-        raise CalibrationDataError(f"{origin}: no image has a pixel with a return.")
-    typical = float(np.nanmedian(median_depth))
-    if not _NEAREST <= typical <= _FARTHEST:
-        unit = "millimetres? Add --depth-unit-mm 1"
-        unit = unit if typical > _FARTHEST else "metres? Add --depth-unit-mm 1000"
-        raise CalibrationDataError(f"{origin}: median depth is {typical:.4g} m. Is it in {unit}.")
-
-
-def _refuse_impossible_poses(world_from_tool: np.ndarray, origin: str) -> None:
-    """Refuse poses (N, 4, 4) that are not in metres, or the same to a millimetre and milliradian.
+def _refuse_equal_poses(world_from_tool: np.ndarray, origin: str) -> None:
+    """Refuse poses (N, 4, 4) that are the same to a millimetre and a milliradian.
 
     Raises:
         CalibrationDataError: As said.
     """
-    extent = float(np.linalg.norm(np.ptp(world_from_tool[:, :3, 3], axis=0)))
-    turned = float(np.abs(world_from_tool[:, :3, :3] - world_from_tool[0, :3, :3]).max())
-    if extent > _FARTHEST:
-        said = f"the tool moves over {extent:.4g} m"
-        raise CalibrationDataError(f"{origin}: {said}. Are the translations in millimetres?")
-    if 1000 * max(extent, turned) < 1:
-        raise CalibrationDataError(f"{origin}: all poses are the same to {1000 * extent:.2g} mm.")
+    if 1000 * np.ptp(world_from_tool, axis=0).max() < 1:
+        raise CalibrationDataError(f"{origin}: all poses are the same to a millimetre.")
 
 
 def _amplitudes(image: DepthImage) -> np.ndarray:
-    """Return the amplitudes of an image as if they were its depth, metres."""
+    """Return the amplitudes of an image as if they were its depth, metres; whole numbers are mm."""
     assert image.amplitude is not None
     counts = np.where(image.amplitude > 0, image.amplitude, np.nan)
-    return counts / (1000 if np.nanmedian(counts) > _FARTHEST else 1)
+    return counts / (1000 if (image.amplitude % 1 == 0).all() else 1)
 
 
 def _lag_warnings(lag: Lag) -> list[str]:

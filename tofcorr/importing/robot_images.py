@@ -106,23 +106,22 @@ class ImagesOfPlanes:
         self.source, self._options = source, options
         self._planes: dict[int, list[ImagePlane]] = {}
 
-    def look(self, sieve: Sieve) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def look(self, sieve: Sieve) -> tuple[np.ndarray, np.ndarray]:
         """Read every image once, and keep a few numbers of each.
 
         Args:
             sieve: Sets aside the images that cannot be read.
 
         Returns:
-            Which images can be read, shape (I,), bool; the median depth of each, metres, NaN
-            without returns; and the median absolute difference to the readable image before,
-            metres, NaN for the first one, or where no pixel has a return in both.
+            Which images can be read, shape (I,), bool; and the median absolute difference to the
+            readable image before, metres, NaN for the first one, or where no pixel has a return in
+            both.
 
         Raises:
             CalibrationDataError: No image can be used, or the intrinsics hold for another size.
         """
         names = self.source.names
-        median, change = (np.full(len(names), np.nan) for _ in range(2))
-        before = np.zeros(0)
+        change, before = np.full(len(names), np.nan), np.zeros(0)
 
         def read(k: int) -> int:
             nonlocal before
@@ -134,15 +133,13 @@ class ImagesOfPlanes:
             depth = of_size(image, self.camera).depth
             # The median change of so many pixels is known to a sixtieth of their noise.
             few = depth.ravel()[:: max(1, depth.size // 4096)]
-            if np.isfinite(few).any():
-                median[k] = np.nanmedian(few)
             if len(before) and np.isfinite(moved := np.abs(few - before)).any():
                 change[k] = np.nanmedian(moved)
             before = few
             return k
 
         readable = sieve.apply(read, range(len(names)), names.__getitem__, "looking at images")
-        return np.isin(np.arange(len(names)), readable), median, change
+        return np.isin(np.arange(len(names)), readable), change
 
     def read(self, number: int) -> DepthImage:
         """Return an image that was readable before.

@@ -98,11 +98,6 @@ def test_a_missing_or_wrong_topic_is_named_with_those_there_are(
     assert "it is sensor_msgs/CameraInfo" in wrong.text
     info = import_bag(path, out, "--camera-info", bags.DEPTH)
     assert "expected sensor_msgs/CameraInfo, it is sensor_msgs/Image" in info.text
-    swapped = import_bag(path, out, "--amplitude", bags.DEPTH, depth=bags.INFRARED)
-    assert "is coded 'mono16', as amplitudes are" in swapped.text
-    assert "swap them" in swapped.text
-    alone = import_bag(path, out, depth=bags.INFRARED)
-    assert f"name {bags.DEPTH} with --depth" in alone.text
 
 
 def test_a_missing_frame_or_transform_is_named(at_stops: Recorded, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.robust import sigma_from_mad
+from tofcorr.estimation.robust import LEVEL, f_tail, sigma_from_mad
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.boards import FlatBoard
 from tofcorr.importing.run import RefusedViewError
@@ -18,10 +18,6 @@ exceeds so many pixels and several standard deviations. Set by hand."""
 
 _SMALLEST_SHARE_OF_CORNERS = 0.8
 """Smallest share of a view's corners that must fit: one pose, or one camera. Set by hand."""
-
-_AMBIGUOUS_RATIO = 1.2
-"""A plane that is small or far has two poses with similar projections. The reprojection error of
-the second must be larger by this factor, or the view is refused. Set by hand."""
 
 _FEWEST_VIEWS = 5
 """Set by hand: two tilted views determine the camera, five allow outliers."""
@@ -121,10 +117,13 @@ def estimate_pose(
     if not best.reprojection_rms <= max_reprojection:
         missed = f"{best.reprojection_rms:.2f} px of at most {max_reprojection:g} px"
         raise RefusedViewError(f"the corners miss the board by {missed}; is it bent, or blurred?")
+    unknown = 2 * int(used.sum()) - 6
     for other in others:
-        # Poses whose normals differ by less than 3 degrees are the same pose.
+        # Poses whose normals differ by less than 3 degrees are the same pose. Of a board that is
+        # small or far, the errors of two others do not differ significantly.
         same = best.plane()[0] @ other.plane()[0] > np.cos(np.radians(3))
-        if not same and other.reprojection_rms < _AMBIGUOUS_RATIO * best.reprojection_rms:
+        ratio = np.square(np.float64(other.reprojection_rms) / best.reprojection_rms)
+        if not same and f_tail(float(ratio), unknown, unknown) > LEVEL:
             raise RefusedViewError("two different poses fit; move the board nearer or tilt it more")
     return best
 
@@ -193,9 +192,9 @@ def calibrate(
     views = len(corner_sets)
     if views < _FEWEST_VIEWS:
         raise CalibrationDataError(f"{views} views show the board; at least {_FEWEST_VIEWS} must.")
-    chosen = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
-    most = 5
-    while True:
+    inliers = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
+    for _ in range(6):
+        chosen = inliers
         camera, about, errors = _solve(corner_sets, chosen, board, size)
         # Five standard deviations of a coordinate: the median length of an error is 1.18.
         deviation = float(np.nanmedian(np.concatenate(errors))) / np.sqrt(2 * np.log(2))
@@ -205,9 +204,8 @@ def calibrate(
             error <= max(limit, np.nanquantile(error, _SMALLEST_SHARE_OF_CORNERS))
             for error in errors
         ]
-        if most == 0 or all(map(np.array_equal, inliers, chosen)):
+        if all(map(np.array_equal, inliers, chosen)):
             break
-        chosen, most = inliers, most - 1
     keep = [
         i
         for i, error in enumerate(errors)

@@ -27,10 +27,6 @@ from tofcorr.importing.pose_track import PoseTrack, nearest
 from tofcorr.importing.robot_images import RobotImages
 from tofcorr.importing.run import Refused, RefusedViewError
 
-_SAME_IMAGE = 0.01
-"""Seconds between the stamps of depth and amplitude of one exposure: a third of a frame at 30 Hz;
-most drivers give both one stamp."""
-
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
@@ -246,7 +242,10 @@ def open_bag(
     with ExitStack() as opened:
         bag, warnings = opened.enter_context(_opened(path)), list[str]()
         with damage_reported(path):
-            _check_image_topics(bag, depth_topic, amplitude_topic)
+            for named, option in ((depth_topic, "--depth"), (amplitude_topic, "--amplitude")):
+                if named is not None:
+                    _check(bag, named, option, _IMAGES)
+                    bag.first(named)
             if intrinsics is not None:
                 given = read_named_intrinsics(intrinsics)
             else:
@@ -266,10 +265,10 @@ def open_bag(
             names = [f"{stamp:.6f}" for stamp in depth.stamps]
             refused, partner = Refused(), order
             if amplitude is not None:
-                partner, gap = _partners(depth, amplitude)
+                partner, alone = _partners(depth, amplitude)
                 reason = f"{amplitude.topic} has no image of its time"
-                refused = {names[k]: reason for k in order if gap[k] > _SAME_IMAGE}
-                order = order[gap[order] <= _SAME_IMAGE]
+                refused = {names[k]: reason for k in order if alone[k]}
+                order = order[~alone[order]]
 
         def read(number: int) -> DepthImage:
             place, beside = int(order[number]), None
@@ -291,7 +290,10 @@ def open_bag(
 
 
 def _partners(depth: TopicMessages, amplitude: TopicMessages) -> tuple[np.ndarray, np.ndarray]:
-    """Return the amplitude image nearest in time to each of depth, and the seconds between them.
+    """Return the amplitude image nearest in time to each of depth, and which depth has none.
+
+    One of the same exposure is within a third of the time between images; most drivers give both
+    one stamp.
 
     Raises:
         CalibrationDataError: None is of the time of any.
@@ -299,29 +301,11 @@ def _partners(depth: TopicMessages, amplitude: TopicMessages) -> tuple[np.ndarra
     by_time = np.argsort(amplitude.stamps, kind="stable")
     partner = by_time[nearest(amplitude.stamps[by_time], depth.stamps)]
     gap = np.abs(depth.stamps - amplitude.stamps[partner])
-    if (gap > _SAME_IMAGE).all():
+    alone = 3 * gap > np.median(np.diff(np.sort(depth.stamps))) if len(gap) > 1 else gap > 0
+    if alone.all():
         said = f"no image of {amplitude.topic} is near one of {depth.topic}"
         raise CalibrationDataError(f"{depth.bag.path}: {said}, to {gap.min():.3f} s at best.")
-    return partner, gap
-
-
-def _check_image_topics(bag: Bag, depth: str, amplitude: str | None) -> None:
-    """Refuse topics that are missing, of another type, or exchanged; the message lists all."""
-    for topic, option in ((depth, "--depth"), (amplitude, "--amplitude")):
-        if topic is not None:
-            _check(bag, topic, option, _IMAGES)
-            bag.first(topic)
-    seen = _encoding(bag, depth)
-    if not seen.startswith("mono"):
-        return
-    others = [topic for topic, kind in bag.types.items() if kind in _IMAGES]
-    for topic in others if amplitude is None else [amplitude]:
-        beside = _encoding(bag, topic)
-        # By ROS's convention (REP 118) depth has these encodings, and amplitude has not.
-        if beside.startswith(("16UC1", "32FC1")):
-            advice = f"name {topic} with --depth" if amplitude is None else "swap them"
-            said = f"--depth {depth} is coded '{seen}', as amplitudes are, and {topic} '{beside}'"
-            raise CalibrationDataError(f"{bag.path}: {said}, as depth is: {advice}.")
+    return partner, alone
 
 
 def _camera_info_topic(bag: Bag, depth: str, given: str | None) -> str:
@@ -383,11 +367,6 @@ def _check(bag: Bag, topic: str, option: str, wanted: tuple[str, ...]) -> None:
         found = "there is no such topic" if kind is None else f"it is {kind}"
         said = f"{option} {topic}: expected {' or '.join(wanted)}, {found}".replace("/msg/", "/")
         raise CalibrationDataError(f"{bag.path}: {said}. The topics: {bag.listed_topics()}.")
-
-
-def _encoding(bag: Bag, topic: str) -> str:
-    message = next((message for _, message in bag.messages(topic)), None)
-    return str(getattr(message, "encoding", None) or getattr(message, "format", ""))
 
 
 def _read_tf(bag: Bag) -> tuple[dict[str, str], dict[str, PoseTrack]]:

@@ -10,6 +10,7 @@ import torch
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.walls.hand_eye import (
+    TYPICAL,
     Joint,
     match,
     match_single_ray,
@@ -36,8 +37,10 @@ class FoundWalls:
         left_out: Why images, and planes of images, are on no wall, by their names.
     """
 
-    OFF_WALL_MM: ClassVar[float] = 60.0
+    OFF_WALL_MM: ClassVar[float] = 6000 * TYPICAL
     """What a plane that lies on no wall counts: the nearness at which planes are gathered."""
+    SUSPICIOUS_MM: ClassVar[float] = 2000 * TYPICAL
+    """Misfit from which a mistake is suspected: twice what an uncalibrated camera leaves."""
     names: list[str]
     walls: np.ndarray
     images: np.ndarray

@@ -30,7 +30,7 @@ from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.geometry import se3
 from tofcorr.importing.walls.image_planes import SeenPlanes
 
-_TYPICAL = 0.01
+TYPICAL = 0.01
 """What an uncalibrated camera's error typically measures, metres, beside a constant and a slope:
 the standard deviation of a plane's place. Widths below are multiples of it."""
 
@@ -93,7 +93,7 @@ def _gather(planes: SeenPlanes, parameters: Parameters, fewest: int) -> Tensor:
         return torch.stack([fitted(planes.label == k) for k in planes.label.unique()])
     left = torch.ones(len(planes), dtype=torch.bool)
     found = [torch.zeros(0, 4, dtype=torch.float64)]
-    near = 6 * _TYPICAL
+    near = 6 * TYPICAL
     while int(left.sum()) >= fewest:
         # Of a wall that a tenth of the planes show, thirty of 300 propose it. A single image's own
         # error comes on top.
@@ -101,7 +101,7 @@ def _gather(planes: SeenPlanes, parameters: Parameters, fewest: int) -> Tensor:
         seeds = seeds[torch.linspace(0, len(seeds) - 1, min(len(seeds), 300)).long()]
         offset = -(points[seeds].mean(dim=1) * normal[seeds]).sum(dim=1, keepdim=True)
         proposed = torch.cat([normal[seeds], offset], dim=1)
-        close = left[:, None] & (distances(points, normal, proposed) < near + 2 * _TYPICAL)
+        close = left[:, None] & (distances(points, normal, proposed) < near + 2 * TYPICAL)
         # The most planes; between equals the larger ones.
         best = (close * (1 + planes.support[:, None] / 1000)).sum(dim=0).argmax()
         members, wall = close[:, best], proposed[best]
@@ -165,7 +165,7 @@ class Joint:
 
         The unit is twice the typical deviation.
         """
-        off = (self.deviation / (2 * _TYPICAL)).square().clamp(max=9)
+        off = (self.deviation / (2 * TYPICAL)).square().clamp(max=9)
         return float(off.sum()) + len(self.walls)
 
 
@@ -246,7 +246,7 @@ def _alternated(planes: SeenPlanes, along: Tensor) -> tuple[Tensor, Tensor, Tens
     hit = planes.world_from_tool[:, :3, 3] + way
     origin, loss, normal = torch.zeros_like(along), along[:, 0], along
     # An origin is known to 150 mm beforehand, a distance to 10 mm.
-    prior = (_TYPICAL / (_USUAL / 2)) ** 2
+    prior = (TYPICAL / (_USUAL / 2)) ** 2
     for _ in range(12):
         points = hit + turned(origin)
         centred = points - mean(points)[:, label]
@@ -364,7 +364,7 @@ def _candidate_translation(planes: SeenPlanes, rotation: Tensor) -> tuple[Tensor
     apart = (towards * (middle[first] - middle[second])).sum(dim=1)
     lever = (towards[:, None] @ (planes.rotation[first] - planes.rotation[second]))[:, 0]
     found = torch.cartesian_prod(*[torch.tensor([-_USUAL, 0.0, _USUAL]).double()] * 3)
-    narrow, width = 3 * _TYPICAL, 40 * _TYPICAL
+    narrow, width = 3 * TYPICAL, 40 * TYPICAL
     prior = torch.eye(3, dtype=torch.float64) * (narrow / _USUAL) ** 2 * weight.mean()
     for _ in range(12):  # From wide, when the translation is open, to the camera's error alone.
         agree = weight * (-((apart + found @ lever.T) / width).square()).exp()
@@ -438,7 +438,7 @@ def _fit_assigned(
         points = planes.in_world(start)[0]
         off = (points * found.normal_world[wall][:, None]).sum(dim=2) + found.offset[wall][:, None]
         off = off.square().mean(dim=1).sqrt()
-        scale = max(sigma_from_mad(float(off.median())), _TYPICAL / 10)
+        scale = max(sigma_from_mad(float(off.median())), TYPICAL / 10)
         weighted = moments.weighted(robust_weights(off / scale, "cauchy"))
         fitted = estimate_walls(weighted, start, found, _held(start, centre), 4)
         if bool((fitted[0].coefficients.abs() > 10 * _ERROR).any()):
@@ -474,7 +474,7 @@ def _held(start: Parameters, centre: Tensor, stiff: float = 1.0) -> NormalEquati
     Along what the images determine it is far too weak to matter, unless `stiff` holds the error.
     """
     sigma = torch.cat([torch.full((6,), PRIOR_SIGMA, dtype=torch.float64), _ERROR / stiff**0.5])
-    hessian = torch.diag((_TYPICAL / sigma) ** 2)
+    hessian = torch.diag((TYPICAL / sigma) ** 2)
     step = exact(centre).step_to(start)
     return NormalEquations(step @ hessian @ step, hessian @ step, hessian)
 
@@ -491,7 +491,7 @@ def _assigned(planes: SeenPlanes, parameters: Parameters, walls: Tensor) -> Join
         distance = torch.where(other, torch.inf, distance)
     # No wall is infinitely far.
     deviation, wall = torch.nn.functional.pad(distance, (0, 1), value=torch.inf).min(dim=1)
-    gate = 5 * max(_TYPICAL, float(deviation[deviation.isfinite()].nanmedian().nan_to_num(0.0)))
+    gate = 5 * max(TYPICAL, float(deviation[deviation.isfinite()].nanmedian().nan_to_num(0.0)))
     wall = torch.where(deviation <= gate, wall, -1)
     order = deviation.argsort(stable=True)
     pairs = torch.stack([planes.image, wall], dim=1)[order].numpy()

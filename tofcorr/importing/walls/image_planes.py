@@ -192,7 +192,7 @@ def planes_of_image(
     left = torch.ones(len(measured), dtype=torch.bool)
     gradients: list[Tensor] = []
     while len(gradients) < options.most_planes and int(left.sum()) >= max(least, 3):
-        triples = _triples(seen, left, generator)
+        triples = _triples(seen, left, least, generator)
         gradient = largest_plane(ray[left], measured[left], tolerance, generator, triples)
         if gradient is None:
             break
@@ -250,15 +250,15 @@ def _described(rays: Tensor, mask: Tensor, gradient: Tensor) -> ImagePlane:
     return ImagePlane(-gradient / length, 1 / length, len(used), four)
 
 
-def _triples(seen: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw triples of the pixels left, by number, shape (T, 3): half anywhere, half in a window.
+def _triples(seen: Tensor, left: Tensor, least: float, generator: torch.Generator) -> Tensor:
+    """Draw triples of the pixels left, by number, shape (T, 3): half anywhere, half close together.
 
-    The window is about as large as a plane on 5 % of the image.
+    Those are within the side of a square of the `least` pixels that make a plane.
     """
     half, size, places = _HYPOTHESES // 2, torch.tensor(seen.shape), seen.nonzero()[left]
     anywhere = torch.randint(len(places), (half, 3), generator=generator)
     first = torch.randint(len(places), (half, 1), generator=generator)
-    reach = max(1, round(0.12 * math.hypot(*seen.shape)))
+    reach = max(1, round(math.sqrt(least)))
     shift = torch.randint(-reach, reach + 1, (half, 2, 2), generator=generator)
     number = torch.full(seen.shape, -1)
     number[tuple(places.T)] = torch.arange(len(places))
