@@ -1,12 +1,10 @@
 """Depth, amplitude and grey images in files: found by name, decoded, and turned into metres."""
 
-import math
 import os
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -137,12 +135,12 @@ def times_in_names(views: list[str]) -> np.ndarray | None:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Read a grey image (PNG, TIFF, PGM), an NPY array, or an EXR or HDF5 image, shape (H, W).
+    """Read a grey image (PNG, TIFF, PGM), an NPY array, or an EXR image, shape (H, W).
 
     Raises:
         RefusedViewError: The file cannot be read, is no image, or has several channels.
     """
-    reader = {".npy": _npy, ".exr": _exr, ".hdf5": _hdf5}.get(path.suffix.lower(), read_image)
+    reader = {".npy": _npy, ".exr": _exr}.get(path.suffix.lower(), read_image)
     return _one_channel(reader(path), path)
 
 
@@ -221,29 +219,6 @@ def _exr(path: Path) -> np.ndarray:
         raise RefusedViewError(f"{path.name} is not a readable EXR file ({error})") from None
     listed = one_line(", ".join(names))
     raise RefusedViewError(f"{path.name} holds channels {listed}; expected Z, depth.Z or depth.V")
-
-
-@contextmanager
-def opened_hdf5(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file; what the library raises on damaged bytes becomes one sentence."""
-    try:
-        import h5py
-    except ImportError:
-        raise RefusedViewError(f"{path} needs h5py: pip install 'tofcorr[hdf5]'") from None
-    try:
-        with open_regular(path, math.inf), h5py.File(path, "r") as file:
-            yield file
-    except (OSError, RuntimeError, KeyError, TypeError) as error:
-        raise RefusedViewError(f"{path}: not a readable HDF5 file ({error})") from None
-
-
-def _hdf5(path: Path) -> np.ndarray:
-    """Read `depth`, or else `distance`, as BlenderProc writes them."""
-    with opened_hdf5(path) as file:
-        depth = np.asarray(file["depth" if "depth" in file else "distance"])
-    if depth.dtype.kind not in "fiu":
-        raise RefusedViewError(f"{path.name}: its depth is not an array of numbers")
-    return depth
 
 
 Counts = tuple[np.ndarray, str]

@@ -1,16 +1,15 @@
-"""BOP scenes and BlenderProc's files become the recording of the same images and camera poses."""
+"""BOP scenes become the recording of the same images and camera poses."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from cameras import apart
 from importing import scene_files
 from importing.frames.imported import assert_equal_recordings, import_png, run_import
-from importing.posed_scene import Drive, Recorded, unit_rays
+from importing.posed_scene import Drive, Recorded
 
 
 @pytest.fixture(scope="module")
@@ -59,50 +58,3 @@ def test_a_scene_without_poses_with_two_cameras_or_none_is_refused(
     assert "'cam_K' of images 0 and 1 differ" in run_import("bop", folder, out=out).text
     path.unlink()
     assert "scene_camera.json: there is no such file" in run_import("bop", folder, out=out).text
-
-
-def write_hdf5(scene: Recorded, folder: Path, key: str, *, poses: bool = True) -> Path:
-    """Write files as BlenderProc does: metres, Blender's camera axes."""
-    folder.mkdir()
-    matrix = scene.matrix
-    length = 1 / unit_rays(matrix, *scene.size)[..., 2]
-    for number, (counts, pose) in enumerate(zip(scene.depth_mm, scene.exact, strict=True)):
-        depth = np.where(counts > 0, counts / 1e3, 1e10)
-        with h5py.File(folder / f"{number}.hdf5", "w") as file:
-            file[key] = (depth * (length if key == "distance" else 1.0)).astype(np.float32)
-            blender = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-            if poses and number % 2:
-                file["cam2world_matrix"] = blender
-            elif poses:
-                state = [{"cam2world_matrix": blender.tolist(), "cam_K": matrix.tolist()}]
-                file["campose"] = np.bytes_(json.dumps(state))
-    return folder
-
-
-@pytest.mark.parametrize("key", ["depth", "distance"])
-def test_files_of_blenderproc_give_the_same_poses_and_depth(
-    key: str, scene: Recorded, tmp_path: Path
-) -> None:
-    imported = run_import("bop", write_hdf5(scene, tmp_path / "scene", key), out=tmp_path / "out")
-    recording = imported.done
-    assert recording.depth_kind == ("z" if key == "depth" else "radial")
-    images = [int(frame["view"]) for frame in imported.report["views"]]
-    poses = recording.frames.world_from_tool
-    np.testing.assert_allclose(poses, scene.exact[images], rtol=0, atol=1e-6)
-    seen = scene.depth_mm[images] > 0
-    np.testing.assert_array_equal(np.isfinite(recording.depth), seen)
-    if key == "depth":
-        off = recording.depth - scene.depth_mm[images] / 1e3
-        assert np.abs(off[seen]).max() < 1e-6
-
-
-def test_files_without_pose_depth_or_sense_are_refused(scene: Recorded, tmp_path: Path) -> None:
-    few, out = scene.take(np.arange(3)), tmp_path / "out"
-    matrix = scene_files.write_intrinsics(scene, tmp_path / "camera.yaml")
-    bare = write_hdf5(few, tmp_path / "bare", "depth", poses=False)
-    refused = run_import("bop", bare, "--intrinsics", matrix, out=out)
-    assert "no pose of the camera" in refused.text
-    colour = write_hdf5(few, tmp_path / "colour", "colors")
-    assert "expected 'depth' or 'distance'" in run_import("bop", colour, out=out).text
-    (bare / "0.hdf5").write_bytes(b"no")
-    assert "not a readable HDF5 file" in run_import("bop", bare, out=out).text

@@ -1,4 +1,4 @@
-"""Scenes in BOP's layout, and BlenderProc's HDF5 files: depth with the camera's own poses."""
+"""Scenes in BOP's layout: depth with the camera's own poses."""
 
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,11 @@ from tofcorr.importing.command_line import (
 @click.argument("scene", type=click.Path(path_type=Path))
 @recording_out_option
 @option("--amplitude", "Names of 16-bit amplitude images, such as 'gray/*.png'; left out: none.")
-@option("--intrinsics", "For HDF5 without cam_K: a file, or a shipped name.")
 @posed_options
 def command(scene: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
-    """Import SCENE: a folder of BOP's layout, or of BlenderProc's HDF5 files.
+    """Import SCENE: a folder of BOP's layout, as BlenderProc's write_bop makes it.
 
-    A BOP scene holds scene_camera.json with the camera's poses (cam_R_w2c, cam_t_w2c) and
+    It holds scene_camera.json with the camera's poses (cam_R_w2c, cam_t_w2c) and
     depth/*.png. The poses are the camera's own: the tool is the camera, and tool_from_camera the
     identity.
     """
