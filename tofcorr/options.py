@@ -4,6 +4,7 @@
 configuration: a shipped name, a file, a mapping or options that exist already.
 """
 
+import os
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -128,7 +129,7 @@ def refused_in_words(
 def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:
     path = one_line(".".join(str(part) for part in detail["loc"]) or "the file")
     if detail["type"] == "extra_forbidden":
-        close = get_close_matches(str(detail["loc"][-1]), _known_keys(cls), n=1)
+        close = get_close_matches(str(detail["loc"][-1]), _known_keys(cls, set()), n=1)
         hint = f" Did you mean '{close[0]}'?" if close else ""
         return f"'{path}' is not a known key.{hint}"
     if detail["type"] == "missing":
@@ -147,24 +148,14 @@ def _shown(value: object) -> str:
         return "a very long number"
 
 
-def _known_keys(cls: type[BaseModel], seen: set[type] | None = None) -> list[str]:
-    """Collect the keys of `cls` and of every options class nested in it."""
-    seen = set() if seen is None else seen
-    if cls in seen:
-        return []
-    seen.add(cls)
-    keys = list(cls.model_fields)
-    for field in cls.model_fields.values():
-        for nested in _option_classes(field.annotation):
-            keys += _known_keys(nested, seen)
-    return keys
-
-
-def _option_classes(annotation: Any) -> list[type[BaseModel]]:  # noqa: ANN401 - any annotation
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    nested = getattr(annotation, "__args__", ())
-    return [found for argument in nested for found in _option_classes(argument)]
+def _known_keys(kind: Any, seen: set[type]) -> list[str]:  # noqa: ANN401 - any annotation
+    """Collect the keys of the options classes in an annotation, and of those nested in them."""
+    if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
+        return [key for part in getattr(kind, "__args__", ()) for key in _known_keys(part, seen)]
+    fields = {} if kind in seen else kind.model_fields
+    seen.add(kind)
+    nested = [key for one in fields.values() for key in _known_keys(one.annotation, seen)]
+    return [*fields, *nested]
 
 
 _MOST_BYTES = 16_000_000
@@ -174,6 +165,7 @@ takes 5 MB, the largest file that tofcorr itself writes."""
 _MOST_NODES = 1_000_000
 """Most keys, values and lists of a document, with every alias written out. The same simulator has
 0.3 million. Aliases of aliases ("billion laughs") double the number with every line."""
+_TOO_MANY = f"more than {_MOST_NODES} values once its aliases are written out"
 
 _DEEPEST = 100
 """Most levels of lists and mappings inside each other. Ten times those of the deepest shipped
@@ -231,12 +223,23 @@ def parse_yaml(text: str, where: str, kind: type[TofcorrError] = ConfigError) ->
     Raises:
         TofcorrError: Of kind `kind`: the text is not YAML, or its aliases expand to too much.
     """
+    depth = 0
     try:
-        events = yaml.parse(text, Loader=_LOADER)  # Refuses control characters already.
-        for event in events:
-            if isinstance(event, yaml.NodeEvent):
-                _size(event, events, {}, where, 0)
-        return _LOADER(text).get_single_data()
+        # Refuses control characters already.
+        for number, event in enumerate(yaml.parse(text, Loader=_LOADER)):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > _DEEPEST:
+                said = f"lists and mappings nested more than {_DEEPEST} levels deep"
+                raise kind(f"{where}: {said} in line {event.start_mark.line + 1}.")
+            if number > 2 * _MOST_NODES:  # Each begins, and may end.
+                raise kind(f"{where}: {_TOO_MANY}.")
+        loader = _LOADER(text)
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _size(node, {}, where)
+        return loader.construct_document(node)
     except ConfigError as error:
         raise kind(str(error)) from None
     except _NOT_YAML as error:
@@ -257,56 +260,37 @@ def dump_yaml(values: Mapping[str, Any], last: str = "") -> str:
     return yaml.dump(ordered, Dumper=_DUMPER, sort_keys=False, allow_unicode=True, width=100)
 
 
-def _size(
-    event: yaml.NodeEvent,
-    further: Iterator[yaml.Event],
-    sizes: dict[str | None, int | None],
-    where: str,
-    depth: int,
-) -> int:
+def _size(node: yaml.Node, sizes: dict[int, int], where: str) -> int:
     """Return how many values an entry means, aliases written out, before any of it is built.
 
     Args:
-        event: Begins the entry.
-        further: The events after it; read to the end of the entry.
-        sizes: The number found of each anchor; None while its entry is read.
+        node: The entry.
+        sizes: The number found of each entry; 0 while it is counted.
         where: What to call the source in an error message.
-        depth: How many lists and mappings the entry stands in.
 
     Raises:
-        ConfigError: It is nested too deeply, means too much or has no end; or a key stands twice in
-            a mapping, of which YAML would silently take the last.
+        ConfigError: It means too much or has no end; or a key stands twice in a mapping, of which
+            YAML would silently take the last.
     """
-    line = event.start_mark.line + 1
-    if isinstance(event, yaml.AliasEvent):
-        known = sizes.get(event.anchor, 1)  # The parser itself refuses an unknown anchor.
-        if known is None:
-            raise ConfigError(f"{where}: the alias in line {line} repeats the entry that holds it.")
+    known = sizes.get(id(node))
+    if known == 0:
+        line = node.start_mark.line + 1
+        raise ConfigError(f"{where}: the alias in line {line} repeats the entry that holds it.")
+    if known:
         return known
-    if depth > _DEEPEST:
-        raise ConfigError(
-            f"{where}: lists and mappings nested more than {_DEEPEST} levels deep in line {line}."
-        )
-    size, keys, sizes[event.anchor] = 1, set[str](), None
-    for number, child in enumerate(further if isinstance(event, yaml.CollectionStartEvent) else ()):
-        if not isinstance(child, yaml.NodeEvent):
-            break
-        if isinstance(event, yaml.MappingStartEvent) and number % 2 == 0:
-            key = (
-                child.value if isinstance(child, yaml.ScalarEvent) else "<<"
-            )  # A merge may repeat.
-            if key in keys - {"<<"}:
-                line = child.start_mark.line + 1
-                raise ConfigError(
-                    f"{where}: the key '{one_line(key)}' in line {line} stands twice."
-                )
-            keys.add(key)
-        size += _size(child, further, sizes, where, depth + 1)
+    size, keys, sizes[id(node)] = 1, set[str](), 0
+    for child in node.value if isinstance(node, yaml.CollectionNode) else ():
+        key = child[0] if isinstance(child, tuple) else None
+        if isinstance(key, yaml.ScalarNode) and key.value != "<<":  # A merge may repeat.
+            if key.value in keys:
+                said = f"the key '{one_line(key.value)}' in line {key.start_mark.line + 1}"
+                raise ConfigError(f"{where}: {said} stands twice.")
+            keys.add(key.value)
+        for part in child if isinstance(child, tuple) else (child,):
+            size += _size(part, sizes, where)
         if size > _MOST_NODES:
-            raise ConfigError(
-                f"{where}: more than {_MOST_NODES} values once its aliases are written out."
-            )
-    sizes[event.anchor] = size
+            raise ConfigError(f"{where}: {_TOO_MANY}.")
+    sizes[id(node)] = size
     return size
 
 
@@ -386,39 +370,36 @@ def apply_changes(
     for change in changes:
         key, equals, text = change.partition("=")
         names = key.split(".")
+        shown = f"'{one_line(change)}'"
         if not equals or not all(names):
-            raise ConfigError(
-                f"'{one_line(change)}': expected KEY=VALUE, such as solver.max_iterations=30."
-            )
-        value = parse_yaml(text, f"'{one_line(change)}'")
-        values = _replaced(values, defaults, names, 0, value)
+            raise ConfigError(f"{shown}: expected KEY=VALUE, such as solver.max_iterations=30.")
+        values = _replaced(values, defaults, names, parse_yaml(text, shown))
     return values
 
 
-def _replaced(here: Any, default: Any, names: list[str], depth: int, value: object) -> Any:  # noqa: ANN401 - any YAML value
-    """Return the value below `names[:depth]` with the entry at `names` replaced."""
-    if depth == len(names):
+def _replaced(here: Any, default: Any, names: list[str], value: object, above: str = "") -> Any:  # noqa: ANN401 - any YAML value
+    """Return a value with the entry at `names` below it replaced; `above` leads to it."""
+    if not names:
         return value
-    above, name = ".".join(names[:depth]), names[depth]
-    if here is None:
-        here = {} if default is None else default
-    if isinstance(here, Mapping):
-        below = default.get(name) if isinstance(default, Mapping) else None
-        return {**here, name: _replaced(here.get(name), below, names, depth + 1, value)}
-    if not isinstance(here, list | tuple):
-        raise ConfigError(
-            one_line(f"'{'.'.join(names)}': '{above}' is the value {here!r}, ")
-            + "which has no entries."
-        )
-    if not name.isdecimal() or int(name) >= len(here):
+    here = default if here is None else here
+    listed, (name, *below) = isinstance(here, list | tuple), names
+    where = ".".join(filter(None, (above, name)))
+    if not listed and not isinstance(here, Mapping | None):
+        said = one_line(f"'{where}': '{above}' is the value {here!r}, ")
+        raise ConfigError(f"{said}which has no entries.")
+    entries, within = _entries(here), _entries(default)
+    key = int(name) if listed and name.isdecimal() else name
+    if listed and key not in entries:
         span = f"0 to {len(here) - 1}" if here else "none: it is empty"
-        raise ConfigError(
-            f"'{one_line(f'{above}.{name}')}': '{above}' is a list; its entries are {span}."
-        )
-    changed = list(here)
-    below = dict(enumerate(default)).get(int(name)) if isinstance(default, list) else None
-    changed[int(name)] = _replaced(here[int(name)], below, names, depth + 1, value)
-    return changed
+        said = one_line(f"'{where}': '{above}' is a list")
+        raise ConfigError(f"{said}; its entries are {span}.")
+    entries[key] = _replaced(entries.get(key), within.get(key), below, value, where)
+    return list(entries.values()) if listed else entries
+
+
+def _entries(value: object) -> dict[Any, Any]:
+    listed = dict(enumerate(value)) if isinstance(value, list | tuple) else {}
+    return dict(value) if isinstance(value, Mapping) else listed
 
 
 def configs_folder() -> Path:
@@ -462,19 +443,10 @@ def shipped_file(text: str, folder: str) -> Path:
     if is_shipped_name(text, folder):
         return configs_folder() / folder / f"{text}.yaml"
     path = Path(text)
-    if not folder or _exists(path):
+    if not folder or os.path.lexists(path):
         return path
     names = shipped_names(folder)
     close = get_close_matches(path.stem, names, n=1)
     hint = f" Did you mean '{close[0]}'?" if close else ""
-    raise ConfigError(
-        f"{text}: neither a file nor a configuration shipped for '{folder}'.{hint} "
-        f"Shipped: {', '.join(names)}."
-    )
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # A name too long for any file.
-        return False
+    said = f"{text}: neither a file nor a configuration shipped for '{folder}'.{hint}"
+    raise ConfigError(f"{said} Shipped: {', '.join(names)}.")

@@ -192,9 +192,9 @@ def calibrate(
     views = len(corner_sets)
     if views < _FEWEST_VIEWS:
         raise CalibrationDataError(f"{views} views show the board; at least {_FEWEST_VIEWS} must.")
-    inliers = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
-    for _ in range(6):
-        chosen = inliers
+    chosen = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
+    most = 5
+    while True:
         camera, about, errors = _solve(corner_sets, chosen, board, size)
         # Five standard deviations of a coordinate: the median length of an error is 1.18.
         deviation = float(np.nanmedian(np.concatenate(errors))) / np.sqrt(2 * np.log(2))
@@ -204,8 +204,9 @@ def calibrate(
             error <= max(limit, np.nanquantile(error, _SMALLEST_SHARE_OF_CORNERS))
             for error in errors
         ]
-        if all(map(np.array_equal, inliers, chosen)):
+        if most == 0 or all(map(np.array_equal, inliers, chosen)):
             break
+        chosen, most = inliers, most - 1
     keep = [
         i
         for i, error in enumerate(errors)
