@@ -28,7 +28,7 @@ def measured(**delays: Any) -> dict[str, Any]:
             {"robot": {"distance_m": [3.0, 4.0], "farthest_pixel_m": 2.0}},
             "no pose found where the wall fills the image",
         ),
-        ({"robot": {"distance_m": [2.0, 1.0]}}, "smallest distance 2 exceeds the largest 1"),
+        ({"robot": {"distance_m": [2.0, 1.0]}}, "smallest, 2, exceeds the largest, 1"),
         ({"robot": {"motion": "continuous", "repeat_poses": 2}}, "allows neither repeat_poses"),
         ({"scene": {"plane": {"normal": [0.0, 0.0, 2.0]}}}, "length 1, its length is 2"),
         (

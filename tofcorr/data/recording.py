@@ -73,10 +73,10 @@ def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
             )
 
 
-# Successive frames count as one pose if no entry of pose or plane differs from the first of them by
-# more than this, metres or no unit. Chosen: a robot that stands still reports its joints to about
-# 0.05 mm and 0.05 mrad.
-_STANDSTILL = 5e-5
+STANDSTILL = 5e-5
+"""Successive frames count as one pose if no entry of pose or plane differs from the first of them
+by more than this, metres or no unit. Chosen: a robot that stands still reports its joints to about
+0.05 mm and 0.05 mrad."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -273,7 +273,7 @@ def pose_numbers(recording: Recording) -> np.ndarray:
     for frame in range(count):
         # Compared with the first of the stretch: a slow robot moves less from frame to frame.
         # Nothing says that the target stood still where no pose is recorded.
-        same = moves and np.abs(place[frame] - place[first]).max() <= _STANDSTILL
+        same = moves and np.abs(place[frame] - place[first]).max() <= STANDSTILL
         if not (same and table.target[frame] == table.target[first]):
             first = frame
         name = f"pose {named[frame]}" if named[frame] != "" else f"stretch {first}"
@@ -305,6 +305,9 @@ class FrameBatch:
     offset_tool: Tensor
     conditions: Tensor | None = None
 
+
+OUTSIDE = 0.001
+"""Share of the pixels that may lie beyond either end of a range. Chosen: gross errors are rarer."""
 
 CHUNK_PIXELS = 131_072
 """Pixels that are read at once: a few megabytes. Set by timing on VGA recordings."""

@@ -79,7 +79,7 @@ class CameraMountOptions(Options):
         """Return the true transform, shape (4, 4)."""
         rotation = torch.deg2rad(torch.tensor(self.rotation_deg, dtype=torch.float64))
         turned = se3.exp(torch.cat([torch.zeros(3, dtype=torch.float64), rotation]))
-        translation = torch.tensor(self.translation_mm, dtype=torch.float64) * 1e-3
+        translation = torch.tensor(self.translation_mm, dtype=torch.float64) / 1000
         return se3.assemble(turned[:3, :3], translation)
 
 
@@ -163,13 +163,9 @@ class RobotOptions(Options):
     def _consistent(self) -> Self:
         low, high = self.distance_m
         if high < low:
-            raise ValueError(
-                f"distance_m: the smallest distance {low:g} exceeds the largest {high:g}"
-            )
+            raise ValueError(f"distance_m: the smallest, {low:g}, exceeds the largest, {high:g}")
         if self.motion == "continuous" and (self.repeat_poses or self.order != "random"):
-            raise ValueError(
-                "continuous motion allows neither repeat_poses nor an order other than random"
-            )
+            raise ValueError("continuous motion allows neither repeat_poses nor another order")
         return self
 
 

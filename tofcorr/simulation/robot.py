@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import condition
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
@@ -20,10 +20,6 @@ from tofcorr.simulation.options import (
     RobotOptions,
     SimulatorOptions,
 )
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import RotationSpline
 
 # Largest number of draws of a pose or a path before it is given up. Chosen by hand: all shipped
 # configurations need far fewer.
@@ -71,10 +67,8 @@ def draw_plan(
     commanded = [world @ pose @ se3.inverse(mount) for pose in poses]
     reached = [pose @ se3.exp(draw_slip(robot, generator)) for pose in commanded]
     if num_frames is not None and num_frames > len(stops):
-        raise ConfigError(
-            f"{num_frames} frames are asked for, but the options plan {len(stops)}; "
-            "raise 'poses' under 'shots'."
-        )
+        said = f"{num_frames} frames are asked for, but the options plan {len(stops)}"
+        raise ConfigError(f"{said}; raise 'poses' under 'shots'.")
     recorded = torch.stack(commanded)[stops]
     facts = FrameFacts(
         world_from_tool=recorded,
@@ -106,16 +100,14 @@ def hand_eye_guess(mount: CameraMountOptions, generator: torch.Generator) -> Ten
     )
     zero, truth = torch.zeros(3, dtype=torch.float64), mount.tool_from_camera()
     turn = se3.exp(torch.cat([zero, direction[1] * math.radians(mount.guess.rotation_deg)]))
-    shift = truth[:3, 3] + direction[0] * mount.guess.translation_mm * 1e-3
+    shift = truth[:3, 3] + direction[0] * mount.guess.translation_mm / 1000
     return se3.assemble(truth[:3, :3] @ turn[:3, :3], shift)
 
 
 def draw_slip(robot: RobotOptions, generator: torch.Generator) -> Tensor:
     """Draw the twist (6,) from a reported pose to the true one, metres and radians."""
-    scale = torch.tensor(
-        [robot.repeatability_mm * 1e-3] * 3 + [robot.repeatability_mrad * 1e-3] * 3,
-        dtype=torch.float64,
-    )
+    thousandths = [robot.repeatability_mm] * 3 + [robot.repeatability_mrad] * 3
+    scale = torch.tensor(thousandths, dtype=torch.float64) / 1000
     return scale * torch.randn(6, generator=generator, dtype=torch.float64)
 
 
@@ -173,18 +165,16 @@ def _draw_conditions(
     low, high = options.ambient_counts
     share = torch.rand(num_poses, generator=generator, dtype=torch.float64)
     ambient = (low + (high - low) * share) * (levels[level] / levels[0])
-    rooms, bodies = [], []
-    for time in timestamps:
-        turn = 2 * math.pi * time / options.room_period_s
-        rooms.append(options.room_temperature_c + options.room_drift_c * math.sin(turn))
-        warmed = (time + options.power_on_s) / options.body_time_constant_s
-        bodies.append(rooms[-1] - options.body_rise_c * math.expm1(-warmed))
+    time = levels.new_tensor(timestamps)
+    drift = torch.sin(2 * math.pi * time / options.room_period_s)
+    room = options.room_temperature_c + options.room_drift_c * drift
+    warmed = (time + options.power_on_s) / options.body_time_constant_s
     return {
-        "timestamp": levels.new_tensor(timestamps),
-        "integration_time": levels[level[stops]] * 1e-6,
+        "timestamp": time,
+        "integration_time": levels[level[stops]] * condition("integration_time").si_per_unit,
         "ambient": ambient[stops],
-        "room_temperature": levels.new_tensor(rooms),
-        "body_temperature": levels.new_tensor(bodies),
+        "room_temperature": room,
+        "body_temperature": room - options.body_rise_c * torch.expm1(-warmed),
     }
 
 
@@ -257,28 +247,23 @@ def _draw_path(
 
     num_waypoints = max(2, math.ceil(len(timestamps) / options.waypoint_every_frames) + 1)
     times = np.asarray(timestamps, dtype=np.float64)
-    duration = max(float(times[-1]), 1e-3)
-    knots = np.linspace(0.0, duration, num_waypoints)
+    knots = np.linspace(0.0, times[-1] or 1.0, num_waypoints)
     for _ in range(_TRIES):
         waypoints = torch.stack(_draw_poses(options, num_waypoints, fills_image, generator)).numpy()
         positions = CubicSpline(knots, waypoints[:, :3, 3])
         rotations = RotationSpline(knots, Rotation.from_matrix(waypoints[:, :3, :3]))
-        step = 1e-4 * duration
-        before, path, after = (
-            _poses_at(when, positions, rotations) for when in (times - step, times, times + step)
+        turned = rotations(times)
+        path = se3.assemble(
+            torch.from_numpy(turned.as_matrix()), torch.from_numpy(positions(times))
         )
         if all(fills_image(pose) for pose in path):
-            return list(path), list(se3.log(se3.inverse(before) @ after) / (2 * step))
+            # Of a spline of rotations the rate is in the moving frame already.
+            rates = turned.inv().apply(positions(times, 1)), rotations(times, 1)
+            return list(path), list(torch.from_numpy(np.concatenate(rates, axis=1)))
     raise _not_found("path")
 
 
-def _poses_at(when: np.ndarray, positions: "CubicSpline", rotations: "RotationSpline") -> Tensor:
-    turned = torch.from_numpy(rotations(when).as_matrix())
-    return se3.assemble(turned, torch.from_numpy(positions(when)))
-
-
 def _not_found(what: str) -> ConfigError:
-    return ConfigError(
-        f"robot: no {what} found where the wall fills the image within farthest_pixel_m and "
-        "steepest_incidence_deg; widen these, or reduce distance_m or tilt_deg."
-    )
+    said = f"robot: no {what} found where the wall fills the image within farthest_pixel_m and"
+    advice = "steepest_incidence_deg; widen these, or reduce distance_m or tilt_deg."
+    return ConfigError(f"{said} {advice}")

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
+from tofcorr.geometry.se3 import UNIT_LENGTH_TOLERANCE
 from tofcorr.options import Number, Options, PositiveNumber, Share, Vector3
 
 
@@ -40,7 +41,7 @@ class PlaneOptions(Options):
     @model_validator(mode="after")
     def _unit_length(self) -> Self:
         length = sum(entry * entry for entry in self.normal) ** 0.5
-        if abs(length - 1) > 1e-6:
+        if abs(length - 1) > UNIT_LENGTH_TOLERANCE:
             raise ValueError(f"the normal must have length 1, its length is {length:.6g}")
         return self
 
@@ -74,10 +75,7 @@ def target_named(targets: Mapping[str, Target], name: str) -> Target:
     """
     if name not in targets:
         known = ", ".join(targets)
-        raise ConfigError(
-            f"scene.targets: there is no target '{name}' (known: {known}). Describe it there, or "
-            "take the reflectivity from the recording."
-        )
+        raise ConfigError(f"scene.targets: no target '{name}' (known: {known}); describe it there.")
     return targets[name]
 
 
@@ -98,9 +96,8 @@ def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Ten
     """
     if isinstance(target, UniformTarget):
         return torch.full_like(target_xy[..., 0], target.reflectivity)
-    square = target.square_mm * 1e-3
-    corner = target_xy.new_tensor(target.corner_mm) * 1e-3
-    in_squares = (target_xy - corner) / square
+    corner = target_xy.new_tensor(target.corner_mm) / 1000
+    in_squares = (target_xy - corner) / (target.square_mm / 1000)
     share_bright = _bright(in_squares)
     # How the coordinates change from row to row, and from column to column.
     steps = [

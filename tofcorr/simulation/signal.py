@@ -18,6 +18,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
+from tofcorr.conditions import condition
 from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Count, NonNegativeNumber, Number, Options, PositiveNumber
 from tofcorr.simulation.hooks import FrameState
@@ -99,7 +100,7 @@ def amplitude_per_reflectivity(options: LightOptions, state: FrameState) -> Tens
     is taken as the reference.
     """
     vignetting = state.ray_directions[..., 2] ** options.vignetting_exponent
-    reference = options.reference_integration_time_us * 1e-6
+    reference = options.reference_integration_time_us * condition("integration_time").si_per_unit
     exposure = (state.recorded("integration_time") or reference) / reference
     electrons = options.electrons_at_1m * exposure * options.demodulation_contrast
     return electrons * vignetting * state.incidence_cosine / state.radial_distance**2
@@ -148,7 +149,7 @@ class AmplitudeDelayOptions(Options):
         """Return metres, of the shape of `amplitude` (electrons)."""
         share = amplitude / self.electrons
         curve = torch.log1p(share) if self.law == "log" else share**self.exponent
-        return self.scale_mm * 1e-3 * curve
+        return self.scale_mm / 1000 * curve
 
 
 class CurveTable(Options):
@@ -239,7 +240,7 @@ def delays(
     """
     measured = options.measured
     by_pixel = pixel_delay(options.pixel, ray_directions)
-    by_pixel = by_pixel + options.constant_mm * 1e-3 + measured.constant_m
+    by_pixel = by_pixel + options.constant_mm / 1000 + measured.constant_m
     if measured.pixel is not None:
         by_pixel = by_pixel + image_from_lattice(measured.pixel.values_m, *by_pixel.shape)
     by_distance, by_amplitude = (
@@ -273,7 +274,7 @@ def pixel_delay(options: PixelDelayOptions, ray_directions: Tensor) -> Tensor:
     bowl = options.bowl_mm * (1 / ray_directions[..., 2] - 1) / (math.sqrt(2.0) - 1)
     camera = torch.Generator().manual_seed(options.unit)
     irregular = torch.randn(height, width, generator=camera, dtype=torch.float64)
-    return (slopes + lines + bowl + options.irregular_mm * irregular) * 1e-3
+    return (slopes + lines + bowl + options.irregular_mm * irregular) / 1000
 
 
 # The correlation function of a modulated signal that is not quite sinusoidal.

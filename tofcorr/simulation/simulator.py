@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, pose_numbers
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry import se3
@@ -355,17 +355,13 @@ def _reached_poses(
     options: SimulatorOptions, recording: Recording, generator: torch.Generator | None
 ) -> Tensor:
     """Return the true poses of the tool, (N, 4, 4): recorded poses with repeatability errors."""
-    recorded, pose_id = torch.from_numpy(recording.frames.world_from_tool), recording.frames.pose_id
+    recorded = torch.from_numpy(recording.frames.world_from_tool)
     if generator is None or not recording.moves:
         return recorded
-    slips = torch.stack([draw_slip(options.robot, generator) for _ in range(recording.num_frames)])
-    if pose_id is not None:
-        # Same pose_id: same pose error; without one, independent errors.
-        alone = [f"frame {index}" for index in range(recording.num_frames)]
-        stop = np.where(pose_id == "", alone, pose_id)
-        _, first, group = np.unique(stop, return_index=True, return_inverse=True)
-        slips = slips[torch.from_numpy(first[group])]
-    return recorded @ se3.exp(slips)
+    # Frames that were taken without moving share one error.
+    pose = pose_numbers(recording)
+    slips = torch.stack([draw_slip(options.robot, generator) for _ in np.unique(pose)])
+    return recorded @ se3.exp(slips[torch.from_numpy(pose)])
 
 
 def _image(recording: Recording, name: str, index: int) -> Tensor | None:

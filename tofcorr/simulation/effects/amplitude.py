@@ -12,6 +12,7 @@ from tofcorr.simulation.effects.base import (
     Coefficient,
     EffectInputs,
     LinearDelay,
+    inner_range,
     legendre,
     side_by_side,
 )
@@ -41,23 +42,20 @@ class AmplitudeEffect(LinearDelay):
     remedy = "a grey ladder of five reflectivities at one distance, with three integration times"
     needs = (AMPLITUDE,)
     shape_type: ClassVar[type[Options]] = AmplitudeShape
+    prior_linear = 0.03
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "AmplitudeEffect":
-        """Take the range of all but the lowest and highest 0.2 % of the amplitudes.
+        """Take the range of nearly all amplitudes.
 
         Raises:
             CalibrationDataError: No amplitude is above zero.
         """
         known = inputs.known_amplitude
-        ordered = known[known > 0].sort().values
-        if not len(ordered):
-            raise CalibrationDataError(
-                "amplitude.npy holds 0 in every pixel used, so it was not measured: remove the "
-                "file; what is missing is unknown, never zero."
-            )
-        beyond = int(0.002 * len(ordered))
-        low, high = ordered[[beyond, min(len(ordered) - 1, int(0.998 * len(ordered)))]].tolist()
+        if not bool((known > 0).any()):
+            said = "amplitude.npy holds 0 in every pixel used, so it was not measured"
+            raise CalibrationDataError(f"{said}: remove the file; what is missing is unknown.")
+        low, high = inner_range(known[known > 0])
         return cls(AmplitudeShape(low_counts=low, high_counts=high))
 
     @classmethod
@@ -67,7 +65,10 @@ class AmplitudeEffect(LinearDelay):
             Coefficient(f"log_{k}", "m", 2 * cls.prior / (1 + 0.5 * k))
             for k in range(1, shape.degree + 1)
         ]
-        return (*logarithm, *(Coefficient(name, "m", 0.03) for name in ("linear", "square")))
+        return (
+            *logarithm,
+            *(Coefficient(name, "m", cls.prior_linear) for name in ("linear", "square")),
+        )
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the functions of the amplitude, shape (M, K)."""

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from tofcorr.conditions import condition
+from tofcorr.data.recording import CHUNK_PIXELS, OUTSIDE
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import (
     distance_along_rays,
@@ -32,8 +33,6 @@ from tofcorr.simulation.hooks import Effect, FrameFacts, FrameState
 
 # Long: every effect needs all of it, and its parts call one another.
 
-# Largest number of pixels in one batch of images. Set by hand: bounds the memory to some 100 MB.
-_CHUNK_PIXELS = 500_000
 _OfImages = Callable[..., Tensor]
 
 
@@ -160,7 +159,7 @@ class EffectInputs:
             whole = [known(self, "amplitude_images"), known(self, "distance_images")]
             whole += [] if of_frames is None else [of_frames]
             size = whole[0][0].numel()
-            step, values = max(1, _CHUNK_PIXELS // size), []
+            step, values = max(1, CHUNK_PIXELS // size), []
             for start in range(0, len(whole[0]), step):
                 images = function(*(each[start : start + step] for each in whole), *arguments)
                 inside = (self.frame >= start) & (self.frame < start + step)
@@ -608,7 +607,7 @@ def phase_difference(signal: Tensor, own: Tensor) -> Tensor:
     return torch.atan2(product.imag.contiguous(), product.real + (product == 0))
 
 
-def inner_range(values: Tensor, beyond: float) -> tuple[float, float]:
+def inner_range(values: Tensor, beyond: float = OUTSIDE) -> tuple[float, float]:
     """Return the ends of what values (M,) lie between, but for a share of them at either end."""
     ordered, last = values.sort().values, len(values) - 1
     return float(ordered[int(beyond * last)]), float(ordered[int((1 - beyond) * last)])
@@ -641,11 +640,9 @@ def exponents(low: int, high: int) -> list[tuple[int, int]]:
     return [(total - j, j) for total in range(low, high + 1) for j in range(total + 1)]
 
 
-# Half width of the kernel in standard deviations: 0.3 % of a Gaussian lies beyond 3.
-_KERNEL_SIGMAS = 3.0
-# Samples per standard deviation of a wide Gaussian. Set by hand; the tests of `blur` bound what it
-# changes in a smooth image.
-_PIXELS_PER_SIGMA = 3.0
+# Half width of the kernel in standard deviations: 0.3 % of a Gaussian lies beyond 3. As many
+# samples has a standard deviation; the tests of `blur` bound what that changes in a smooth image.
+_SIGMAS = 3.0
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
@@ -656,11 +653,11 @@ def blur(images: Tensor, sigma: float) -> Tensor:
     if images.is_complex():
         return torch.complex(blur(images.real, sigma), blur(images.imag, sigma))
     size = images.shape[-2:]
-    square = max(1, min(int(sigma / _PIXELS_PER_SIGMA), *size))
+    square = max(1, min(int(sigma / _SIGMAS), *size))
     wide = images[:, None].contiguous()
     if square > 1:
         wide = avg_pool2d(wide, square, ceil_mode=True, count_include_pad=False)
-    side = 2 * max(1, round(_KERNEL_SIGMAS * sigma / square)) + 1
+    side = 2 * max(1, round(_SIGMAS * sigma / square)) + 1
     wide = gaussian_blur2d(wide, side, (sigma / square, sigma / square), border_type="replicate")
     if square > 1:
         wide = interpolate(wide, scale_factor=square, mode="bilinear", align_corners=False)

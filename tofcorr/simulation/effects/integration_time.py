@@ -5,6 +5,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import condition
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import (
     INTEGRATION_TIME,
@@ -14,10 +15,6 @@ from tofcorr.simulation.effects.base import (
     known,
 )
 from tofcorr.simulation.hooks import FrameFacts
-
-# Integration times whose logarithms differ by less (no unit) are one setting. Set by hand: settings
-# differ by far more than 0.1 %, rounding in a file by far less.
-_LEVEL_TOLERANCE = 1e-3
 
 
 class IntegrationTimeShape(Options):
@@ -48,11 +45,9 @@ class IntegrationTimeEffect(FrameEffect):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "IntegrationTimeEffect":
         """Take the median setting as reference, and as many terms as the settings allow."""
-        times = known(inputs.facts, "integration_time")
-        levels = torch.unique((times.log() / _LEVEL_TOLERANCE).round())
-        degree = max(1, min(3, len(levels) - 1))
-        reference = float(times.median()) * 1e6
-        return cls(IntegrationTimeShape(reference_us=reference, degree=degree))
+        times = _microseconds(inputs.facts)
+        degree = max(1, min(3, len(torch.unique(times.round())) - 1))
+        return cls(IntegrationTimeShape(reference_us=float(times.median()), degree=degree))
 
     @classmethod
     def terms(cls, shape: IntegrationTimeShape) -> tuple[Coefficient, ...]:
@@ -63,6 +58,10 @@ class IntegrationTimeEffect(FrameEffect):
 
     def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
         """Return the polynomial of the logarithm, shape (F,), metres."""
-        logarithm = (known(facts, "integration_time") * 1e6 / self.shape.reference_us).log()
+        logarithm = (_microseconds(facts) / self.shape.reference_us).log()
         powers = [logarithm**k for k in range(1, self.shape.degree + 1)]
         return torch.stack(powers, dim=-1) @ coefficients
+
+
+def _microseconds(facts: FrameFacts) -> Tensor:
+    return condition("integration_time").in_file(known(facts, "integration_time"))

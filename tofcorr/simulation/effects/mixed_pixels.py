@@ -126,7 +126,8 @@ def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
     They are: squared slope of the smoothed logarithm; presence of an edge, from 0 to 1; how evenly
     the pixel is shared between the dark and the bright side, from 0 to 1.
     """
-    floor = 0.02 * amplitude.amax(dim=(1, 2), keepdim=True).clamp(min=1e-12)
+    least = torch.finfo(amplitude.dtype).tiny
+    floor = (0.02 * amplitude.amax(dim=(1, 2), keepdim=True)).clamp(min=least)
     bounded = torch.maximum(amplitude, floor)
     logarithm = bounded.log()
     contrast = _squared_slope(blur(logarithm, _EDGE_PX))
@@ -134,7 +135,7 @@ def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
     present = sharp / (sharp + _EDGE_SLOPE**2)
     # The extremes of 3 x 3 pixels.
     high, low = (sign * max_pool2d(sign * bounded[:, None], 3, 1, 1)[:, 0] for sign in (1, -1))
-    bright = (bounded - low) / (high - low).clamp(min=1e-12)
+    bright = (bounded - low) / (high - low).clamp(min=least)
     jump = (high / low).log() ** 2
     shared = 4 * bright * (1 - bright) * jump / (jump + 4 * _EDGE_SLOPE**2)
     return torch.stack([contrast, present, shared]).movedim(0, -1)

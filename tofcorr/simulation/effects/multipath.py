@@ -34,8 +34,6 @@ Set by hand: a surface close by, and one farther away."""
 _BEFORE, _DEPTH = (0.05, 0.15, 0.4), (0.1, 0.15, 0.35)
 _ASIDE = (-0.25, 0.0, 0.25)
 _WIDTH = 0.25
-# Smallest distance to a patch, metres: nearer patches are not point sources. Set by hand.
-_NEAREST = 0.05
 
 # Pixels evaluated at once. Chosen: what is computed of them stays in a processor's cache.
 _AT_ONCE = 10_000
@@ -59,7 +57,8 @@ def light_by_surfaces(
     """
     low, high = area.low_xy_m, area.high_xy_m
     extent = max(high[0] - low[0], high[1] - low[1])
-    # Along the last axes: where a patch lies along the edge, and how high.
+    # Along the last axes: where a patch lies along the edge, and how high. A patch nearer than the
+    # lowest is high is no point source.
     up, depth, aside = (extent * xy.new_tensor(row) for row in (_BEFORE, _DEPTH, _ASIDE))
     aside, height = aside[:, None], camera[:, 2, None, None] - up
     direct = (distance**2 / cosine.clamp(min=LEAST_COSINE))[:, None, None]
@@ -69,8 +68,8 @@ def light_by_surfaces(
         lit = (wall - sign * camera[:, axis]).clamp(min=0.0)[:, None, None]
         away = (wall - sign * xy[:, axis])[:, None, None]
         along = (xy - camera[:, :2])[:, 1 - axis, None, None] + aside
-        first = (lit**2 + along**2 + height**2).sqrt().clamp(min=_NEAREST)
-        second = (away**2 + aside**2 + up**2).sqrt().clamp(min=_NEAREST)
+        first = (lit**2 + along**2 + height**2).sqrt().clamp(min=float(up[0]))
+        second = (away**2 + aside**2 + up**2).sqrt()
         # Three cosines, and the fall of the light on both parts of the path.
         cosines = depth * up * lit * away
         strength = (_WIDTH * extent / torch.pi) * cosines / (first**3 * second.square().square())

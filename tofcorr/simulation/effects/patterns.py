@@ -36,6 +36,7 @@ class MapEffect(CatalogueEffect):
 
     tables: ClassVar[dict[str, tuple[str, Any]]]
     form_error = 0.0  # A map holds every pattern of its kind.
+    prior = 0.01
 
     @classmethod
     @abstractmethod
@@ -108,7 +109,7 @@ def drawn_values(count: int, rms: float, seed: int) -> Tensor:
 @lru_cache(maxsize=4)
 def _cell_terms(count: int) -> tuple[Coefficient, ...]:
     """Return the coefficients of so many cells; a map is built many times, of thousands of them."""
-    return tuple(Coefficient(f"cell_{number}", "m", 0.01) for number in range(count))
+    return tuple(Coefficient(f"cell_{number}", "m", MapEffect.prior) for number in range(count))
 
 
 class ImageShape(Options):

@@ -6,15 +6,13 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
+from tofcorr.data.recording import STANDSTILL
 from tofcorr.geometry import se3
 from tofcorr.geometry.se3 import small_motion
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import ROBOT, Coefficient, EffectInputs, GeometryEffect
 from tofcorr.simulation.hooks import FrameFacts
 
-# A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:
-# above what the encoders of a robot at rest report, below the play that matters.
-_LEAST_MOVE = 1e-4
 _AXES = "xyz"
 _PAIRS = tuple(f"{i}{j}" for i in _AXES for j in _AXES)
 _BASE = ("cos_1", "sin_1", "cos_2", "sin_2", "cos_3", "sin_3")
@@ -134,7 +132,7 @@ def sides_of_approach(world_from_tool: Tensor) -> Tensor:
     position = world_from_tool[:, :3, 3]
     moved = torch.zeros_like(position)
     moved[1:] = position.diff(dim=0)
-    turned = moved.abs() > _LEAST_MOVE
+    turned = moved.abs() > STANDSTILL  # Less turns no gear over: the side stays.
     number = torch.arange(len(moved), device=moved.device)[:, None]
     last = torch.where(turned, number, 0).cummax(0).values
     return torch.where(turned, moved.sign(), 0.0).gather(0, last)

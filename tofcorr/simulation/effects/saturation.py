@@ -23,8 +23,6 @@ from tofcorr.simulation.hooks import FrameState
 # Share of the dim pixels whose amplitude per light is above that of white (no unit). Set by hand:
 # white is above dark surfaces, below the noise of bright ones.
 _ABOVE_WHITE = 0.1
-# Share of the pixels that may be brighter than the brightest (no unit).
-_BRIGHTER = 0.001
 # A pixel may be clipped if its amplitude is at least this share of white's (no unit). Set by hand:
 # a clipped tap loses less than three quarters of the amplitude.
 _DARKEST_CLIPPED = 0.25
@@ -48,7 +46,7 @@ def _restored(inputs: EffectInputs) -> Tensor:
     light = inputs.of_frame(seconds) * inputs.incidence_cosine / inputs.radial_distance**2
     dim = light <= light.median()
     white = light * inner_range((amplitude / light)[dim], _ABOVE_WHITE)[1]
-    _, brightest = inner_range(amplitude, _BRIGHTER)
+    _, brightest = inner_range(amplitude)
     clipped = (white > brightest) & (amplitude > _DARKEST_CLIPPED * white)
     return torch.where(clipped, torch.maximum(amplitude, white), amplitude)
 
@@ -56,9 +54,6 @@ def _restored(inputs: EffectInputs) -> Tensor:
 # The effect.
 
 
-# Strength of the soft bend at which its chord is taken (no unit). Set by hand: a third of its
-# prior's standard deviation.
-_SOFT_CHORD = 0.1
 # A phasor below this share of the brightest tap has no phase. Chosen: far above the rounding of
 # float64, far below any noise.
 _LEAST_LEFT = 1e-9
@@ -105,12 +100,13 @@ class SaturationEffect(CatalogueEffect):
     needs = (AMPLITUDE, FREQUENCY)
     shape_type: ClassVar[type[Options]] = SaturationShape
     reads_light = True
+    prior_soft = 0.3
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the brightest tap of the recording, A + A / contrast, as the full level."""
         ambient, contrast = inputs.facts.ambient, SaturationShape().contrast
-        full = (1 + 1 / contrast) * inner_range(inputs.known_amplitude, _BRIGHTER)[1]
+        full = (1 + 1 / contrast) * inner_range(inputs.known_amplitude)[1]
         full += 0.0 if ambient is None else float(ambient.nan_to_num(0.0).max())
         return cls(SaturationShape(full_counts=full or 1.0))
 
@@ -119,7 +115,7 @@ class SaturationEffect(CatalogueEffect):
         """Return the strength of the soft bend and of every knee, then the shares that spill."""
         knees = [Coefficient(f"knee_{knee:g}", "1", 0.5) for knee in shape.knees]
         spills = [Coefficient(f"spill_along_{lines}", "1", 0.5) for lines in ("columns", "rows")]
-        return (Coefficient("soft", "1", 0.3), *knees, *spills)
+        return (Coefficient("soft", "1", cls.prior_soft), *knees, *spills)
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four bent taps, shape (M,), metres."""
@@ -140,7 +136,7 @@ class SaturationEffect(CatalogueEffect):
         lower = [*map(_phasor, self._bends(taps)), *(-self._spills_of(inputs)).unbind(-1)]
         chords = []
         for number, bend in enumerate(lower):
-            strength = 1.0 if number else _SOFT_CHORD
+            strength = 1.0 if number else self.prior_soft / 3
             bent = _phasor(taps) - strength * bend
             # Four taps beyond the knee are all equal: what is left has no phase but rounding's.
             left = bent.abs() > _LEAST_LEFT * taps.amax(0)
