@@ -100,7 +100,7 @@ def test_another_camera_is_refused_and_another_lens_is_said(
     with pytest.raises(CalibrationDataError, match="frames are 7x5 pixels, the sensor has 512x424"):
         degrade("kinect_v2", ideal, tmp_path / "real")
     camera = sensor().camera.to_mapping() | {"distortion": []}
-    with pytest.warns(UserWarning, match="intrinsics are not those of the sensor"):
+    with pytest.warns(UserWarning, match="intrinsics are not the sensor.s"):
         degrade(sensor(camera=camera), ideal, tmp_path / "real")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ideal", "real"]
 
@@ -147,7 +147,7 @@ def test_depth_in_millimetres_is_said(tmp_path: Path) -> None:
 
 def test_a_reflectivity_of_8_bits_is_refused(tmp_path: Path) -> None:
     ideal = rendered(tmp_path / "ideal", 1.2, 200.0)
-    with pytest.raises(CalibrationDataError, match=r"a share from 0 to 1, .* got 200; divide"):
+    with pytest.raises(CalibrationDataError, match=r"a share from 0 to 1, got 200; divide"):
         degrade(sensor(), ideal, tmp_path / "out", amplitude_is="reflectivity")
     assert not (tmp_path / "out").exists()
 

@@ -22,10 +22,6 @@ from tofcorr.sensor.sensor_file import SensorFile, read_sensor
 AmplitudeMeaning = Literal["amplitude", "reflectivity"]
 """What `amplitude.npy` of the ideal recording holds: the camera's own units, or a share 0 to 1."""
 
-# Largest difference of two hand-eye transforms that count as one, metres or radians: what a robot
-# repeats. Of focal lengths, principal points (pixels) and distortion (no unit) of one lens: a tenth
-# of what a calibration determines. Chosen.
-_SAME_MOUNT, _SAME_LENS = 1e-3, 0.02
 # Reflectivity above which the numbers are of another kind. Chosen: gloss returns a few times what
 # white paint does, and images of 8 bits hold tens.
 _MOST_REFLECTED = 10.0
@@ -127,11 +123,9 @@ def degrade(
     # Then most of the result rests on errors at the edge of a range, or the unit is wrong.
     if counts[0] and covered_share < 0.5:
         near, far = file.validity.radial_distance_m
-        _warn(
-            f"{recording.path}: {100 * covered_share:.0f} % of its pixels are at distances that "
-            f"the sensor was measured at, {near:.2g} to {far:.2g} m; beyond, the error at the "
-            "range's edge was used. Is the depth in metres?"
-        )
+        said = f"{100 * covered_share:.0f} % of its pixels are at distances that the sensor was"
+        beyond = "beyond, the error at the range's edge was used. Is the depth in metres?"
+        _warn(f"{recording.path}: {said} measured at, {near:.2g} to {far:.2g} m; {beyond}")
     return Degraded(
         recording=Recording.open(out, check_contents=False),
         valid_share=valid_share,
@@ -157,29 +151,20 @@ def _refuse_another_camera(recording: Recording, sensor: SensorFile) -> None:
     """Refuse frames of another size; warn of those of another lens or hand-eye transform."""
     camera, own = recording.camera, sensor.intrinsics()
     if (camera.width, camera.height) != (own.width, own.height):
-        raise CalibrationDataError(
-            f"{recording.path}: frames are {camera.width}x{camera.height} pixels, the sensor has "
-            f"{own.width}x{own.height}. Render with the intrinsics of the sensor."
-        )
-    lenses = [
-        np.append(each.matrix, np.pad(each.distortion, (0, 14))[:14]) for each in (camera, own)
-    ]
-    if np.abs(lenses[0] - lenses[1]).max() > _SAME_LENS:
-        _warn(
-            f"{recording.path}: its intrinsics are not those of the sensor. Each pixel gets the "
-            "sensor's error for that pixel; render with the sensor's intrinsics to avoid this."
-        )
+        sizes = f"{camera.width}x{camera.height} pixels, the sensor has {own.width}x{own.height}"
+        said = f"frames are {sizes}. Render with the intrinsics of the sensor."
+        raise CalibrationDataError(f"{recording.path}: {said}")
+    if not torch.allclose(ray_directions(camera), ray_directions(own)):
+        said = "its intrinsics are not the sensor's, whose error each pixel gets"
+        _warn(f"{recording.path}: {said}; render with the sensor's to avoid this.")
     given, found = recording.tool_from_camera, sensor.tool_from_camera
     if found is None or np.allclose(given, np.eye(4)):  # The identity: no robot, or unknown.
         return
     shift, turn = se3.apart(torch.as_tensor(given), torch.tensor(found, dtype=torch.float64))
-    if max(shift, turn) > _SAME_MOUNT:
-        _warn(
-            f"{recording.path}: its tool_from_camera is {1e3 * shift:.1f} mm and "
-            f"{np.degrees(turn):.2f} degrees from that of the sensor. Its errors go with its own: "
-            "if these frames stand for the sensor's robot, render them with the tool_from_camera "
-            "of sensor.yaml."
-        )
+    if 1000 * max(shift, turn) > 1:  # What a robot repeats.
+        away = f"{1e3 * shift:.1f} mm and {np.degrees(turn):.2f} degrees from that of the sensor"
+        advice = "If they are frames of its robot, render them with that of sensor.yaml."
+        _warn(f"{recording.path}: its tool_from_camera is {away}. {advice}")
 
 
 def _warn(sentence: str) -> None:
@@ -189,8 +174,5 @@ def _warn(sentence: str) -> None:
 def _refuse_no_share(recording: Recording, light: Tensor, number: int) -> None:
     most = float(light.nan_to_num(0.0).max())
     if most > _MOST_REFLECTED:
-        raise CalibrationDataError(
-            f"{recording.path}: frame {number}, amplitude: a reflectivity is a share from 0 to 1, "
-            f"a little more in highlights, got {most:.6g}; divide by what white has (255 in images "
-            "of 8 bits)."
-        )
+        said = f"a reflectivity is a share from 0 to 1, got {most:.6g}; divide by what white has"
+        raise CalibrationDataError(f"{recording.path}: frame {number}, amplitude: {said}.")

@@ -103,9 +103,8 @@ def error_model_of(section: ErrorSection, domain: Domain) -> ErrorModel:
     try:
         model.set_paper_coefficients(groups)
     except KeyError as error:
-        raise ConfigError(
-            f"sensor: error.coefficients lack {error}, which a term of error.terms has."
-        ) from None
+        said = f"error.coefficients lack {error}, which a term of error.terms has"
+        raise ConfigError(f"sensor: {said}.") from None
     return model
 
 
@@ -390,14 +389,14 @@ class SensorModel(DescribedModule):
         self._say(self.effects.usable(known)[1])
         one_by_one = self.sensor.effects_see == "delayed_distance"
         lens = self.effects.shift(Group.GEOMETRY, frames)
-        at = frames.moved(lens) if one_by_one else frames
+        at = replace(frames, distance=frames.distance + lens) if one_by_one else frames
         conditions = with_means(known, self.base.mean_conditions)
         error = self.base(at.distance, frames.amplitude, conditions)
         if of_frame is None:
             of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays)
         error = error + of_frame.to(error.dtype).reshape(-1, 1, 1)
         error = error + self.effects.shift(Group.DELAY, at)
-        at = at.moved(error) if one_by_one else frames
+        at = replace(at, distance=at.distance + error) if one_by_one else frames
         return frames.distance + lens + error + self.effects.shift(Group.SIGNAL, at)
 
     def _say(self, sentences: list[str]) -> None:

@@ -1,7 +1,7 @@
 """A rendered scene as a sensor sees it: distances, surfaces, light, and what effects add."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 from typing import Any
@@ -24,14 +24,12 @@ from tofcorr.simulation.effects.base import (
     FrameEffect,
 )
 from tofcorr.simulation.effects.registry import build_effects
+from tofcorr.simulation.effects.surface import LEAST_COSINE
 from tofcorr.simulation.hooks import FrameFacts
 
 # Conditions count up to this share of their range beyond it (no unit). Derived: a parabola that
 # errs by 1 at most within a range errs by 2 an eighth of it further, by 7 half of it further.
 _BEYOND = 0.125
-# Least cosine between ray and normal (89.4 degrees; no unit). Chosen: keeps light and slant finite
-# at the outlines of objects.
-_LEAST_COSINE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,10 +51,6 @@ class SceneFrames:
     seen: Tensor
     conditions: Mapping[str, Tensor]
     surface: Callable[[], tuple[Tensor, Tensor]]
-
-    def moved(self, error: Tensor) -> "SceneFrames":
-        """Return the same surfaces, seen at distances longer by an error (B, H, W), metres."""
-        return replace(self, distance=self.distance + error)
 
     def inputs(self, camera: CameraIntrinsics, modulation_frequency: float | None) -> EffectInputs:
         """Return what effects may use of all pixels, M = B H W of them.
@@ -106,10 +100,7 @@ class Eye(nn.Module):
         super().__init__()
         camera = sensor.intrinsics()
         if min(camera.width, camera.height) < 2:
-            raise ConfigError(
-                f"camera: {camera.width} x {camera.height} pixels; a sensor compares "
-                "neighbouring pixels, and needs 2 x 2 at least."
-            )
+            raise ConfigError("camera: a sensor compares neighbours, and needs 2 x 2 at least.")
         self.light = sensor.light
         rays = ray_directions(camera)
         self.register_buffer("rays", rays)
@@ -143,11 +134,8 @@ class Eye(nn.Module):
         for name, image in given.items():
             self._check(name, image, true_depth)
         if amplitude is self.light is None and (needs_amplitude or reflectivity is not None):
-            raise FrameError(
-                "amplitude: what this sensor measures depends on the amplitude, and its file has "
-                "no section 'light' that gives it from a reflectivity; pass amplitudes in the "
-                "camera's units."
-            )
+            said = "amplitude: the measurement depends on it, and the sensor's file has no section"
+            raise FrameError(f"{said} 'light'; pass amplitudes in the camera's units.")
         depth, lit, shares = (
             None if image is None else image.reshape(-1, *image.shape[-2:]).to(self.rays.dtype)
             for image in given.values()
@@ -179,11 +167,8 @@ class Eye(nn.Module):
         refuse_other_than_tensor(name, image)
         height, width = self.radial_of_depth.shape
         if image.shape != depth.shape or list(image.shape[-2:]) != [height, width]:
-            raise FrameError(
-                f"{name}: expected shape (..., {height}, {width}), the size of the camera, for all "
-                f"images of a scene; got {list(image.shape)}. Render with the intrinsics of the "
-                "sensor."
-            )
+            said = f"expected shape (..., {height}, {width}) of all images of a scene, got"
+            raise FrameError(f"{name}: {said} {[*image.shape]}. Render with the sensor's camera.")
         if not image.is_floating_point():
             raise FrameError(f"{name}: expected floating point, got {image.dtype}.")
 
@@ -228,7 +213,7 @@ def surfaces(distance: Tensor, seen: Tensor, rays: Tensor) -> tuple[Tensor, Tens
     b = scale * (right_x * down - right * down_x)
     normal = torch.stack([a, b, inverse - a * x - b * y], dim=-1)
     length = normal.norm(dim=-1)
-    cosine = (1 / (distance * length)).clamp(_LEAST_COSINE, 1.0)
+    cosine = (1 / (distance * length)).clamp(LEAST_COSINE, 1.0)
     return cosine, -normal / length[..., None]
 
 
@@ -353,11 +338,6 @@ class ImageEffects(nn.Module):
     def needs_amplitude(self) -> bool:
         """Whether an effect reads the amplitude."""
         return any(AMPLITUDE in each.effect.needs for each in self._all())
-
-    @property
-    def reads_light(self) -> bool:
-        """Whether an effect reads the light of clipped pixels."""
-        return any(each.effect.reads_light for each in self._all())
 
     def usable(self, known: Mapping[str, Tensor]) -> tuple[list[ImageEffect], list[str]]:
         """Return the effects whose conditions are known, and a sentence about each other one."""

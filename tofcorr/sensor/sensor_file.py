@@ -11,6 +11,7 @@ from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.condition_terms import NAME_OF
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation.noise import NoiseModel
+from tofcorr.estimation.robust import LEVEL
 from tofcorr.files import staged_file
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.geometry.se3 import RigidTransform
@@ -27,11 +28,9 @@ from tofcorr.options import (
     shipped_names,
 )
 from tofcorr.simulation.options import CameraOptions
+from tofcorr.simulation.scene import UniformTarget
 
 FILE_NAME = "sensor.yaml"
-
-# Reflectivity of white paper and paint (no unit). Chosen: those of real scenes are rarely measured.
-_WHITE = 0.8
 
 _HEADING = """\
 # {title}
@@ -237,13 +236,14 @@ def light_section(observed: Observed) -> LightSection | None:
     """Return the light of a camera, if its bright surfaces are white; None without amplitudes.
 
     Reflectivities are unknown: the 95 % quantile of the amplitude, less the fall-off with distance
-    and incidence, is taken as white of reflectivity 0.8.
+    and incidence, is taken as white of the simulator's reflectivity, 0.8.
     """
     table = observed.table
     full = table.amplitude / table.signal
     full = full[np.isfinite(full) & (full > 0)]
     if not len(full):
         return None
-    at_1m = float(np.quantile(full, 0.95)) / _WHITE
-    usual = float(np.clip(np.median(full) / at_1m, 0.01, 1.0))
-    return LightSection(amplitude_at_1m=float(f"{at_1m:.4g}"), usual_reflectivity=round(usual, 3))
+    at_1m = float(np.quantile(full, 1 - LEVEL)) / UniformTarget().reflectivity
+    usual = min(float(np.median(full)) / at_1m, 1.0)
+    numbers = {"amplitude_at_1m": f"{at_1m:.4g}", "usual_reflectivity": f"{usual:.3g}"}
+    return LightSection.model_validate(numbers)
