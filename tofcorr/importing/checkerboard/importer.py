@@ -9,10 +9,9 @@ Kinect v2 in `tests/importing/checkerboard/test_kinect2.py` they refuse at most 
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -127,30 +126,29 @@ class CheckerboardOptions(Options):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class BoardView:
+class BoardView(NamedTuple):
     """A view whose board has a pose: measured depth against it.
 
     Attributes:
-        name: What the view is called.
         pose: The board in the camera frame.
-        board_pixels: Pixels that see the board.
-        usable_pixels: Those with depth and below saturation.
-        distance: Median true radial distance, metres.
-        error: Median of measured minus true depth, of the kind recorded, metres.
         ratio: Median of measured over true distance.
         kind_moments: Sum over pixels of v v', shape (4, 4), metres, with v = (1, D, D (1 - cos a),
             measured minus true radial distance) and a the angle to the optical axis.
+        reported: What `import.json` says of it. `plane_sd_mm` is the standard deviation of the
+            plane's position at the board's centre, along its normal, propagated from the corners;
+            errors that all views share (focal length, square length) are not included.
+            `depth_error_mm` is the median of measured minus true depth, of the kind recorded.
     """
 
-    name: str
     pose: BoardPose
-    board_pixels: int
-    usable_pixels: int
-    distance: float
-    error: float
     ratio: float
     kind_moments: np.ndarray
+    reported: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """What the view is called."""
+        return self.reported["view"]
 
 
 def import_checkerboard(
@@ -209,7 +207,7 @@ class BoardImport:
         views = sieve.apply(refuse, views, lambda view: view.name, "comparing boards")
         warnings += agreement_warnings(views, ratio, options.depth_kind)
         return PreparedImport(
-            views=[self._reported(view) for view in views],
+            views=[view.reported for view in views],
             frames=self._frames(views),
             writer=partial(
                 RecordingWriter,
@@ -288,16 +286,22 @@ class BoardImport:
             if tilt > _LARGEST_TILT_DEG:
                 raise RefusedViewError(f"depth is {tilt:.0f} degrees off the board; {_SAME_VIEW}")
         columns = np.stack([np.ones_like(true), true, true * (1.0 - cosine), errors])
-        return BoardView(
-            name=view,
-            pose=pose,
-            board_pixels=int(area.sum()),
-            usable_pixels=int(seen.sum()),
-            distance=float(np.median(true)),
-            error=float(np.median(errors * along)),
-            ratio=float(np.median(measured / true)),
-            kind_moments=columns @ columns.T,
-        )
+        centre, files = pose.centre(self._board), self._files[view]
+        slant = abs(float(pose.plane()[0] @ centre)) / float(np.linalg.norm(centre))
+        reported = {
+            "view": view,
+            "depth_file": files["depth"].relative_to(self._folder).as_posix(),
+            "infrared_file": files["infrared"].relative_to(self._folder).as_posix(),
+            "reprojection_rms_px": pose.reprojection_rms,
+            "corners_used": int(pose.used.sum()),
+            "board_pixels": int(area.sum()),
+            "usable_pixels": int(seen.sum()),
+            "distance_m": float(np.median(true)),
+            "incidence_deg": float(np.degrees(np.arccos(min(slant, 1.0)))),
+            "plane_sd_mm": 1000 * pose.plane_deviation,
+            "depth_error_mm": 1000 * float(np.median(errors * along)),
+        }
+        return BoardView(pose, float(np.median(measured / true)), columns @ columns.T, reported)
 
     def _frames(self, views: Sequence[BoardView]) -> Iterator[Frame]:
         for index, view in enumerate(views):
@@ -311,30 +315,6 @@ class BoardImport:
             )
             depth, amplitude = self._read(view.name)
             yield row, depth, amplitude, self._area(view.pose)
-
-    def _reported(self, view: BoardView) -> dict[str, Any]:
-        """Return what `import.json` says of a view.
-
-        `plane_sd_mm` is the standard deviation of the plane's position at the board's centre, along
-        its normal, propagated from the corners; errors that all views share (focal length, square
-        length) are not included. `depth_error_mm` is the median of measured minus true depth.
-        """
-        pose, centre = view.pose, view.pose.centre(self._board)
-        cosine = abs(float(pose.plane()[0] @ centre)) / float(np.linalg.norm(centre))
-        files = self._files[view.name]
-        return {
-            "view": view.name,
-            "depth_file": files["depth"].relative_to(self._folder).as_posix(),
-            "infrared_file": files["infrared"].relative_to(self._folder).as_posix(),
-            "reprojection_rms_px": pose.reprojection_rms,
-            "corners_used": int(pose.used.sum()),
-            "board_pixels": view.board_pixels,
-            "usable_pixels": view.usable_pixels,
-            "distance_m": view.distance,
-            "incidence_deg": float(np.degrees(np.arccos(min(cosine, 1.0)))),
-            "plane_sd_mm": 1000 * pose.plane_deviation,
-            "depth_error_mm": 1000 * view.error,
-        }
 
 
 def typical_ratio(views: Sequence[BoardView]) -> float:
