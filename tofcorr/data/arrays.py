@@ -14,8 +14,6 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.files import UNREADABLE, open_regular
 from tofcorr.options import LARGEST_NUMBER
 
-# Size of a chunk of frames, bytes. Set by hand: large enough for fast reads, small for any memory.
-_CHUNK_BYTES = 16_000_000
 LARGEST_DISTANCE = 1e6
 """Largest distance and coordinate that is accepted, metres. Chosen: beyond any camera's range in
 any unit; drivers write larger numbers, such as the largest of float32, for "no return"."""
@@ -163,11 +161,11 @@ def read_frames(array: np.ndarray, indices: np.ndarray) -> np.ndarray:
     return frames
 
 
-def frame_chunks(num_frames: int, frame_bytes: int) -> Iterator[np.ndarray]:
-    """Split 0..num_frames-1 into runs of about 16 MB."""
-    step = max(1, _CHUNK_BYTES // max(1, frame_bytes))
-    for start in range(0, num_frames, step):
-        yield np.arange(start, min(start + step, num_frames))
+def frame_chunks(frames: np.ndarray, pixels: int, most: int) -> Iterator[np.ndarray]:
+    """Split the numbers of frames, each of so many pixels, into runs of at most so many."""
+    step = max(1, most // pixels)
+    for start in range(0, len(frames), step):
+        yield frames[start : start + step]
 
 
 class ArrayStream:

@@ -237,7 +237,8 @@ class Recording:
                     f"{file}: has {count} frames; frames.csv has {self.num_frames} rows."
                 )
         for name in present if contents else ():
-            for indices in frame_chunks(self.num_frames, getattr(self, name)[:1].nbytes):
+            pixels, every = self.camera.height * self.camera.width, np.arange(self.num_frames)
+            for indices in frame_chunks(every, pixels, CHUNK_PIXELS):
                 self.read(name, indices)
 
 
@@ -348,9 +349,7 @@ def iterate_frames(
     rays = None
     if recording.depth_kind == "z":
         rays = ray_directions(camera).to(device=device, dtype=image_dtype)
-    step = max(1, chunk_pixels // (camera.height * camera.width))
-    for start in range(0, len(chosen), step):
-        chunk = chosen[start : start + step]
+    for chunk in frame_chunks(chosen, camera.height * camera.width, chunk_pixels):
         depth = recording.read("depth", chunk)
         assert depth is not None
         distance = torch.from_numpy(depth).to(device, image_dtype)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.arrays import IMAGE_ARRAYS, ArrayStream, read_frames
+from tofcorr.data.arrays import IMAGE_ARRAYS, ArrayStream, frame_chunks, read_frames
 from tofcorr.data.recording import (
     HEADER_FILE,
     DepthKind,
@@ -294,11 +294,11 @@ def write_corrected(
     Raises:
         CalibrationDataError: `path` exists, cannot be written, or `recording` is broken.
     """
-    camera = recording.camera
-    step = max(1, chunk_pixels // (camera.height * camera.width))
     num_returns = num_valid = 0
     with RecordingWriter.like(path, recording) as writer, torch.inference_mode():
-        for depth, amplitude, on_target, corrected, kept in _frames(corrector, recording, step):
+        for depth, amplitude, on_target, corrected, kept in _frames(
+            corrector, recording, chunk_pixels
+        ):
             for i, frame in enumerate(corrected):
                 strength = None if amplitude is None else amplitude[i]
                 writer.append(frame, amplitude=strength, mask=kept[i])
@@ -335,17 +335,17 @@ def write_point_clouds(corrector: Corrector, recording: Recording, path: Path | 
 
 
 def _frames(
-    corrector: Corrector, recording: Recording, at_once: int
+    corrector: Corrector, recording: Recording, most: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the frames of a recording in order, so many at once, and show how many have passed.
+    """Yield the frames of a recording in order, by so many pixels, and show how many have passed.
 
     Yields:
         Depth as recorded; amplitude as recorded, or None; where a pixel looks at the target;
         corrected depth; where the correction is valid on the target: each of shape (B, H, W).
     """
     with bar(recording.num_frames, "correcting") as advance:
-        for start in range(0, recording.num_frames, at_once):
-            chunk = np.arange(start, min(start + at_once, recording.num_frames))
+        pixels, every = recording.depth[0].size, np.arange(recording.num_frames)
+        for chunk in frame_chunks(every, pixels, most):
             depth = read_frames(recording.depth, chunk)
             amplitude, mask = (recording.read(name, chunk) for name in ("amplitude", "mask"))
             on_target = np.ones(depth.shape, dtype=bool) if mask is None else mask == 1

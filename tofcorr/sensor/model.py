@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import torch
+from kornia.filters import filter2d_separable
 from torch import Tensor, nn
-from torch.nn.functional import conv1d
 
 from tofcorr.correction.model import signal_error
 from tofcorr.error_terms.base import EVERYTHING, DescribedModule, Domain, Interval
@@ -174,12 +174,8 @@ class SensorNoise(nn.Module):
         height, width = like.shape[-2:]
         size = (like[..., 0, 0].numel(), height + 2 * reach, width + 2 * reach)
         drawn = torch.randn(size, generator=generator, dtype=like.dtype, device=like.device)
-        if reach:
-            for _ in range(2):  # Along the rows, then along the columns.
-                lines = drawn.flatten(0, 1)[:, None]
-                filtered = conv1d(lines, self.kernel.to(like.dtype)[None, None])
-                drawn = filtered.reshape(*drawn.shape[:2], -1).mT
-        return drawn.reshape(like.shape)
+        line = self.kernel.to(like.dtype)[None]
+        return filter2d_separable(drawn[:, None], line, line, padding="valid").reshape(like.shape)
 
 
 class SensorWarning(UserWarning):
