@@ -27,6 +27,7 @@ from tokenize import TokenError
 from typing import Any, BinaryIO
 
 import click
+from pydantic_core import to_json
 
 from tofcorr.errors import CalibrationDataError, ExportError, TofcorrError, is_control
 
@@ -70,10 +71,12 @@ def staged_file(path: Path | str, kind: type[TofcorrError] = ExportError) -> Ite
 def write_json(
     path: Path, values: Mapping[str, Any], kind: type[TofcorrError] = CalibrationDataError
 ) -> None:
-    """Write plain values as JSON, whole or not at all; an older file is replaced."""
+    """Write plain values as JSON, whole or not at all; an older file is replaced.
+
+    A number that could not be measured (NaN, infinity) is null.
+    """
     with staged_file(path, kind) as part:
-        text = json.dumps(dict(values), indent=1, allow_nan=False) + "\n"
-        part.write_text(text, encoding="utf-8")
+        part.write_bytes(to_json(dict(values), indent=1, inf_nan_mode="null") + b"\n")
 
 
 @contextmanager

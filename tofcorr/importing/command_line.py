@@ -4,6 +4,7 @@ Heavy packages are imported inside the functions, so that `--help` answers at on
 """
 
 from collections.abc import Callable, Mapping
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -48,13 +49,7 @@ class NumberList(click.ParamType):
 
 def _adding(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
     """Return a decorator that adds options to a command, in this order."""
-
-    def add(command: Command) -> Command:
-        for option in reversed(options):
-            command = option(command)
-        return command
-
-    return add
+    return lambda command: reduce(lambda made, add: add(made), reversed(options), command)
 
 
 def option(flag: str, text: str, *names: str, **more: Any) -> Callable[[Command], Command]:  # noqa: ANN401

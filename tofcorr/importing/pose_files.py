@@ -187,7 +187,14 @@ def _read_table(path: Path) -> PoseTrack:
     message are understood as well, such as `pose.position.x` and `header.stamp.sec`. Cells are
     separated by commas, or by semicolons or tabs, and then decimals may have commas.
     """
-    delimiter, columns, rows = _table(path)
+    text = read_text(path)
+    head = _header(text)
+    if head is None:
+        raise CalibrationDataError(f"{path}: expected a header row and poses, found none.")
+    delimiter, columns, line = head
+    lines = text[text.index(line) + len(line) :].splitlines()
+    cut = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+    rows = [row for row in cut if row and not row[0].startswith("#")]
     short = next((k for k, row in enumerate(rows, start=1) if len(row) < len(columns)), None)
     if short is not None:
         raise CalibrationDataError(f"{path}, row {short}: expected {len(columns)} cells.")
@@ -231,18 +238,6 @@ def _read_table(path: Path) -> PoseTrack:
         np.array(_TIME[time]) @ [numbers(one) for one in time] if time else None,
         cells[name[0]] if name else None,
     )
-
-
-def _table(path: Path) -> tuple[str, list[str], list[list[str]]]:
-    """Return what separates the cells of a table, its columns' plain names, and its rows."""
-    text = read_text(path)
-    head = _header(text)
-    if head is None:
-        raise CalibrationDataError(f"{path}: expected a header row and poses, found none.")
-    delimiter, columns, line = head
-    lines = text[text.index(line) + len(line) :].splitlines()
-    rows = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-    return delimiter, columns, [row for row in rows if row and not row[0].startswith("#")]
 
 
 def _plain_name(text: str) -> str:

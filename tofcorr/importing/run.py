@@ -5,8 +5,6 @@ returns a `PreparedImport`: what is known before frames are written, and the fra
 at a time. Writing and reporting are the same for all (`run_import`).
 """
 
-import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +15,7 @@ import numpy as np
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import staged_folder
+from tofcorr.files import staged_folder, write_json
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
 from tofcorr.progress import through
@@ -143,24 +141,10 @@ def run_import(
         for path in inner.iterdir():
             path.rename(folder / path.name)
         inner.rmdir()
-        (folder / FILE_NAME).write_text(report_text(report), encoding="utf-8")
+        write_json(folder / FILE_NAME, report)
     return report
-
-
-def report_text(report: Mapping[str, Any]) -> str:
-    """Return the text of `import.json`; a number that could not be measured is null."""
-    return json.dumps(_measured(report), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def camera_mapping(camera: CameraIntrinsics, source: str) -> dict[str, Any]:
     """Return what `import.json` says of the camera intrinsics."""
     return {"source": source, **camera.section()}
-
-
-def _measured(value: Any) -> Any:  # noqa: ANN401 - of plain values
-    """Return plain values with null for what is not a finite number, which JSON cannot hold."""
-    if isinstance(value, Mapping):
-        return {key: _measured(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_measured(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

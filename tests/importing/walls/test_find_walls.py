@@ -21,7 +21,6 @@ from importing.walls.rendered_room import (
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.walls.finding import FoundWalls
-from tofcorr.importing.walls.image_planes import WallOptions
 
 # How near a start is: the camera's error of 10 to 20 mm is not calibrated yet.
 NEAR_MM, NEAR_DEG = 20.0, 0.6
@@ -72,8 +71,6 @@ def test_walls_are_named_by_their_pixels_and_the_lowest_horizontal_one_is_the_fl
     assert planes_shown(room, found)[names.index("floor")] == 0
     pixels = (found.images * found.share)[np.array(names) != "floor"]
     assert pixels.tolist() == sorted(pixels, reverse=True)
-    plain = found_in(room, views, options=WallOptions(up="unknown"))
-    assert plain.names == ["wall 1", "wall 2", "wall 3", "wall 4"]
 
 
 def test_parallel_walls_are_kept_apart_by_their_places() -> None:

@@ -112,7 +112,7 @@ def walls_of_planes(
     if given is None:  # The walls in the order of their pixels.
         support = torch.bincount(joint.wall[on_wall], planes.support[on_wall], len(joint.walls))
         joint = joint.reordered(support.argsort(descending=True, stable=True))
-    called = _names(joint, options.up) if given is None else [str(name) for name in given]
+    called = _names(joint) if given is None else [str(name) for name in given]
     members = [joint.wall == k for k in range(len(called))]
     views = on_wall.nonzero()[:, 0].tolist()
     views.sort(key=lambda k: (int(planes.image[k]), int(joint.wall[k])))
@@ -133,14 +133,14 @@ def walls_of_planes(
     )
 
 
-def _names(joint: Joint, up: str) -> list[str]:
-    """Number the walls; the lowest horizontal one is the floor if z points up.
+def _names(joint: Joint) -> list[str]:
+    """Number the walls; the lowest horizontal one is the floor, as z points up.
 
     Its normal is within 5 degrees of z: robots stand more upright, and ramps are steeper.
     """
     level = joint.walls[:, 2] > math.cos(math.radians(5))
     floor = -1
-    if up == "z" and bool(level.any()):
+    if bool(level.any()):
         # A horizontal wall's height is -d.
         floor = int(torch.where(level, joint.walls[:, 3], -torch.inf).argmax())
     others = (f"wall {number}" for number in range(1, len(level) + 1))

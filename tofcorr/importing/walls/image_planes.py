@@ -7,7 +7,7 @@ is a linear one. The search looks at a thinned image; all pixels are assigned af
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -35,15 +35,12 @@ class WallOptions(Options):
         least_share: Smallest share of an image's pixels that makes a plane.
         most_planes: Largest number of planes taken from one image, the largest first.
         fewest_images: A wall that fewer images show is left out.
-        up: `z`: the world's z axis points up, so that the lowest horizontal wall is called `floor`;
-            `unknown`: every wall gets a number.
     """
 
     tolerance_mm: PositiveFloat = 30.0
     least_share: float = Field(default=0.05, gt=0.0, lt=1.0)
     most_planes: PositiveInt = 6
     fewest_images: int = Field(default=6, ge=3)
-    up: Literal["z", "unknown"] = "z"
 
 
 class ImagePlane(NamedTuple):
