@@ -268,31 +268,11 @@ class Group(Enum):
     SIGNAL = ("signal", "taps", "readout")
 
 
-class ImageEffect(nn.Module):
-    """One effect; its coefficients are a parameter.
-
-    Args:
-        effect: The effect with its coefficients.
-
-    Attributes:
-        group: The last group of stages at which it acts; that of whole frames by itself.
-    """
-
-    def __init__(self, effect: CatalogueEffect) -> None:
-        super().__init__()
-        self.effect = effect
-        stages = [(group, f"on_{stage}") for group in Group for stage in group.value]
-        acts = [group for group, hook in stages if hasattr(effect, hook)]
-        self.group = Group.FRAME if effect.of_frame else [Group.DELAY, *acts][-1]
-        self.coefficients = nn.Parameter(effect.coefficients.clone())
-
-    def shift(self, inputs: EffectInputs) -> Tensor:
-        """Return the change of the measured distance in the chosen pixels, (M,), metres."""
-        return self.effect.shift(inputs, self.coefficients.to(inputs.radial_distance.dtype))
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the entry of a simulator's YAML."""
-        return self.effect.with_coefficients(self.coefficients.detach().cpu()).to_mapping()
+def _group_of(effect: CatalogueEffect) -> Group:
+    """Return the last group of stages at which an effect acts; that of whole frames by itself."""
+    stages = [(group, f"on_{stage}") for group in Group for stage in group.value]
+    acts = [group for group, hook in stages if hasattr(effect, hook)]
+    return Group.FRAME if effect.of_frame else [Group.DELAY, *acts][-1]
 
 
 class ImageEffects(nn.Module):
@@ -323,7 +303,8 @@ class ImageEffects(nn.Module):
         self._camera, self._frequency = camera, modulation_frequency
         self.left_out: list[str] = []
         self._kept_as_given: list[Mapping[str, Any]] = []
-        self.effects = nn.ModuleList()
+        self._effects: list[CatalogueEffect] = []
+        self.coefficients = nn.ParameterList()
         for entry, effect in zip(entries, build_effects(entries), strict=True):
             reasons = [need.beyond_image for need in effect.needs if need.beyond_image]
             if modulation_frequency is None and FREQUENCY in effect.needs:
@@ -332,23 +313,31 @@ class ImageEffects(nn.Module):
                 self.left_out.append(f"{effect.name}: {reasons[0]}.")
                 self._kept_as_given.append(entry)
             else:
-                self.effects.append(ImageEffect(effect))
+                self._effects.append(effect)
+                self.coefficients.append(nn.Parameter(effect.coefficients.clone()))
 
     @property
     def needs_amplitude(self) -> bool:
         """Whether an effect reads the amplitude."""
-        return any(AMPLITUDE in each.effect.needs for each in self._all())
+        return any(AMPLITUDE in effect.needs for effect in self._effects)
 
-    def usable(self, known: Mapping[str, Tensor]) -> tuple[list[ImageEffect], list[str]]:
+    @property
+    def reads_light(self) -> bool:
+        """Whether an effect reads the light of clipped pixels."""
+        return any(effect.reads_light for effect in self._effects)
+
+    def usable(
+        self, known: Mapping[str, Tensor]
+    ) -> tuple[list[tuple[CatalogueEffect, Tensor]], list[str]]:
         """Return the effects whose conditions are known, and a sentence about each other one."""
         usable, missing = [], []
-        for each in self._all():
-            needed = [need.condition for need in each.effect.needs if need.condition]
+        for effect, coefficients in zip(self._effects, self.coefficients, strict=True):
+            needed = [need.condition for need in effect.needs if need.condition]
             columns = [condition(name).column for name in needed if name not in known]
             if columns:
-                missing.append(f"{each.effect.name}: {', '.join(columns)} was not given.")
+                missing.append(f"{effect.name}: {', '.join(columns)} was not given.")
             else:
-                usable.append(each)
+                usable.append((effect, coefficients))
         return usable, missing
 
     def frame_shift(self, known: Mapping[str, Tensor], count: int, like: Tensor) -> Tensor:
@@ -364,9 +353,9 @@ class ImageEffects(nn.Module):
         total = like.new_zeros(count, dtype=torch.float64)
         facts = _facts(known, count, total)
         with total.device:
-            for each in self.usable(known)[0]:
-                if isinstance(each.effect, FrameEffect):
-                    total = total + each.effect.shifts(facts, each.coefficients.to(total))
+            for effect, coefficients in self.usable(known)[0]:
+                if isinstance(effect, FrameEffect):
+                    total = total + effect.shifts(facts, coefficients.to(total))
         return total
 
     def shift(self, group: Group, frames: SceneFrames) -> Tensor:
@@ -379,22 +368,21 @@ class ImageEffects(nn.Module):
             frames: The frames, at the distance that the effects see.
         """
         usable, distance = self.usable(frames.conditions)[0], frames.distance
-        chosen = [each for each in usable if each.group == group]
+        chosen = [(effect, own) for effect, own in usable if _group_of(effect) == group]
         if not chosen:
             return distance.new_zeros(1, 1, 1)
         with distance.device:
             inputs = frames.inputs(self._camera, self._frequency)
-            first, *others = (each.shift(inputs) for each in chosen)
+            first, *others = (effect.shift(inputs, own.to(distance)) for effect, own in chosen)
         return sum(others, first).reshape(distance.shape).to(distance.dtype)
 
     def to_mappings(self) -> tuple[Mapping[str, Any], ...]:
         """Return the entries of a simulator's YAML, with the coefficients of now."""
-        return (*(each.to_mapping() for each in self._all()), *self._kept_as_given)
+        now = zip(self._effects, self.coefficients, strict=True)
+        found = (each.with_coefficients(own.detach().cpu()).to_mapping() for each, own in now)
+        return (*found, *self._kept_as_given)
 
     def description(self) -> list[Any]:
         """Return names and shapes of the effects, and the entries that no image can show."""
-        shapes = [[each.effect.name, each.effect.shape.to_mapping()] for each in self._all()]
+        shapes = [[effect.name, effect.shape.to_mapping()] for effect in self._effects]
         return [*shapes, *self._kept_as_given]
-
-    def _all(self) -> list[ImageEffect]:
-        return [each for each in self.effects if isinstance(each, ImageEffect)]

@@ -334,6 +334,7 @@ class CatalogueEffect(Effect, ABC):
         form_error: What a real effect of this kind may leave of itself, as a share of what these
             columns explain of it (root mean squares): no two lenses, rooms or robots are alike. At
             0.5 they explain four fifths of its squares, if it is as usual.
+        reads_light: Whether it reads the light that reached a clipped pixel, not the amplitude.
     """
 
     summary: ClassVar[str] = ""
@@ -348,6 +349,7 @@ class CatalogueEffect(Effect, ABC):
     of_frame: ClassVar[bool] = False
     prior: ClassVar[float] = 0.02
     form_error: ClassVar[float] = 0.8
+    reads_light: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
         self.shape: Any = shape

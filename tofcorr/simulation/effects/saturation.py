@@ -99,6 +99,7 @@ class SaturationEffect(CatalogueEffect):
     remedy = "a bright target at three integration times, one of them short"
     needs = (AMPLITUDE, FREQUENCY)
     shape_type: ClassVar[type[Options]] = SaturationShape
+    reads_light = True
     prior_soft = 0.3
 
     @classmethod
