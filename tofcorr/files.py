@@ -27,7 +27,6 @@ from tokenize import TokenError
 from typing import Any, BinaryIO
 
 import click
-from pydantic_core import to_json
 
 from tofcorr.errors import CalibrationDataError, ExportError, TofcorrError, is_control
 
@@ -75,8 +74,10 @@ def write_json(
 
     A number that could not be measured (NaN, infinity) is null.
     """
+    from pydantic import TypeAdapter  # Slow to import.
+
     with staged_file(path, kind) as part:
-        part.write_bytes(to_json(dict(values), indent=1, inf_nan_mode="null") + b"\n")
+        part.write_bytes(TypeAdapter(dict[str, Any]).dump_json(dict(values), indent=1) + b"\n")
 
 
 @contextmanager
