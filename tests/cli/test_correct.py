@@ -82,6 +82,19 @@ def test_depth_and_mask_are_corrected_and_all_else_stays(
     assert "raw.npy was left out" in told.err
 
 
+def test_what_was_corrected_is_not_corrected_again(
+    tmp_path: Path, program: Program, source: Path
+) -> None:
+    """39 mm off, then 0.4, then -40, without a word."""
+    model, once = save_corrector(tmp_path / "corrector.ts"), tmp_path / "once"
+    assert program(*CORRECT, model, "--recording", source, "--out", once).code == 0
+    told = program(*CORRECT, model, "--recording", once, "--out", tmp_path / "twice")
+    assert told.code == 2
+    assert "once: its depth was corrected already, by tofcorr" in told.err
+    assert not (tmp_path / "twice").exists()
+    assert "was corrected already" in program("inspect", once).out
+
+
 def test_point_clouds_may_be_written_instead_of_a_recording(
     tmp_path: Path, program: Program, source: Path
 ) -> None:

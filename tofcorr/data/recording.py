@@ -45,6 +45,7 @@ class Header(Options):
     tool_from_camera: RigidTransform | None = None
     planes: PlaneOrigin = "recorded"
     frames: FrameNames = FrameNames()
+    corrected_by: str | None = None
 
 
 def read_header(path: Path) -> Header:
@@ -101,6 +102,7 @@ class Recording:
         planes: `recorded`: the planes of `frames` were measured by other means; `estimated`: an
             importer found them in the depth, they are a start for the fit and never truth.
         frame_names: What the robot calls its coordinate frames.
+        corrected_by: What corrected the depth; None: it is as the camera measured it.
     """
 
     path: Path
@@ -117,6 +119,7 @@ class Recording:
     planes: PlaneOrigin
     frame_names: FrameNames
     true_depth: np.ndarray | None = None
+    corrected_by: str | None = None
 
     @classmethod
     def open(cls, path: Path | str, *, check_contents: bool = True) -> Self:
@@ -150,6 +153,7 @@ class Recording:
             **{name: _opened(image, path, *size) for name, image in IMAGE_ARRAYS.items()},
             planes=head.planes,
             frame_names=head.frames,
+            corrected_by=head.corrected_by,
         )
         recording._check_images(contents=check_contents)
         return recording

@@ -32,6 +32,7 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.geometry.se3 import refuse_unless_rigid
 from tofcorr.options import dump_yaml
 from tofcorr.progress import bar
+from tofcorr.version import __version__
 
 
 class RecordingWriter:
@@ -94,20 +95,33 @@ class RecordingWriter:
         self._folder = self._stack.enter_context(staged_folder(path))
 
     @classmethod
-    def with_header_of(cls, path: Path | str, recording: Recording) -> Self:
-        """Begin a recording with the header of another one; its frames are appended."""
+    def with_header_of(
+        cls, path: Path | str, recording: Recording, *, corrected_by: str | None = None
+    ) -> Self:
+        """Begin a recording with the header of another one; its frames are appended.
+
+        Args:
+            path: The folder to write.
+            recording: The other one.
+            corrected_by: What corrects the depth; None: as that of `recording`.
+        """
         names = ("camera", "depth_kind", "modulation_frequency", "saturation_amplitude")
         names += ("tool_from_camera", "planes", "frame_names")
-        return cls(path, **{name: getattr(recording, name) for name in names})
+        writer = cls(path, **{name: getattr(recording, name) for name in names})
+        changed = {"corrected_by": corrected_by or recording.corrected_by}
+        writer._header = writer._header.model_copy(update=changed)
+        return writer
 
     @classmethod
-    def like(cls, path: Path | str, recording: Recording) -> Self:
+    def like(
+        cls, path: Path | str, recording: Recording, *, corrected_by: str | None = None
+    ) -> Self:
         """Begin a recording with the header and the rows of another one; its images are appended.
 
         `frames.csv` is copied unchanged, with the columns of other tools. `append` then takes no
         row, and as many frames must be appended as `recording` has.
         """
-        writer = cls.with_header_of(path, recording)
+        writer = cls.with_header_of(path, recording, corrected_by=corrected_by)
         writer._rows_from = recording.path / TABLE_FILE
         return writer
 
@@ -213,7 +227,7 @@ class RecordingWriter:
         for stream in self._streams.values():
             stream.finish(self._num_frames)
         folder, header = self._folder, self._header.to_mapping()
-        for key in ("planes", "frames"):  # Only where they say more.
+        for key in ("planes", "frames", "corrected_by"):  # Only where they say more.
             if getattr(self._header, key) == Header.model_fields[key].default:
                 del header[key]
         text = dump_yaml(header, last="depth_kind")
@@ -292,10 +306,20 @@ def write_corrected(
         The share of the pixels on the target with a return that are in the calibrated range.
 
     Raises:
-        CalibrationDataError: `path` exists, cannot be written, or `recording` is broken.
+        CalibrationDataError: `path` exists, cannot be written, or `recording` is broken or was
+            corrected already.
     """
+    if recording.corrected_by is not None:
+        raise CalibrationDataError(
+            f"{recording.path}: its depth was corrected already, by {recording.corrected_by}; "
+            "correct the recording that it was made from."
+        )
     num_returns = num_valid = 0
-    with RecordingWriter.like(path, recording) as writer, torch.inference_mode():
+    by = f"tofcorr {__version__}"
+    with (
+        RecordingWriter.like(path, recording, corrected_by=by) as writer,
+        torch.inference_mode(),
+    ):
         for depth, amplitude, on_target, corrected, kept in _frames(
             corrector, recording, chunk_pixels
         ):

@@ -12,6 +12,7 @@ from tofcorr.plausibility.look import Look, PlaneUse
 
 OF_VALUES = (
     "checks.values:units",
+    "checks.values:corrected",
     "checks.values:depth_values",
     "checks.values:stillness",
     "checks.values:duplicates",

@@ -50,6 +50,13 @@ def units(look: Look) -> Iterator[Finding]:
         yield impossible(f"The poses extend over {extent:.4g} m: {said}.")
 
 
+def corrected(look: Look) -> Iterator[Finding]:
+    """Is the depth as the camera measured it?"""
+    for by in sorted({one.corrected_by or "" for one in look.data.recordings} - {""}):
+        said = f"The depth of a recording was corrected already, by {by}"
+        yield doubtful(f"{said}: what is fitted to it holds for corrected frames alone.")
+
+
 def depth_values(look: Look) -> Iterator[Finding]:
     """Does the depth hold measured values: neither constant, nor clipped, nor rounded, nor none?
 
