@@ -186,8 +186,8 @@ def test_other_cameras_and_depths_are_refused_in_a_sentence(
     cases = {
         "pixels look up to": rendered(name="lens", camera=other),
         "32 x 23 pixels": rendered(Frames(depth[:, 1:], bright[:, 1:]), name="a", camera=smaller),
-        "depth_kind radial": rendered(name="kind", depth_kind="z"),
-        "unit of depth": rendered(Frames(1e3 * depth, bright), name="unit"),
+        "write depth_kind: radial": rendered(name="kind", depth_kind="z"),
+        "depth or poses are in another unit": rendered(Frames(1e3 * depth, bright), name="unit"),
         "if one mistake is undone": flipped,
         "degrees from its tool_from_camera": mounted,
     }

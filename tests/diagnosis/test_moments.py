@@ -1,6 +1,7 @@
 """Sums over poses say what passes over the pixels would."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import pytest
 import torch
@@ -29,8 +30,8 @@ def _base_prior(study: Study) -> torch.Tensor:
 
 def _summed(study: Study, residual: torch.Tensor, columns: Mapping[str, torch.Tensor]) -> PoseSums:
     """Return the sums of a pass over the pixels."""
-    prior = _base_prior(study)
-    return pose_sums(study.observations, columns, study.pose, residual, study.fit, prior)
+    fit = replace(study.fit, residual=residual)
+    return pose_sums(study.observations, columns, study.pose, fit, _base_prior(study))
 
 
 def _per_pose(study: Study, residual: torch.Tensor) -> torch.Tensor:

@@ -68,8 +68,8 @@ def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
     found = []
     for sim in (frames, lambda _: depth):
         opened = open_simulator(sim, nothing_missing)
-        assert opened is not None
-        found.append(Observables(nothing_missing, opened.frames, seed=7))
+        assert isinstance(opened, Recording)
+        found.append(Observables(nothing_missing, opened, seed=7))
     compared, without_amplitude = found
     assert compared.noise is not None
     assert compared.noise["same_poses"]

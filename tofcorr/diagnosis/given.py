@@ -27,15 +27,15 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.rerun.simulator import twin_distance
 from tofcorr.diagnosis.sums.base import SimulatorError
 from tofcorr.diagnosis.sums.noise import PixelNoise, brightness_of, estimate_noise
-from tofcorr.diagnosis.sums.observations import TINY, Observations, observe, predicted_distance
+from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.plausibility.alignment import Alignment, judged
-from tofcorr.plausibility.checks.geometry import agreement
-from tofcorr.plausibility.finding import CAMERA, LARGEST_GAP
+from tofcorr.plausibility.alignment import judged
+from tofcorr.plausibility.checks.geometry import agreement, shape
+from tofcorr.plausibility.finding import CAMERA
 from tofcorr.plausibility.look import Look
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import default_hand_eye
@@ -210,17 +210,6 @@ def _places(recording: Recording) -> list[np.ndarray]:
     return [pose[:, :3, 3], offset[:, None], turn, normal]
 
 
-def repeats_of(recording: Recording) -> np.ndarray:
-    """Return a number for each frame without a pose_id; renders of one pose share it, (F,)."""
-    table = recording.frames
-    _, target = np.unique(table.target, return_inverse=True)
-    rows = [np.round(np.concatenate(_places(recording), axis=1) / _ROUNDING), target[:, None]]
-    if table.integration_time is not None:
-        rows.append(np.round(np.log(table.integration_time) / _ROUNDING)[:, None])
-    keys = np.nan_to_num(np.concatenate(rows, axis=1), nan=-1.0)
-    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
-
-
 def rendered_error(
     rendered: Recording, observations: Observations, options: DiagnosisOptions
 ) -> SimulatorError:
@@ -236,10 +225,7 @@ def rendered_error(
     """
     refuse_other_camera(observations.recording, rendered)
     frames = observe(rendered, options.most_pixels)
-    if rendered.frames.pose_id is None:
-        frames = replace(frames, unit=torch.from_numpy(repeats_of(rendered)))
     if rendered.true_depth is None:
-        refuse_without_truth(rendered, frames)
         refuse_mistaken_geometry(rendered)
     pose = torch.from_numpy(rendered.tool_from_camera)
     noise = estimate_noise(frames, pose)
@@ -317,46 +303,6 @@ def refuse_other_camera(real: Recording, simulated: Recording) -> None:
         )
 
 
-def refuse_without_truth(simulated: Recording, observations: Observations) -> None:
-    """Refuse frames that disagree with their own geometry beyond what any camera does.
-
-    Args:
-        simulated: The rendered frames.
-        observations: Their pixels.
-
-    Raises:
-        CalibrationDataError: Planes, hand-eye transform, axes, unit or kind of depth are wrong.
-    """
-    if simulated.planes == "estimated":
-        raise CalibrationDataError(
-            f"{simulated.path}: its planes are estimated from the depth (recording.yaml: planes); "
-            "a simulator knows its walls: write them to frames.csv."
-        )
-    pose = torch.from_numpy(simulated.tool_from_camera)
-    difference = observations.measured - predicted_distance(observations, pose)
-    off = float(difference.abs().nan_to_num(torch.inf).median())
-    other = "z" if simulated.depth_kind == "radial" else "radial"
-    cosine = ray_directions(simulated.camera).reshape(-1, 3)[observations.pixel, 2]
-    factor = 1 / cosine if other == "z" else cosine
-    # The slope of a line through the differences of pixels whose plane is known.
-    between = (observations.measured * (factor - 1))[difference.isfinite()]
-    between = between - between.mean()
-    slope = float(between @ difference[difference.isfinite()] / (between @ between).clamp(min=TINY))
-    # It is 0 if the kind of depth is right, and -1 if it is the other one.
-    if abs(slope + 1) < 0.5:
-        raise CalibrationDataError(
-            f"{simulated.path}: its depth differs from its own planes as depth_kind {other} "
-            f"does from {simulated.depth_kind}; render {simulated.depth_kind} depth, or correct "
-            "depth_kind in their own recording.yaml."
-        )
-    if not off <= LARGEST_GAP:  # Every mistaken axis or unit gives more.
-        raise CalibrationDataError(
-            f"{simulated.path}: its depth is {off:.2f} m off from its own planes; check "
-            "tool_from_camera and its axes (x right, y down, z forward), the planes in "
-            "frames.csv, and the unit of depth.npy (metres)."
-        )
-
-
 # Where `simulation.simulator` keeps its options in a recording.
 _OPTIONS_OF_SIMULATE = "truth/options.yaml"
 
@@ -368,17 +314,33 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
     simulator is exact besides.
 
     Raises:
-        CalibrationDataError: Images are mirrored, poses inverted, or the like, or tool_from_camera
-            is not that of the simulator.
+        CalibrationDataError: Images are mirrored, poses inverted, the unit or kind of depth is
+            wrong, or the like; planes are estimated, or tool_from_camera is not the simulator's.
     """
+    if simulated.planes == "estimated":
+        raise CalibrationDataError(
+            f"{simulated.path}: its planes are estimated from the depth (recording.yaml: planes); "
+            "a simulator knows its walls: write them to frames.csv."
+        )
     if simulated.moves:
         _refuse_guess(simulated)
     look = Look(Dataset((simulated,)))
-    found = [one.sentence for one in agreement(look) if one.severity == "impossible"]
-    if found:
-        raise CalibrationDataError(f"{simulated.path}: {' '.join(found)}")
-    if look.as_given is not None and simulated.moves:
-        _refuse_other_mounting(simulated, look, look.as_given)
+    odd = (one.sentence for one in (*shape(look), *agreement(look)) if one.severity == "impossible")
+    first = next(odd, None)
+    if first is not None:
+        raise CalibrationDataError(f"{simulated.path}: {first}")
+    best, stated = look.as_given, np.asarray(simulated.tool_from_camera)
+    if best is None or not simulated.moves:
+        return
+    # Directions that the frames do not determine leave no misfit.
+    misfit = judged(look.scene, stated, best.constant, best.slope).misfit
+    if misfit > max(CAMERA, 4 * best.misfit):
+        shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
+        raise CalibrationDataError(
+            f"{simulated.path}: its frames agree with its planes if the camera sits "
+            f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "
+            "tool_from_camera; write the one that they were rendered with."
+        )
 
 
 def _refuse_guess(simulated: Recording) -> None:
@@ -399,19 +361,3 @@ def _refuse_guess(simulated: Recording) -> None:
         "configuration of `tofcorr simulate` to --sim in place of this recording, or simulate with "
         "--set hand_eye.guess.translation_mm=0 --set hand_eye.guess.rotation_deg=0."
     )
-
-
-def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) -> None:
-    """Refuse a transform under which the frames disagree with their planes as no camera does.
-
-    Directions that the frames do not determine leave no misfit.
-    """
-    stated = np.asarray(simulated.tool_from_camera)
-    misfit = judged(look.scene, stated, best.constant, best.slope).misfit
-    if misfit > max(CAMERA, 4 * best.misfit):
-        shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
-        raise CalibrationDataError(
-            f"{simulated.path}: its frames agree with its planes if the camera sits "
-            f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "
-            "tool_from_camera; write the one that they were rendered with."
-        )

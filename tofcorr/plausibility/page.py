@@ -2,8 +2,10 @@
 
 import io
 import math
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
@@ -38,17 +40,35 @@ def write_page(found: Inspection, path: Path) -> None:
         CalibrationDataError: `path` does not end in .html, exists, or cannot be written.
     """
     refuse_page(path)
+    drawn = all_figures(found)
+    text = page_text("tofcorr.plausibility", "inspection.html.j2", drawn, {}, inspection=found)
+    with staged_file(path, CalibrationDataError) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def page_text(
+    folder: str,
+    name: str,
+    figures: Mapping[str, Figure],
+    filters: Mapping[str, Callable[..., Any]],
+    **values: Any,  # noqa: ANN401 - whatever the template reads
+) -> str:
+    """Return a page, made by the template of this name in a package.
+
+    Args:
+        folder: The package.
+        name: File name of the template.
+        figures: Its figures, which it reads as `figures`.
+        filters: What it calls.
+        values: What else it reads; the program's `version` is given.
+    """
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    template = files("tofcorr.plausibility").joinpath("inspection.html.j2")
-    text = environment.from_string(template.read_text(encoding="utf-8")).render(
-        inspection=found,
-        figures={name: Markup(svg_of(figure)) for name, figure in all_figures(found).items()},
-        version=__version__,
-    )
-    with staged_file(path, CalibrationDataError) as part:
-        part.write_text(text, encoding="utf-8")
+    environment.filters |= filters
+    drawn = {key: Markup(svg_of(figure)) for key, figure in figures.items()}
+    template = environment.from_string(files(folder).joinpath(name).read_text(encoding="utf-8"))
+    return template.render(values, figures=drawn, version=__version__)
 
 
 def refuse_page(path: Path) -> None:

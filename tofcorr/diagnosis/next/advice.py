@@ -27,6 +27,7 @@ from tofcorr.diagnosis.sums.study import (
     signal,
 )
 from tofcorr.geometry import se3
+from tofcorr.pixels.sample import thinned
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.base import is_clock
 from tofcorr.simulation.hooks import FrameFacts
@@ -52,7 +53,7 @@ def make_candidates(study: Study, names: Collection[str]) -> Candidates | None:
         tool, nor a clock, nor other conditions.
     """
     facts, frames = study.observations.facts, study.observations.frame.unique()
-    sources = frames[torch.linspace(0, len(frames) - 1, min(12, len(frames))).round().long()]
+    sources = torch.from_numpy(thinned(frames.numpy(), 12))
     known = {name: own[sources] for name, own in vars(facts).items() if own is not None}
     changes = [*_other_conditions(study, known), *_other_poses(study, sources)]
     if not changes:
@@ -102,14 +103,15 @@ def _other_poses(study: Study, sources: Tensor, *, tilt: float = 0.35) -> list[C
     pose, seen = study.fit.tool_from_camera, study.observations.frame
     total = torch.bincount(seen, study.inputs.radial_distance)[sources]
     distance = total / torch.bincount(seen).clamp(min=1)[sources]
+    nearer = 0.3  # Chosen.
     changes = []
     for words, factor, place, angle in (
         ("tilted up or down by +20 degrees", 1.0, 3, tilt),
         ("tilted up or down by -20 degrees", 1.0, 3, -tilt),
         ("tilted to the side by +20 degrees", 1.0, 4, tilt),
         ("tilted to the side by -20 degrees", 1.0, 4, -tilt),
-        ("from 30 % nearer", 0.7, 3, 0.0),
-        ("from 30 % farther", 1.3, 3, 0.0),
+        ("from 30 % nearer", 1 - nearer, 3, 0.0),
+        ("from 30 % farther", 1 + nearer, 3, 0.0),
     ):
         forth, turn, back = torch.zeros(3, len(sources), 6, dtype=torch.float64)
         forth[:, 2], turn[:, place], back[:, 2] = distance, angle, -factor * distance
@@ -183,13 +185,12 @@ def _sums(
     # The few pixels get the weight of all pixels that a frame of the recording has.
     full = len(study.observations.measured) / study.observations.num_frames
     stand_for = full / max(len(made.measured) / made.num_frames, 1.0)
-    zero = torch.zeros_like(sigma)
-    fit = replace(study.fit, residual=zero, sigma=sigma, trust=seen.double() * stand_for)
+    trust, zero = seen.double() * stand_for, torch.zeros_like(sigma)
+    fit = replace(study.fit, residual=zero, sigma=sigma, trust=trust)
     sums = pose_sums(
         made,
         {name: torch.where(seen[:, None], own, 0.0) for name, own in columns.items()},
         torch.where(seen[:, None], pose_columns(inputs).nan_to_num(0.0), 0.0),
-        zero,
         fit,
         layout.prior[: layout.base, : layout.base],
     )

@@ -68,18 +68,10 @@ def stage_bars(result: "DiagnosisResult") -> Figure:
     figure, axes = _bars(
         bars, 1e3, "gap, mm (root mean square, noise taken off)", lambda size: f"{mm(size)} mm"
     )
-    floor, end = 1e3 * result.gap.floor, axes.get_xlim()[1]
-    if floor < end:  # Beyond, its label would be cut; a card tells it.
-        axes.axvline(floor, color="black", linestyle=":", linewidth=1, zorder=0)
-        axes.annotate(
-            "noise of one pixel",
-            (floor, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(3, 1),
-            textcoords="offset points",
-            fontsize=8,
-            ha="left" if floor < end / 2 else "right",
-        )
+    floor = 1e3 * result.gap.floor
+    if floor < axes.get_xlim()[1]:  # A card tells a larger one.
+        axes.axvline(floor, color="black", linestyle=":", linewidth=1, label="noise of one pixel")
+        figure.legend(fontsize=8, frameon=False, loc="outside upper right")
     return figure
 
 
@@ -174,10 +166,8 @@ def image_maps(result: "DiagnosisResult") -> Figure:
         axes.set_axis_off()
         rows, columns = np.nonzero(stage.tile_p_values <= LEVEL)
         axes.plot(columns, rows, "k.", markersize=3)
-        bar = figure.colorbar(shown, ax=axes, orientation="horizontal")
-        bar.ax.tick_params(labelsize=8)
+        bar = figure.colorbar(shown, ax=axes, orientation="horizontal", label="mean residual, mm")
         bar.ax.locator_params(nbins=5)
-        bar.set_label("mean residual, mm", fontsize=8)
     return figure
 
 
@@ -232,9 +222,7 @@ def absorption_map(result: "DiagnosisResult") -> Figure:
     axes.tick_params(labelsize=7)
     axes.set_ylabel("share of this effect ...")
     axes.set_xlabel("... that calibration, or else this effect, absorbs")
-    bar = figure.colorbar(shown, ax=axes)
-    bar.set_label("share absorbed", fontsize=9)
-    bar.ax.tick_params(labelsize=8)
+    figure.colorbar(shown, ax=axes, label="share absorbed")
     return figure
 
 

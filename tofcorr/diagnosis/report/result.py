@@ -46,7 +46,6 @@ from tofcorr.progress import event_writer
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 from tofcorr.simulation.effects.registry import CATALOGUE
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -127,7 +126,100 @@ class DiagnosisResult:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of `diagnosis.json`: plain values, lengths in millimetres."""
-        return content_of(self)
+        gap, remainder, named = self.gap, self.remainder, self.evidence.named
+        outliers, transfer, closure = self.outliers, self.transfer, self.closure
+        degraded = self.degraded
+        untested = {"closes_mm": None, "closed_fraction": None, "probability": None, "aliases": []}
+        lengths = "before", "after", "floor", "between_images", "fixed_pattern", "within_images"
+        lists = "effects", "causes", "remarks", "warnings"
+        trainings = "trained_on_sim", "trained_on_sim_with_effects", "trained_on_real"
+        return {
+            "format": "tofcorr-diagnosis",
+            "version": 3,
+            "simulator": self.simulator_kind,
+            "stages": [
+                {
+                    "name": stage.name,
+                    "gap_mm": _mm(stage.gap),
+                    "ci": None if stage.gap is None else _mm(stage.gap.interval),
+                    "where": _regions(stage, 5),  # What fits beside a picture.
+                }
+                for stage in self.stages
+            ],
+            "attribution": [
+                {"cause": one.cause, "kind": one.kind, "share": round(one.share, 4)}
+                | {"ci": _rounded(one.share.interval)}
+                | ({} if one.of_constant is None else {"of_constant": round(one.of_constant, 4)})
+                | {"aliases": alike(self.evidence.study, one.cause)}
+                for one in self.shares
+            ],
+            "gap_mm": {
+                **{name: _mm(getattr(gap, name)) for name in lengths},
+                **{f"{name}_ci": _mm(getattr(gap, name).interval) for name in ("before", "after")},
+                "closed_fraction": round(gap.closed, 4),
+                "closed_ci": _rounded(gap.closed.interval),
+                "floor_is_upper_bound": not gap.floor_from_repeats,
+            },
+            "parameter_gap_mm": {"as_given": _mm(gap.as_given), "refitted": _mm(gap.before)},
+            "detected": self.detected,
+            "probability": round(self.probability, 4),
+            "cause_sets": [list(members) for members in self.cause_sets],
+            "set_probabilities": [round(named.probability_of_any(*s), 4) for s in self.cause_sets],
+            # Of each member to be the one there, given the other effects.
+            "cause_sets_shares": [
+                {name: round(share, 4) for name, share in own.items()}
+                for own in named.sets.values()
+            ],
+            "unknown": remainder.unknown,
+            "unknown_probability": round(named.unknown, 4),
+            "outliers": {
+                "deleted_share": round(outliers.deleted, 6),
+                "reduced_share": round(outliers.reduced, 6),
+                "rms_mm": _mm(outliers.size),
+                "map": [_rounded(row) for row in outliers.tiles.tolist()],
+                "where": outliers.place,
+            },
+            "ranking": [_ranked(self.evidence.study, named, name) for name in named.ranking]
+            + [
+                {"effect": name, **untested, "available": False, "missing": missing}
+                for name, missing in self.evidence.study.candidates.missing.items()
+            ],
+            "where": _regions(self.stages[1], 60),  # More than anyone reads.
+            "transfer_mm": transfer
+            and {
+                **{name: _mm(getattr(transfer, name)) for name in trainings},
+                "ci": {name: _mm(getattr(transfer, name).interval) for name in trainings},
+                "gain_ci": _mm(transfer.gain.interval),
+            },
+            "fitted": [
+                {name: getattr(one, name) for name in ("cause", "kind", "name", "unit")}
+                | {
+                    "value": _finite(one.value),
+                    "ci": one.interval and [*map(_finite, one.interval)],
+                }
+                for one in self.fitted
+            ],
+            "closure_mm": closure
+            and {name: _mm(getattr(closure, name)) for name in ("without_effects", "with_effects")}
+            | {"frames": closure.frames},
+            "degraded": degraded
+            and {
+                "gap_mm": _mm(degraded.gap),
+                "ci": _mm(degraded.gap.interval),
+                "poses": degraded.poses,
+                "left_out": list(degraded.left_out),
+            },
+            **self.observables.to_dict(),
+            "hand_eye_shift_mm": _mm(gap.hand_eye_shift[0]),
+            "hand_eye_shift_deg": round(math.degrees(gap.hand_eye_shift[1]), 5),
+            "minimum_detectable_mm": {name: _mm(size) for name, size in self.detectable.items()},
+            "next_recording": list(self.advice),
+            "verdict": self.verdict,
+            **{name: list(getattr(self, name)) for name in lists},
+            "unknown_score": round(remainder.score, 4),
+            "remaining_share": round(remainder.remaining_share, 4),
+            "fingerprint": list(remainder.fingerprint),
+        }
 
     @property
     def where(self) -> Stage:
@@ -164,100 +256,6 @@ class DiagnosisResult:
     """Draw the share of each effect that calibration and other effects absorb."""
     plot_poses = partialmethod(_draw, "poses")
     """Draw the held-out error of each pose before and after the effects."""
-
-
-def content_of(result: DiagnosisResult) -> dict[str, Any]:
-    """Return the content of `diagnosis.json`."""
-    gap, remainder, named = result.gap, result.remainder, result.evidence.named
-    outliers, transfer, closure = result.outliers, result.transfer, result.closure
-    degraded = result.degraded
-    untested = {"closes_mm": None, "closed_fraction": None, "probability": None, "aliases": []}
-    lengths = "before", "after", "floor", "between_images", "fixed_pattern", "within_images"
-    lists = "effects", "causes", "remarks", "warnings"
-    trainings = "trained_on_sim", "trained_on_sim_with_effects", "trained_on_real"
-    return {
-        "format": "tofcorr-diagnosis",
-        "version": 3,
-        "simulator": result.simulator_kind,
-        "stages": [
-            {
-                "name": stage.name,
-                "gap_mm": _mm(stage.gap),
-                "ci": None if stage.gap is None else _mm(stage.gap.interval),
-                "where": _regions(stage, 5),  # What fits beside a picture.
-            }
-            for stage in result.stages
-        ],
-        "attribution": [
-            {"cause": one.cause, "kind": one.kind, "share": round(one.share, 4)}
-            | {"ci": _rounded(one.share.interval)}
-            | ({} if one.of_constant is None else {"of_constant": round(one.of_constant, 4)})
-            | {"aliases": alike(result.evidence.study, one.cause)}
-            for one in result.shares
-        ],
-        "gap_mm": {
-            **{name: _mm(getattr(gap, name)) for name in lengths},
-            **{f"{name}_ci": _mm(getattr(gap, name).interval) for name in ("before", "after")},
-            "closed_fraction": round(gap.closed, 4),
-            "closed_ci": _rounded(gap.closed.interval),
-            "floor_is_upper_bound": not gap.floor_from_repeats,
-        },
-        "parameter_gap_mm": {"as_given": _mm(gap.as_given), "refitted": _mm(gap.before)},
-        "detected": result.detected,
-        "probability": round(result.probability, 4),
-        "cause_sets": [list(members) for members in result.cause_sets],
-        "set_probabilities": [round(named.probability_of_any(*s), 4) for s in result.cause_sets],
-        # Of each member to be the one there, given the other effects.
-        "cause_sets_shares": [
-            {name: round(share, 4) for name, share in own.items()} for own in named.sets.values()
-        ],
-        "unknown": remainder.unknown,
-        "unknown_probability": round(named.unknown, 4),
-        "outliers": {
-            "deleted_share": round(outliers.deleted, 6),
-            "reduced_share": round(outliers.reduced, 6),
-            "rms_mm": _mm(outliers.size),
-            "map": [_rounded(row) for row in outliers.tiles.tolist()],
-            "where": outliers.place,
-        },
-        "ranking": [_ranked(result.evidence.study, named, name) for name in named.ranking]
-        + [
-            {"effect": name, **untested, "available": False, "missing": missing}
-            for name, missing in result.evidence.study.candidates.missing.items()
-        ],
-        "where": _regions(result.stages[1], 60),  # More than anyone reads.
-        "transfer_mm": transfer
-        and {
-            **{name: _mm(getattr(transfer, name)) for name in trainings},
-            "ci": {name: _mm(getattr(transfer, name).interval) for name in trainings},
-            "gain_ci": _mm(transfer.gain.interval),
-        },
-        "fitted": [
-            {name: getattr(one, name) for name in ("cause", "kind", "name", "unit")}
-            | {"value": _finite(one.value), "ci": one.interval and [*map(_finite, one.interval)]}
-            for one in result.fitted
-        ],
-        "closure_mm": closure
-        and {name: _mm(getattr(closure, name)) for name in ("without_effects", "with_effects")}
-        | {"frames": closure.frames},
-        "degraded": degraded
-        and {
-            "gap_mm": _mm(degraded.gap),
-            "ci": _mm(degraded.gap.interval),
-            "poses": degraded.poses,
-            "left_out": list(degraded.left_out),
-        },
-        **result.observables.to_dict(),
-        "hand_eye_shift_mm": _mm(gap.hand_eye_shift[0]),
-        "hand_eye_shift_deg": round(math.degrees(gap.hand_eye_shift[1]), 5),
-        "minimum_detectable_mm": {name: _mm(size) for name, size in result.detectable.items()},
-        "next_recording": list(result.advice),
-        "verdict": result.verdict,
-        **{name: list(getattr(result, name)) for name in lists},
-        "unknown_score": round(remainder.score, 4),
-        "remaining_share": round(remainder.remaining_share, 4),
-        "fingerprint": list(remainder.fingerprint),
-    }
 
 
 def _ranked(study: Study, named: NamedEffects, name: str) -> dict[str, Any]:
@@ -338,16 +336,12 @@ def write_report(result: DiagnosisResult, folder: Path) -> None:
 
 def render(result: DiagnosisResult) -> str:
     """Return the page: one HTML file that needs nothing else."""
-    from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
-    from tofcorr.plausibility.page import svg_of
+    from tofcorr.plausibility.page import page_text
 
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
     study, named = result.evidence.study, result.evidence.named
-    environment.filters |= {
+    filters = {
         "mm": _mm_shown,
         "metres": mm,
         "known": known,
@@ -364,11 +358,12 @@ def render(result: DiagnosisResult) -> str:
         "p_of_draws": lambda p: p_words(p, LEAST_P),
         "with_digits": _with_digits,
     }
-    folder = files("tofcorr.diagnosis.report")
-    template, style = (
-        folder.joinpath(f"report.{n}").read_text("utf-8") for n in ("html.j2", "css")
-    )
-    return environment.from_string(template).render(
+    style = files("tofcorr.diagnosis.report").joinpath("report.css").read_text("utf-8")
+    return page_text(
+        "tofcorr.diagnosis.report",
+        "report.html.j2",
+        result.all_figures(),
+        filters,
         style=Markup(style),
         **result.to_mapping(),
         result=result,
@@ -380,9 +375,9 @@ def render(result: DiagnosisResult) -> str:
         pose_errors=pose_errors(result),
         closed={name: named.closed_gap(name)[1] for name in named.ranking},
         catalogue=CATALOGUE,
-        pictures={name: Markup(svg_of(own)) for name, own in result.all_figures().items()},
         stage_words=STAGE_WORDS,
-        versions=f"tofcorr {__version__}, torch {torch.__version__}, NumPy {np.__version__}",
+        torch_version=torch.__version__,
+        numpy_version=np.__version__,
         hand_eye_free=study.fit.model.hand_eye_free,
         saturated_missing=result.observables.real_dropouts.saturated_missing,
     )

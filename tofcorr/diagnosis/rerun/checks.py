@@ -1,6 +1,5 @@
 """The findings put to the test: simulator run again, corrections trained on it, poses held out."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 from warnings import catch_warnings, simplefilter
@@ -24,6 +23,7 @@ from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.pixels.dataset import Dataset, HandEyeOptions, covered_domain
+from tofcorr.pixels.sample import thinned
 from tofcorr.sensor.degrade import conditions_of_frames
 from tofcorr.sensor.model import SensorModel, SensorWarning
 from tofcorr.simulation.effects.saturation import light_of
@@ -80,29 +80,28 @@ def noisy_frames(recording: Recording, simulator: SimulatorOptions, seed: int) -
         reflectivity="pattern" if named or recording.amplitude is None else "from_recording",
         indices=frames,
     )
-    depth, amplitude = zip(
-        *((one.measured_distance, one.measured_amplitude.nan_to_num(0.0)) for one in states),
-        strict=True,
-    )
+    pairs = ((one.measured_distance, one.measured_amplitude.nan_to_num(0.0)) for one in states)
+    depth, amplitude = zip(*pairs, strict=True)
     return _in_memory(
         recording,
         torch.stack(depth),
-        {
-            "saturation_amplitude": None,
-            "frames": recording.frames.select(np.array(frames)),
-            "amplitude": torch.stack(amplitude).float().numpy(),
-            "mask": recording.read("mask", np.array(frames)),
-        },
+        saturation_amplitude=None,
+        frames=recording.frames.select(np.array(frames)),
+        amplitude=torch.stack(amplitude).float().numpy(),
+        mask=recording.read("mask", np.array(frames)),
     )
 
 
-def _in_memory(recording: Recording, distance: Tensor, changes: Mapping[str, Any]) -> Recording:
+def _in_memory(
+    recording: Recording,
+    distance: Tensor,
+    **changes: Any,  # noqa: ANN401 - of any field
+) -> Recording:
     """Return a recording of other radial distances, shape (F, H, W), metres, and changed fields."""
     if recording.depth_kind == "z":
         distance = z_depth_from_radial_distance(distance, ray_directions(recording.camera))
-    depth = distance.float().numpy()
-    whole = {"raw": None, "true_depth": None, "planes": "recorded", "depth": depth}
-    return replace(recording, **whole, **changes)
+    changes |= {"raw": None, "true_depth": None, "planes": "recorded"}
+    return replace(recording, depth=distance.float().numpy(), **changes)
 
 
 def recording_of(
@@ -118,15 +117,14 @@ def recording_of(
     recording = observations.recording
     images = torch.full(observations.distance_images.shape, torch.nan, dtype=torch.float64)
     images.flatten(1)[observations.frame, observations.pixel] = distance
-    amplitude, facts = observations.amplitude_images, observations.facts
-    planes = {"normal_world": facts.normal_world.numpy(), "offset": facts.offset.numpy()}
-    changes = {
-        "tool_from_camera": tool_from_camera.numpy(),
-        "frames": replace(recording.frames, **planes),
-        "amplitude": None if amplitude is None else amplitude.clamp(min=0.0).numpy(),
-        "mask": None,
-    }
-    return _in_memory(recording, images, changes)
+    amplitude = observations.amplitude_images
+    return _in_memory(
+        recording,
+        images,
+        tool_from_camera=tool_from_camera.numpy(),
+        amplitude=None if amplitude is None else amplitude.clamp(min=0.0).numpy(),
+        mask=None,
+    )
 
 
 # Parts of the poses that are held out in turn, whole folds each. Chosen: every part costs a new
@@ -293,23 +291,18 @@ def _expected_images(
         frames: Numbers of the F frames, int64.
         light: Light that returns in all frames, shape (N, H, W), counts; None: unknown.
     """
-    recording = found.observations.recording
-    shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
-    slant = ray_directions(recording.camera)[..., 2]
-    scale = slant if model.sensor.depth_kind == "z" else torch.ones_like(slant)
+    known = conditions_of_frames(found.observations.recording)
+    shift = model.frame_shift(found.observations.num_frames, **known)
     distance = distance_images(found.observations, found.tool_from_camera, frames)
-    measured = torch.empty_like(distance)
     with torch.inference_mode():
-        for place, number in enumerate(frames.tolist()):
-            seen = model(
-                distance[place] * scale,
-                None if light is None else light[number].double(),
-                noise=False,
-                frame_shift=shift[number],
-                **conditions_of_frames(recording, number),
-            )
-            measured[place] = seen.depth / scale
-    return measured
+        seen = model(
+            distance / model.eye.radial_of_depth,
+            None if light is None else light[frames].double(),
+            noise=False,
+            frame_shift=shift[frames],
+            **{name: torch.as_tensor(values)[frames] for name, values in known.items()},
+        )
+    return seen.depth * model.eye.radial_of_depth
 
 
 def _light_images(model: SensorModel, study: Study) -> Tensor | None:
@@ -358,9 +351,8 @@ def degraded_stage(found: Evidence, floor: float, resamples: Tensor) -> Degraded
     frames = max(MOST_PIXELS // observations.distance_images[0].numel(), 1)
     units = observations.num_units
     count = int(np.clip(units * frames / observations.num_frames, 1, units))
-    chosen = torch.linspace(0, units - 1, count).round().long()
     among = torch.zeros(units, dtype=torch.bool)
-    among[chosen] = True
+    among[thinned(np.arange(units), count)] = True
     expected = torch.full_like(observations.measured, torch.nan)
     left_out: tuple[str, ...] = ()
     for held in filter(torch.any, ((members > 0) & among for members in study.folds)):
@@ -377,4 +369,4 @@ def degraded_stage(found: Evidence, floor: float, resamples: Tensor) -> Degraded
         expected[pixels] = images[place, observations.pixel[pixels]]
     left = observations.measured - expected
     gaps = excess_gaps(observations, left, study.fit.share, floor, resamples)
-    return DegradedStage(gap=Estimated.of(gaps), poses=len(chosen), left_out=left_out)
+    return DegradedStage(gap=Estimated.of(gaps), poses=int(among.sum()), left_out=left_out)

@@ -28,6 +28,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions, unambiguous_range
 from tofcorr.geometry.se3 import RigidTransform
 from tofcorr.observables.compare import Observables
+from tofcorr.pixels.sample import thinned
 from tofcorr.sensor.model import section_of
 from tofcorr.sensor.sensor_file import (
     ErrorSection,
@@ -143,12 +144,7 @@ class Evidence:
 
     @cached_property
     def tables(self) -> tuple[MeasuredErrorOptions, list[Numbered]]:
-        """The error model as tables, added to those of a given simulator; terms without a table.
-
-        The simulator has one table of the distance, one of the image, and one of the amplitude or
-        the normalised amplitude. Terms of conditions, of distance and amplitude together, or of a
-        second amplitude variable fit into none.
-        """
+        """The error model as tables, added to those of a given simulator; terms without a table."""
         return _tables(self)
 
     @cached_property
@@ -200,7 +196,12 @@ def fitted_to(study: Study, units: Tensor, names: Sequence[str]) -> Study:
 
 
 def _tables(found: Evidence) -> tuple[MeasuredErrorOptions, list[Numbered]]:
-    """Return `Evidence.tables`."""
+    """Return `Evidence.tables`.
+
+    The simulator has one table of the distance, one of the image, and one of the amplitude or the
+    normalised amplitude. Terms of conditions, of distance and amplitude together, or of a second
+    amplitude variable fit into none.
+    """
     observations, model, given = found.study.observations, found.study.fit.model, found.given
     already = MeasuredErrorOptions() if given is None else given.sensor.delays.measured
     terms: list[Any] = model.terms
@@ -323,7 +324,7 @@ def simulated_frames(recording: Recording) -> list[int]:
     """Return the frames to simulate: all, or as many as do not take long."""
     frames, camera = recording.num_frames, recording.camera
     most = max(MOST_PIXELS // (camera.height * camera.width), 1)
-    return torch.linspace(0, frames - 1, min(frames, most)).round().long().unique().tolist()
+    return thinned(np.arange(frames), most).tolist()
 
 
 def twin_distance(

@@ -82,7 +82,6 @@ def unknown_amplitude_columns(
     exposure = inputs.facts.integration_time
     if exposure is not None and bool((exposure > 0).all()):
         bright = bright * inputs.of_frame(exposure / exposure.mean())
-    bright = bright / bright.square().mean().sqrt()
     forms = torch.stack([bright, bright**2, bright * (inputs.rows**2 + inputs.columns**2)], dim=1)
     forms = amplitude_error * forms / forms.square().mean(0).sqrt()
     # Four targets at most get columns of their own; all frames of rarer ones share the last.

@@ -327,7 +327,6 @@ def pose_sums(
     observations: Observations,
     columns: Mapping[str, Tensor],
     pose: Tensor,
-    residual: Tensor,
     fit: BaseFit,
     prior: Tensor,
 ) -> PoseSums:
@@ -337,8 +336,7 @@ def pose_sums(
         observations: The pixels.
         columns: Of base model and effects by name, as in `Study`, shape (M, K) each.
         pose: Columns of `pose_columns`, shape (M, 3).
-        residual: Of the base fit, shape (M,), metres.
-        fit: Its noise and robust weights.
+        fit: Residual, noise and robust weights.
         prior: Prior precision of the base model, shape (K, K).
     """
     ends = list(accumulate((own.shape[1] for own in columns.values()), initial=0))
@@ -346,7 +344,7 @@ def pose_sums(
     del spans[BASE]
     ones = torch.eye(ends[-1] - len(prior), dtype=torch.float64)
     layout = Layout(base=len(prior), effects=spans, prior=torch.block_diag(prior, ones))
-    parts = [*columns.values(), pose, residual[:, None]]
+    parts = [*columns.values(), pose, fit.residual[:, None]]
     unit = observations.unit[observations.frame]
     sizes = torch.bincount(unit, minlength=observations.num_units)  # A pose may have no pixel.
     pixels = unit.argsort(stable=True).split(sizes.tolist())

@@ -23,6 +23,7 @@ from tofcorr.diagnosis.sums.observations import (
     small_tiles,
 )
 from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
+from tofcorr.pixels.sample import thinned
 
 MOST_PIXELS = 8_000_000
 """Pixels of whole images that are looked at, or simulated: of larger recordings some frames alone.
@@ -249,10 +250,7 @@ def _frames(observations: Observations) -> np.ndarray:
     most = max(MOST_PIXELS // observations.on_target[0].numel(), 20)
     unit = observations.unit.numpy()[seen]
     poses = np.unique(unit)
-    some = max(len(poses) * most // len(seen), 1)
-    if len(seen) > most:
-        poses = poses[np.linspace(0, len(poses) - 1, some).round().astype(int)]
-    return seen[np.isin(unit, poses)]
+    return seen[np.isin(unit, thinned(poses, max(len(poses) * most // len(seen), 1)))]
 
 
 def _image(
@@ -328,6 +326,6 @@ def whole_images(observations: Observations) -> Observations:
     counts = usable.sum(1)
     seen = counts.nonzero()[:, 0]
     most = max(int(400_000 / counts[seen].double().mean()), 8)
-    frames = seen[torch.linspace(0, len(seen) - 1, min(most, len(seen))).round().long()]
+    frames = torch.from_numpy(thinned(seen.numpy(), most))
     number, pixel = usable[frames].nonzero(as_tuple=True)
     return observations.choosing(frames[number], pixel)

@@ -44,27 +44,25 @@ class Probe:
     """One pattern.
 
     Attributes:
-        name: For programs.
         trace: What it looks like: a clause that follows "It".
         scaled_columns: Computes its columns, (M, K), metres at one prior standard deviation.
     """
 
-    name: str
     trace: str
     scaled_columns: Callable[[EffectInputs], Tensor]
 
 
 def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
     """Return the probes that a recording allows."""
-    found = [
-        Probe("frame_period", "repeats every few frames", _frame_period),
-        Probe("image_shape", "has one shape in every image, finer than the pixel effect", _map),
-        Probe("any_smooth", "varies smoothly with distance, angle, place and amplitude", _smooth),
-        Probe("any_time", "changes slowly with time", _slow),
-    ]
+    found = {
+        "frame_period": Probe("repeats every few frames", _frame_period),
+        "image_shape": Probe("has one shape in every image, finer than the pixel effect", _map),
+        "any_smooth": Probe("varies smoothly with distance, angle, place and amplitude", _smooth),
+        "any_time": Probe("changes slowly with time", _slow),
+    }
     if len(inputs.facts.timestamp) > 2:
-        found.append(Probe("previous_frame", "depends on the previous frame", _previous_frame))
-    return {probe.name: probe for probe in found}
+        found["previous_frame"] = Probe("depends on the previous frame", _previous_frame)
+    return found
 
 
 def _frame_period(inputs: EffectInputs) -> Tensor:
@@ -286,7 +284,7 @@ def build_study(
     base, prior = base_columns(observations, fit, inputs)
     columns = {BASE: base, **dict(zip(sources, found, strict=True))}
     pose = pose_columns(inputs)
-    sums = pose_sums(observations, columns, pose, fit.residual, fit, prior)
+    sums = pose_sums(observations, columns, pose, fit, prior)
     return Study(
         options=options,
         observations=observations,
@@ -501,10 +499,6 @@ def without_absorbed(
         for name, share in shares.items()
         if worth_saying < share <= not_judged
     ]
-    return study, [_warning(study, partly)]
-
-
-def _warning(study: Study, partly: Sequence[str]) -> str:
     count, missing = study.observations.num_walls, study.candidates.missing
     unjudged = [name for name, wants in missing.items() if MEASURED_PLANES.words in wants]
     planes = "plane of 1 wall is" if count == 1 else f"planes of {count} walls are"
@@ -513,7 +507,7 @@ def _warning(study: Study, partly: Sequence[str]) -> str:
         sentence += f" Not judged, because measured planes are needed: {', '.join(unjudged)}."
     if partly:
         sentence += f" Estimated planes absorb a large share of {', '.join(partly)}."
-    return sentence
+    return study, [sentence]
 
 
 def absorbed_by_planes(study: Study, name: str) -> float:
