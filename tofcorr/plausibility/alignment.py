@@ -6,8 +6,9 @@ estimated as well, since every camera has them. Where nobody measured the planes
 estimated with the hand-eye.
 """
 
-from dataclasses import dataclass, replace
-from typing import Self
+from copy import copy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -16,11 +17,19 @@ from torch import Tensor
 from tofcorr.estimation.linear import NormalEquations, solved
 from tofcorr.estimation.moments import LEAST_RESIDUAL, ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
-from tofcorr.estimation.robust import robust_weights
+from tofcorr.estimation.robust import (
+    deviation,
+    largest_plane,
+    robust_weights,
+    sigma_from_mad,
+)
 from tofcorr.estimation.solvers import rotation_from_normals
 from tofcorr.geometry import se3
-from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.plausibility.finding import LARGE_CONSTANT
+from tofcorr.geometry.rays import plane_in_frame, planes_through
+from tofcorr.plausibility.finding import CAMERA, FAR_OFF, LARGE_CONSTANT
+
+if TYPE_CHECKING:
+    from tofcorr.plausibility.look import Look
 
 TINY = float(np.finfo(np.float64).tiny)
 """What a divisor is at the least."""
@@ -30,9 +39,15 @@ TINY = float(np.finfo(np.float64).tiny)
 _PRIOR = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.05, 0.01], dtype=torch.float64) / 0.01
 
 
-@dataclass(frozen=True, eq=False)
 class Scene:
     """What a recording claims: poses, planes and the P points of each of F frames.
+
+    The plane of a frame's own points is the largest one, fitted to the pixels near it.
+
+    Args:
+        look: The recording.
+        stored: Depths, shape (F, P), metres; NaN: not usable.
+        pixel: Where, shape (F, P).
 
     Attributes:
         poses: world_from_tool, shape (F, 4, 4), metres.
@@ -53,19 +68,43 @@ class Scene:
         guess: The recorded tool_from_camera, shape (4, 4).
     """
 
-    poses: np.ndarray
-    normal: np.ndarray
-    offset: np.ndarray
-    rays: np.ndarray
-    distance: np.ndarray
-    own_normal: np.ndarray
-    known: np.ndarray
-    on_plane: np.ndarray
-    off_by: np.ndarray
-    flatness: np.ndarray
-    moments: np.ndarray
-    moves: bool
-    guess: np.ndarray
+    def __init__(self, look: "Look", stored: np.ndarray, pixel: np.ndarray) -> None:
+        self.poses, self.moves = look.poses, look.data.moves
+        self.normal, self.offset = look.column("normal_world"), look.column("offset")
+        self.guess = np.asarray(look.recording.tool_from_camera, dtype=np.float64)
+        self.rays = rays = look.rays[pixel]
+        self.distance = stored / rays[..., 2] if look.recording.depth_kind == "z" else stored
+        valid = np.isfinite(self.distance)
+        # On a base as short, as seen from 1 m, errors of the camera turn the plane anywhere. And
+        # three pixels determine a plane, six can judge it.
+        of_rays = _moments(rays, self.distance, valid)[:, 3:, 3:]
+        spread = of_rays[:, 1:, 1:] - of_rays[:, 1:, :1] * of_rays[:, :1, 1:]
+        self.known = np.linalg.eigvalsh(spread)[:, 1] > CAMERA**2
+        self.known &= valid.sum(1) >= 6
+        self.on_plane = valid.copy()
+        for k in np.flatnonzero(self.known):
+            own = _tensors(rays[k, valid[k]], self.distance[k, valid[k]])
+            plane = largest_plane(own[0], own[1], FAR_OFF, torch.Generator().manual_seed(0))
+            if plane is not None:
+                off = deviation(own[0], own[1], plane).abs()
+                near = max(4 * sigma_from_mad(float(off.median())), CAMERA)
+                self.on_plane[k, valid[k]] = (off <= near).numpy()
+        self.moments = _moments(rays, self.distance, self.on_plane)
+        points = torch.from_numpy(self.moments[:, :4, :4])
+        # The camera is the origin; the normal points to its side.
+        normal, offset = planes_through(points, torch.zeros(3).double())
+        plane = torch.cat([normal, offset[:, None]], dim=1)
+        squares = torch.einsum("fa,fab,fb->f", plane, points, plane)
+        self.own_normal, self.flatness = normal.numpy(), squares.clamp(min=0).sqrt().numpy()
+        with np.errstate(divide="ignore", invalid="ignore"):  # Of frames without a plane.
+            cosine = np.einsum("fpa,fa->fp", rays, self.own_normal)
+            self.off_by = self.distance + offset[:, None].numpy() / cosine
+
+    def changed(self, **parts: Any) -> Self:  # noqa: ANN401 - attributes
+        """Return the scene with other attributes."""
+        other = copy(self)
+        vars(other).update(parts)
+        return other
 
     def planes_in_tool(self) -> tuple[np.ndarray, np.ndarray]:
         """Return normals (F, 3) and offsets (F,) of the planes in the tool frame."""
@@ -84,7 +123,15 @@ class Scene:
         """Return the scene of some frames, by index or by mask."""
         whole = ("moves", "guess")
         parts = {name: all_[chosen] for name, all_ in vars(self).items() if name not in whole}
-        return replace(self, **parts)
+        return self.changed(**parts)
+
+
+def _moments(rays: np.ndarray, distance: np.ndarray, used: np.ndarray) -> np.ndarray:
+    one = used[..., None].astype(np.float64)
+    points = rays * np.where(used, distance, 0.0)[..., None]
+    joined = np.concatenate([points, one, rays * one], axis=-1)
+    total = np.einsum("fpa,fpb->fab", joined, joined, optimize=True)
+    return total / np.maximum(used.sum(1), 1)[:, None, None]
 
 
 def _tensors(*arrays: np.ndarray) -> list[Tensor]:

@@ -9,11 +9,10 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import torch
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import Recording
-from tofcorr.estimation.robust import deviation, largest_plane, sigma_from_mad
+from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import (
     Alignment,
@@ -21,7 +20,7 @@ from tofcorr.plausibility.alignment import (
     align,
     align_with_free_walls,
 )
-from tofcorr.plausibility.finding import CAMERA, FAR_OFF, LARGE_CONSTANT
+from tofcorr.plausibility.finding import LARGE_CONSTANT
 from tofcorr.plausibility.linear import (
     Estimate,
     LinearResiduals,
@@ -93,68 +92,6 @@ def _noise_of(differences: np.ndarray) -> tuple[float, float]:
     return noise, float((np.mean(differences**2) / 6) ** 0.5)
 
 
-def _scene_of(look: "Look", stored: np.ndarray, pixel: np.ndarray) -> Scene:
-    """Fit a plane to each frame: robustly, then by least squares to the pixels near it.
-
-    Args:
-        look: The recording.
-        stored: Depths, shape (F, P), metres; NaN: not usable.
-        pixel: Where, shape (F, P).
-    """
-    rays = look.rays[pixel]
-    distance = stored / rays[..., 2] if look.recording.depth_kind == "z" else stored
-    valid = np.isfinite(distance)
-    # On a base as short, as seen from 1 m, errors of the camera turn the plane anywhere. And three
-    # pixels determine a plane, six can judge it.
-    known = _spread(_moments(rays, distance, valid), slice(4, 7))[1][:, 1] > CAMERA**2
-    known &= valid.sum(1) >= 6
-    on_plane = valid.copy()
-    for k in np.flatnonzero(known):
-        own = torch.from_numpy(rays[k, valid[k]]), torch.from_numpy(distance[k, valid[k]])
-        plane = largest_plane(*own, FAR_OFF, torch.Generator().manual_seed(0))
-        if plane is not None:
-            off = deviation(*own, plane).abs()
-            near = max(4 * sigma_from_mad(float(off.median())), CAMERA)
-            on_plane[k, valid[k]] = (off <= near).numpy()
-    moments = _moments(rays, distance, on_plane)
-    mean, variances, directions = _spread(moments, slice(0, 3))
-    normal = directions[..., 0]
-    height = (normal * mean).sum(-1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # Of frames without a plane.
-        off_by = distance - height[:, None] / np.einsum("fpa,fa->fp", rays, normal)
-    return Scene(
-        poses=look.poses,
-        normal=look.column("normal_world"),
-        offset=look.column("offset"),
-        moves=look.data.moves,
-        guess=np.asarray(look.recording.tool_from_camera, dtype=np.float64),
-        rays=rays,
-        distance=distance,
-        # The camera is the origin; the normal points to its side.
-        own_normal=normal * np.where(height > 0, -1.0, 1.0)[:, None],
-        known=known,
-        on_plane=on_plane,
-        off_by=off_by,
-        flatness=np.sqrt(np.maximum(variances[:, 0], 0.0)),
-        moments=moments,
-    )
-
-
-def _moments(rays: np.ndarray, distance: np.ndarray, used: np.ndarray) -> np.ndarray:
-    one = used[..., None].astype(np.float64)
-    points = rays * np.where(used, distance, 0.0)[..., None]
-    joined = np.concatenate([points, one, rays * one], axis=-1)
-    total = np.einsum("fpa,fpb->fab", joined, joined, optimize=True)
-    return total / np.maximum(used.sum(1), 1)[:, None, None]
-
-
-def _spread(moments: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean of points or rays (F, 3), and variances and directions about it."""
-    mean = moments[:, part, 3]
-    found = np.linalg.eigh(moments[:, part, part] - mean[:, :, None] * mean[:, None])
-    return mean, found.eigenvalues, found.eigenvectors
-
-
 class Look:
     """Some pixels of each frame, and the frames' rows: enough to judge, and read in a moment.
 
@@ -187,7 +124,7 @@ class Look:
         # A plane is then known to a tenth of the noise of one pixel, and 60 frames are read and
         # judged in well below 0.3 s.
         self._read(int(np.clip(12_000 // len(self.sampled), 24, 200)))
-        whole = _scene_of(self, self.stored, self.pixel)
+        whole = Scene(self, self.stored, self.pixel)
         self.usable = np.asarray(whole.on_plane.any(1))
         self.frames, self.scene = self.sampled[self.usable], whole.some(self.usable)
 
@@ -248,7 +185,7 @@ class Look:
 
     def with_images(self, stored: np.ndarray, pixel: np.ndarray) -> Scene:
         """Return the scene if these depths (F, P) had been measured, at these pixels."""
-        return _scene_of(self, stored, pixel).some(self.usable)
+        return Scene(self, stored, pixel).some(self.usable)
 
     @property
     def flatness(self) -> float:

@@ -5,7 +5,6 @@ before a recording is written, and words its advice by its own options.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -171,7 +170,7 @@ def _of_poses(look: Look) -> Iterator[tuple[str, str, Scene]]:
         # Frames at the end have no pose of theirs.
         too_few = name.startswith("shifted") and len(poses) <= 3 + 2 * abs(int(name[-2:]))
         if not too_few and np.ptp(poses[:, :3, 3], axis=0).max() >= narrowest:
-            yield cause, advice, replace(scene, poses=poses)
+            yield cause, advice, scene.changed(poses=poses)
 
 
 WRONG_PLANES = "the recorded planes are wrong or of another frame"
@@ -184,9 +183,9 @@ def _of_planes(look: Look) -> Iterator[tuple[str, str, Scene | Alignment | None]
     if look.planes != "known":
         return
     turned = "the planes' normals nx, ny, nz point the wrong way and d does not"
-    yield turned, "turn nx, ny, nz round", replace(scene, normal=-scene.normal)
+    yield turned, "turn nx, ny, nz round", scene.changed(normal=-scene.normal)
     for unit, factor in _UNITS.items():
-        in_metres = replace(scene, offset=factor * scene.offset)
+        in_metres = scene.changed(offset=factor * scene.offset)
         yield f"the planes' offsets d are in {unit}", "write d in metres", in_metres
     free = align_with_free_walls(scene)
     yield WRONG_PLANES, "measure them again, or train with `planes: unknown`", free
@@ -195,7 +194,7 @@ def _of_planes(look: Look) -> Iterator[tuple[str, str, Scene | Alignment | None]
             "the planes are not in the camera's frame, which a recording without robot poses asks "
             "for",
             "write the planes in camera coordinates, or the robot's poses",
-            look.aligned(replace(scene, moves=True)),
+            look.aligned(scene.changed(moves=True)),
         )
 
 
