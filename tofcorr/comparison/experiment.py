@@ -19,7 +19,7 @@ from tofcorr.comparison.options import (
     ComparisonOptions,
     masks_of,
 )
-from tofcorr.comparison.statistics import Estimate, estimate
+from tofcorr.comparison.statistics import Estimate
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.moments import ImageMoments
@@ -165,7 +165,7 @@ class Experiment:
         """
         values = self.values[protocol][metric]
         difference = values[column] - (0.0 if less is None else values[less])
-        return estimate(difference, self.options.overlap(protocol))
+        return Estimate(difference, self.options.overlap(protocol))
 
 
 class ModelFitter:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofcorr.comparison.experiment import Experiment
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
-from tofcorr.comparison.statistics import Ranking, Table, rank
+from tofcorr.comparison.statistics import Ranking, Table
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
@@ -204,7 +204,7 @@ def select(
                 name: _by_pose(dataset, [one[name]["to_plane"] for one in groups], options)
                 for name in complexity
             }
-            rankings[by] = rank(errors, complexity, len(groups))
+            rankings[by] = Ranking(errors, complexity, len(groups))
         # What the page says of the models is what was asked for.
         result = SelectionResult(rankings, found, options, inspection.headline)
         if folder is not None:

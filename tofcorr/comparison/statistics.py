@@ -1,7 +1,6 @@
 """Means of held-out errors with their intervals, the ranking of models, and tables of both."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from math import nan, sqrt
 from typing import Any, NamedTuple
 
@@ -11,9 +10,16 @@ from tofcorr.estimation.robust import LEVEL, student_quantile, student_tail
 from tofcorr.training.report import number_or_none
 
 
-@dataclass(frozen=True)
 class Estimate:
-    """A mean.
+    """A mean of values with its interval.
+
+    Splits of the same frames share most of their training frames, so their errors are not
+    independent: the variance of the mean is enlarged (Nadeau and Bengio 2003, the corrected
+    resampled t-test).
+
+    Args:
+        values: Shape (N,); for six folds the half width is 2.57 standard errors.
+        overlap: By how many variances of one value; n_test / n_train for random splits.
 
     Attributes:
         mean: The mean.
@@ -24,12 +30,18 @@ class Estimate:
         degrees_of_freedom: Values minus one.
     """
 
-    mean: float
-    standard_deviation: float
-    standard_error: float
-    half_width: float
-    p_value: float
-    degrees_of_freedom: int
+    def __init__(self, values: np.ndarray, overlap: float = 0.0) -> None:
+        self.mean, self.degrees_of_freedom = float(np.mean(values)), len(values) - 1
+        several = self.degrees_of_freedom > 0
+        self.standard_deviation = float(np.std(values, ddof=1)) if several else nan
+        self.standard_error = self.standard_deviation * sqrt(1 / len(values) + overlap)
+        # Two columns that are equal in every split have no difference to test.
+        self.p_value = float(self.mean == 0) if several else nan
+        if self.standard_error > 0:
+            ratio = abs(self.mean) / self.standard_error
+            self.p_value = 2 * student_tail(ratio, self.degrees_of_freedom)
+        quantile = student_quantile(1 - LEVEL / 2, self.degrees_of_freedom)
+        self.half_width = quantile * self.standard_error
 
     @property
     def significant(self) -> bool:
@@ -50,51 +62,8 @@ class Estimate:
         }
 
 
-def estimate(values: np.ndarray, overlap: float = 0.0) -> Estimate:
-    """Return the mean of values with its interval.
-
-    Splits of the same frames share most of their training frames, so their errors are not
-    independent: the variance of the mean is enlarged (Nadeau and Bengio 2003, the corrected
-    resampled t-test).
-
-    Args:
-        values: Shape (N,); for six folds the half width is 2.57 standard errors.
-        overlap: By how many variances of one value; n_test / n_train for random splits.
-    """
-    mean, dof = float(np.mean(values)), len(values) - 1
-    if not dof:
-        return Estimate(mean, nan, nan, nan, nan, 0)
-    deviation = float(np.std(values, ddof=1))
-    error = deviation * sqrt(1 / len(values) + overlap)
-    # Two columns that are equal in every split have no difference to test.
-    p_value = 2 * student_tail(abs(mean) / error, dof) if error > 0 else float(mean == 0)
-    half_width = student_quantile(1 - LEVEL / 2, dof) * error
-    return Estimate(mean, deviation, error, half_width, p_value, dof)
-
-
-@dataclass(frozen=True)
 class Ranking:
-    """The models of one cross-validation.
-
-    Attributes:
-        errors: Each model's held-out error over the poses, millimetres, in the order given.
-        behind: Each model's error minus that of the best, pose by pose, millimetres.
-        complexity: Number of unknowns of each model.
-        best: The model of the smallest held-out error.
-        winner: The simplest model within one standard error of the best.
-        ties: Models whose 95 % interval of the difference to the winner contains zero.
-    """
-
-    errors: dict[str, Estimate]
-    behind: dict[str, Estimate]
-    complexity: Mapping[str, int]
-    best: str
-    winner: str
-    ties: list[str]
-
-
-def rank(errors: Mapping[str, np.ndarray], complexity: Mapping[str, int], groups: int) -> Ranking:
-    """Compare models on poses that they were not fitted to.
+    """The models of one cross-validation, compared on poses that they were not fitted to.
 
     Poses held out together share a fit, and fits share most of their poses; so the variance of a
     mean over N poses is taken as s^2 / N (1 + K / (K - 1)) with K groups held out in turn, the
@@ -108,24 +77,33 @@ def rank(errors: Mapping[str, np.ndarray], complexity: Mapping[str, int], groups
         errors: Each model's held-out error of each pose, shape (N,), in the same order of poses.
         complexity: Number of unknowns of each model.
         groups: K.
+
+    Attributes:
+        errors: Each model's held-out error over the poses, millimetres, in the order given.
+        behind: Each model's error minus that of the best, pose by pose, millimetres.
+        complexity: Number of unknowns of each model.
+        best: The model of the smallest held-out error.
+        winner: The simplest model within one standard error of the best.
+        ties: Models whose 95 % interval of the difference to the winner contains zero.
     """
 
-    def paired(values: np.ndarray) -> Estimate:
-        return estimate(values, groups / (groups - 1) / len(values))
+    def __init__(
+        self, errors: Mapping[str, np.ndarray], complexity: Mapping[str, int], groups: int
+    ) -> None:
+        def less(other: np.ndarray | float) -> dict[str, Estimate]:
+            overlap = groups / (groups - 1)
+            return {k: Estimate(own - other, overlap / len(own)) for k, own in errors.items()}
 
-    own = {name: paired(values) for name, values in errors.items()}
-    best = min(errors, key=lambda name: (own[name].mean, complexity[name], name))
-    behind = {name: paired(values - errors[best]) for name, values in errors.items()}
-    # Of a single pose no standard error is known: then all are near, and all tie.
-    near = [name for name, one in behind.items() if not one.mean > one.standard_error]
-    winner = min(near, key=lambda name: (complexity[name], own[name].mean, name))
-    differences = {name: paired(values - errors[winner]) for name, values in errors.items()}
-    ties = [
-        name
-        for name, one in differences.items()
-        if name != winner and not abs(one.mean) > one.half_width
-    ]
-    return Ranking(own, behind, complexity, best, winner, ties)
+        own, self.complexity = less(0.0), complexity
+        self.errors = own
+        self.best = min(own, key=lambda name: (own[name].mean, complexity[name], name))
+        self.behind = less(errors[self.best])
+        # Of a single pose no standard error is known: then all are near, and all tie.
+        near = [name for name, one in self.behind.items() if not one.mean > one.standard_error]
+        self.winner = min(near, key=lambda name: (complexity[name], own[name].mean, name))
+        differences = less(errors[self.winner]).items()
+        close = [name for name, one in differences if not abs(one.mean) > one.half_width]
+        self.ties = [name for name in close if name != self.winner]
 
 
 class Table(NamedTuple):
