@@ -11,7 +11,7 @@ from synthetic_scene import Scene, write_scene
 from tofcorr.comparison.experiment import Experiment
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.sample import without_outliers
+from tofcorr.pixels.sample import MaskOptions, usable_pixels
 
 
 def with_outliers(scene: Scene, *, masked: bool) -> dict[str, np.ndarray]:
@@ -46,9 +46,9 @@ def test_the_window_lies_about_the_median_raw_error(scene: Scene, tmp_path: Path
     far = scene.batch.radial_distance.float().numpy() + np.float32(0.3)
     known = scene.truth.tool_from_camera
     dataset = Dataset((write_scene(scene, tmp_path / "a", known, depth=far),))
-    kept = sum(int(batch.valid.sum()) for batch in without_outliers(dataset, 150.0).batches())
-    assert kept == int(scene.batch.valid.sum())
-    assert without_outliers(dataset, None) is dataset
+    inside = usable_pixels(dataset, MaskOptions(outlier_window_mm=150.0), robust=False)
+    assert sum(int(one.valid.sum()) for one in inside.batches()) == int(scene.batch.valid.sum())
+    assert usable_pixels(dataset, MaskOptions(), robust=False) is dataset
 
 
 def test_a_window_without_any_plane_in_sight_is_refused(scene: Scene, tmp_path: Path) -> None:
@@ -56,4 +56,4 @@ def test_a_window_without_any_plane_in_sight_is_refused(scene: Scene, tmp_path: 
     guess = scene.truth.tool_from_camera @ about_face
     dataset = Dataset((write_scene(scene, tmp_path / "a", guess),))
     with pytest.raises(CalibrationDataError, match="outlier_window_mm needs pixels"):
-        without_outliers(dataset, 80.0)
+        usable_pixels(dataset, MaskOptions(outlier_window_mm=80.0), robust=False)

@@ -140,18 +140,3 @@ def raw_errors(
     planes = batch.normal_tool, batch.offset_tool
     here = plane_in_frame(*planes, tool_from_camera.to(like).expand(count, 4, 4))
     return like - ray_plane_distance(rays.to(like), *here)
-
-
-def outside_window(
-    rays: Float[Tensor, "H W 3"],
-    tool_from_camera: Float[Tensor, "4 4"],
-    centre: float,
-    half_width: float,
-) -> Mask:
-    """Return the mask of pixels whose raw error is far from a centre, or unknown; metres."""
-
-    def mask(batch: FrameBatch) -> Tensor:
-        # A comparison with NaN is False: pixels without a plane count as outside.
-        return ~((raw_errors(batch, rays, tool_from_camera) - centre).abs() <= half_width)
-
-    return mask

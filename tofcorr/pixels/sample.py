@@ -18,11 +18,11 @@ from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differe
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
 from tofcorr.pixels.masks import (
+    Mask,
     edges,
     grazing,
     off_largest_plane,
     off_the_wall,
-    outside_window,
     raw_errors,
 )
 
@@ -275,12 +275,10 @@ def _repeat_differences(
     return differences, amplitudes
 
 
-def without_outliers(
-    dataset: Dataset,
-    window_mm: float | None,
-    frames: Sequence[int] | np.ndarray | None = None,
-) -> Dataset:
-    """Return the data set with every pixel left out whose raw error is off by more than a window.
+def _outside_window(
+    dataset: Dataset, half_width: float, frames: Sequence[int] | np.ndarray | None
+) -> Mask:
+    """Return the mask of pixels whose raw error is off by more than a window, or unknown.
 
     Mixed pixels at edges, reflections and misplaced masks are off by decimetres; the errors to be
     calibrated are centimetres. In a squared loss a few such pixels would outweigh all others. The
@@ -289,14 +287,12 @@ def without_outliers(
 
     Args:
         dataset: The recordings.
-        window_mm: Largest distance from the median raw error, millimetres; None keeps all.
+        half_width: Largest distance from the median raw error, metres.
         frames: Global numbers of the frames that the median is taken over; None: all.
 
     Raises:
         CalibrationDataError: No usable pixel looks at its plane.
     """
-    if window_mm is None:
-        return dataset
     transform, rays = recorded_hand_eye(dataset), dataset.ray_directions()
     num_frames = dataset.num_frames if frames is None else len(frames)
     # Two million pixels, evenly spread, give the median.
@@ -311,7 +307,8 @@ def without_outliers(
         advice = "check the planes in frames.csv and tool_from_camera"
         raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
     centre = float(np.median(finite.numpy()))
-    return dataset.without(outside_window(rays, transform, centre, window_mm / 1e3))
+    # A comparison with NaN is False: pixels without a plane count as outside.
+    return lambda batch: ~((raw_errors(batch, rays, transform) - centre).abs() <= half_width)
 
 
 class MaskOptions(Options):
@@ -357,12 +354,14 @@ def usable_pixels(
         CalibrationDataError: `edge_contrast` is set and there are no amplitudes, or no pixel is
             within `outlier_window_mm`; or that is set and the planes are estimated.
     """
-    if options.outlier_window_mm is not None and dataset.planes_are_estimated:
-        said = "outlier_window_mm compares with planes, and these are estimated from the depth"
-        advice = "use weights.robust or mask: ransac instead"
-        raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
-    dataset = without_outliers(dataset, options.outlier_window_mm, frames)
     rays = dataset.ray_directions()
+    if options.outlier_window_mm is not None:
+        if dataset.planes_are_estimated:
+            said = "outlier_window_mm compares with planes, and these are estimated from the depth"
+            advice = "use weights.robust or mask: ransac instead"
+            raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
+        window = options.outlier_window_mm / 1000
+        dataset = dataset.without(_outside_window(dataset, window, frames))
     if options.mask == "ransac":
         dataset = dataset.without(off_largest_plane(rays, options.mask_tolerance_mm / 1000))
     if options.edge_contrast is not None:
