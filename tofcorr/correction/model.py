@@ -3,8 +3,7 @@
 In float64 it is the reference: the runtime is folded from it, every export must agree with it.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -375,7 +374,7 @@ class FrameCorrection(DescribedModule):
         model = self.error_model
         seen, radial, strength, distance, held = self._variables(depth, amplitude)
         bounds = self.ranges.normalised_amplitude.unbind()
-        error = model.pixel_error() + signal_error(model, distance, held, bounds)
+        error = model.pixel_error() + model.signal_error(distance, held, bounds)
         known = self._conditions(depth, conditions)
         if known is not None:
             error = error + model.condition_error(known)[..., None, None]
@@ -416,27 +415,6 @@ class FrameCorrection(DescribedModule):
         mean = self.ranges.mean_conditions
         known = in_si_units(given, depth.shape[:-2], mean.dtype, mean.device)
         return with_means(known, mean) if known and len(self.error_model.condition_terms) else None
-
-
-def signal_error(
-    model: ErrorModel, distance: Tensor, amplitude: Tensor, normalised_range: Iterable[Any]
-) -> Tensor:
-    """Return the sum of the signal terms, shape (...), metres.
-
-    Args:
-        model: The error model.
-        distance: Radial distances inside their range, shape (...), metres.
-        amplitude: Amplitudes inside their range, same shape.
-        normalised_range: Both ends of the range of N = I D^2, to which N is clamped here.
-    """
-    error = torch.zeros_like(distance)
-    for term in model.signal_terms:
-        strength = amplitude
-        if term.uses_normalised_amplitude:
-            square = distance.square()
-            strength = (strength * square).clamp(*normalised_range) / square
-        error = error + term(distance, strength)
-    return error
 
 
 def required_amplitude(amplitude: Tensor | None) -> Tensor:

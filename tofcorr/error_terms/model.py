@@ -173,6 +173,25 @@ class ErrorModel(DescribedModule):
             error = error + self.fixed_pattern.offset
         return error
 
+    def signal_error(
+        self, distance: Tensor, amplitude: Tensor, normalised_range: Iterable[Any] = EVERYTHING
+    ) -> Tensor:
+        """Return the sum of the signal terms, shape (...), metres.
+
+        Args:
+            distance: Radial distances inside their range, shape (...), metres.
+            amplitude: Amplitudes inside their range, same shape.
+            normalised_range: Both ends of the range of N = I D^2, to which N is clamped here.
+        """
+        error = torch.zeros_like(distance)
+        for term in self.signal_terms:
+            strength = amplitude
+            if term.uses_normalised_amplitude:
+                square = distance.square()
+                strength = (strength * square).clamp(*normalised_range) / square
+            error = error + term(distance, strength)
+        return error
+
     def condition_error(self, conditions: Tensor) -> Tensor:
         """Return the sum of the condition terms of frames (..., C), shape (...), metres."""
         error = torch.zeros_like(conditions[..., 0])
@@ -184,9 +203,7 @@ class ErrorModel(DescribedModule):
         self, radial_distance: Tensor, amplitude: Tensor, conditions: Tensor | None = None
     ) -> Tensor:
         """Return the predicted error, shape (..., H, W), metres."""
-        error = self.pixel_error()
-        for term in self.signal_terms:
-            error = error + term(radial_distance, amplitude)
+        error = self.pixel_error() + self.signal_error(radial_distance, amplitude)
         if conditions is not None:
             error = error + self.condition_error(conditions)[..., None, None]
         if self.residual is not None:

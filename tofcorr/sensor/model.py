@@ -10,7 +10,6 @@ import torch
 from kornia.filters import filter2d_separable
 from torch import Tensor, nn
 
-from tofcorr.correction.model import signal_error
 from tofcorr.error_terms.base import EVERYTHING, DescribedModule, Domain, Interval
 from tofcorr.error_terms.condition_terms import Condition, with_means
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -85,7 +84,7 @@ class BaseError(nn.Module):
         error = torch.zeros_like(true)
         for _ in range(1 + _ITERATIONS if self.reads_measured else 1):
             distance = (true + error).clamp(*self.limits.radial_distance)
-            error = fixed + signal_error(self.model, distance, held, bounds)
+            error = fixed + self.model.signal_error(distance, held, bounds)
         return error.expand(true.shape)
 
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.lookup import FORMAT, LookupTable, digest_of, interpolate, read_lut
-from tofcorr.correction.model import signal_error
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING, Interval
 from tofcorr.errors import ConfigError
@@ -67,7 +66,7 @@ def _tabulate(state: CalibrationState) -> np.ndarray:
             low + (high - low) * u for (low, high), u in zip(ranges, places, strict=True)
         )
         bounds = reference.ranges.normalised_amplitude.unbind()
-        return signal_error(error, distance, amplitude, bounds).numpy()
+        return error.signal_error(distance, amplitude, bounds).numpy()
 
     probes = torch.rand(2, 50_000, generator=torch.Generator().manual_seed(0)).double()
     table, wanted = np.zeros((1, 1)), exact(probes)
