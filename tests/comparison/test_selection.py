@@ -61,8 +61,7 @@ def test_the_ranking_depends_on_no_order_and_equal_models_are_ranked_by_name() -
         Ranking(dict(own), complexity, 6) for own in (errors.items(), [*errors.items()][::-1])
     )
     assert (one.best, one.winner, set(one.ties)) == (other.best, other.winner, set(other.ties))
-    for name, error in one.errors.items():
-        assert vars(error) == vars(other.errors[name])
+    assert all(vars(error) == vars(other.errors[name]) for name, error in one.errors.items())
 
 
 def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None:
