@@ -15,7 +15,7 @@ with :math:`\delta` the step from a guess, and :math:`s^2` the effective varianc
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -63,17 +63,10 @@ class ImageMoments:
         """Each image's plane in the tool frame, normal and offset."""
         return torch.cat([self.normal_tool, self.offset_tool[:, None]], dim=1)
 
-    def _each(self, change: Callable[[Tensor], Tensor]) -> "ImageMoments":
-        return replace(self, **{name: change(getattr(self, name)) for name in _PER_IMAGE})
-
     def images(self, chosen: Tensor | Sequence[int]) -> "ImageMoments":
         """Return the moments of some images, by index or by mask (N,)."""
         pick = torch.as_tensor(chosen, device=self.gram.device)
-        return self._each(lambda part: part[pick])
-
-    def to(self, device: torch.device | str) -> "ImageMoments":
-        """Return the moments on a device."""
-        return self._each(lambda part: part.to(device))
+        return replace(self, **{name: getattr(self, name)[pick] for name in _PER_IMAGE})
 
     def weighted(self, weights: Float[Tensor, "N"]) -> "ImageMoments":
         """Return the moments with each image counted `weights` (N,) times."""

@@ -69,20 +69,14 @@ _AXES = {
     "x and z exchanged": np.eye(4)[[2, 1, 0, 3]],
 }
 _DRIVER = "undo the driver's flip before writing"
+_INVERSE = "the poses are tool_from_world, the inverse of what the format asks for"
+_ORDER = "the quaternions are stored as w, x, y, z"
+_TURNED = "the rotations are inverted and the translations are not"
+_OPPOSITE = "the poses are in the opposite order of the images"
 IN_POSES: dict[str, Mistake] = {
-    "inverted": Mistake(
-        "the poses are tool_from_world, the inverse of what the format asks for",
-        "invert them",
-        np.linalg.inv,
-    ),
-    "quaternions": Mistake(
-        "the quaternions are stored as w, x, y, z", "write them as qx, qy, qz, qw", reordered
-    ),
-    "rotations": Mistake(
-        "the rotations are inverted and the translations are not",
-        "write world_from_tool",
-        transposed,
-    ),
+    "inverted": Mistake(_INVERSE, "invert them", np.linalg.inv),
+    "quaternions": Mistake(_ORDER, "write them as qx, qy, qz, qw", reordered),
+    "rotations": Mistake(_TURNED, "write world_from_tool", transposed),
     **{
         f"shifted {rows:+d}": Mistake(
             f"poses and images are shifted by {words} against each other",
@@ -91,9 +85,7 @@ IN_POSES: dict[str, Mistake] = {
         )
         for rows, words in {1: "1 row", -1: "1 row", 2: "2 rows", -2: "2 rows"}.items()
     },
-    "reversed": Mistake(
-        "the poses are in the opposite order of the images", "reverse one of them", np.flipud
-    ),
+    "reversed": Mistake(_OPPOSITE, "reverse one of them", np.flipud),
     **{
         name: Mistake(
             f"the poses are of a left-handed world ({name})",
@@ -116,7 +108,7 @@ IN_IMAGES: dict[str, Mistake] = {
     "mirrored": Mistake("the images are mirrored left to right", _DRIVER, np.fliplr),
     "upside down": Mistake("the images are turned upside down", _DRIVER, np.flipud),
     "transposed": Mistake(
-        "the images are transposed: rows are columns", "transpose them before writing", np.transpose
+        "the images are transposed", "transpose them before writing", np.transpose
     ),
 }
 """The same in images (H, W), whatever their pixels hold. Each undoes itself."""

@@ -386,14 +386,11 @@ def _scale(look: Look) -> Iterator[Finding]:
     if not heads and not (1000 * length > 2 and abs(share) > SIGMAS * error):
         return
     uncertain = f" (standard error {100 * error:.2g} %)" if math.isfinite(error) else ""
-    yield Finding(
-        "ambiguous" if heads else "note",
-        f"The camera's distances are {100 * abs(share):.1f} %{uncertain} "
-        f"{'longer' if share > 0 else 'shorter'} than the robot's lengths, and this "
-        "recording cannot tell which of them is right; if the camera's are, a fit makes the "
-        f"hand-eye translation {1e3 * length:.1f} mm too {'short' if share > 0 else 'long'}.",
-        check="scale",
-    )
+    longer, short = ("longer", "short") if share > 0 else ("shorter", "long")
+    said = f"The camera's distances are {100 * abs(share):.1f} %{uncertain} {longer} than"
+    wrong = f"a fit makes the hand-eye translation {1e3 * length:.1f} mm too {short}"
+    said = f"{said} the robot's lengths, and nothing tells which are right; if the first, {wrong}."
+    yield Finding("ambiguous" if heads else "note", said, check="scale")
 
 
 def outlying_poses(look: Look) -> Iterator[Finding]:
