@@ -117,7 +117,7 @@ class NamedEffects:
 
 
 def name_effects(study: Study) -> NamedEffects:
-    """Name the effects of the most probable set, unless nothing may be missing.
+    """Name as many effects as are probably there: the most probable set of that size.
 
     The search is done twice: what poses scatter, and how an effect that is not linear looks, is
     known only beside the effects that are there. The first one asks for half of the evidence: an
@@ -156,11 +156,19 @@ def name_effects(study: Study) -> NamedEffects:
 
 
 def _with_names(found: NamedEffects, evidence: Evidence) -> NamedEffects:
-    """Name the effects of the most probable set that add enough, each with its cause set."""
+    """Name the effects of the most probable set of as many as are there, each with its cause set.
+
+    Those that add too little are left out.
+    """
     study, tests, order = found.study, found.study.options.tests, found.probabilities
     joint = _without_probes(found.models, found.probability)
-    anything = 1.0 - joint[()] > tests.named_from
-    chosen = max((one for one in joint if one or not anything), key=lambda one: joint[one])
+    # How many effects are there, at the least, with this probability? The most probable set of all
+    # may have fewer: the probability of an effect spreads over sets that differ in others.
+    of_size = torch.zeros(1 + max(map(len, joint)), dtype=torch.float64)
+    for one, own in joint.items():
+        of_size[len(one)] += own
+    number = int((of_size[1:].flip(0).cumsum(0) > tests.named_from).sum())
+    chosen = max((one for one in joint if len(one) == number), key=lambda one: joint[one])
     sizes = found.models.sizes_of(chosen)
     large = _large_enough(study, evidence, sizes) if found.tested else ()
     sets = {
