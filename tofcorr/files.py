@@ -36,10 +36,7 @@ except ImportError:  # Not on Windows: leftovers are then named, and never remov
     fcntl = None
 
 _LOG = logging.getLogger("tofcorr")
-_OURS = re.compile(r"\..+\.tofcorr-[0-9a-f]{8}\.part[^/]*|tofcorr-scratch-[0-9a-f]{8}", re.DOTALL)
-_LONGEST_NAME = 120
-"""Longest part of a file's name that its temporary name repeats, bytes. File systems take 255 in
-all; the rest is for the suffix and the mark. Set by hand."""
+_OURS = re.compile(r"\.tofcorr-[0-9a-f]{8}\.part[^/]*|tofcorr-scratch-[0-9a-f]{8}", re.DOTALL)
 _BEGUN: dict[Path, Callable[[Path], object]] = {}
 """How to remove each file and folder that this process has begun, in the order of their making."""
 
@@ -61,7 +58,7 @@ def staged_file(path: Path | str, kind: type[TofcorrError] = ExportError) -> Ite
     """
     target = file_to_replace(Path(path), kind)
     remove_leftovers(target.parent)
-    part = target.with_name(temporary_name(target.stem, target.suffix))
+    part = target.with_name(temporary_name(target.suffix))
     with writing_to(path, kind), _temporary(part, lambda: part.touch(exist_ok=False)):
         yield part
         part.replace(target)
@@ -112,7 +109,7 @@ def staged_folder(path: Path | str) -> Iterator[Path]:
     refuse_existing(Path(path))
     # absolute() instead of resolve(): a symbolic link in the path is kept.
     target = Path(path).absolute()
-    folder = target.parent / temporary_name(target.name)
+    folder = target.parent / temporary_name()
     with ExitStack() as made:
         with writing_to(path):
             for parent in reversed([one for one in target.parents if not one.exists()]):
@@ -169,14 +166,12 @@ def remove_leftovers(folder: Path) -> None:
         _LOG.warning(said, path)
 
 
-def temporary_name(name: str, suffix: str = "") -> str:
-    """Return a hidden name, never used before, for what will be called `name + suffix`."""
-    # torch calls the folder inside an archive after its file: plain names serve all programs.
-    if len(name) > _LONGEST_NAME or not name.isascii():
-        name = sha256(os.fsencode(name)).hexdigest()[:16]
-    if len(suffix) > _LONGEST_NAME or not suffix.isascii():
-        suffix = ""
-    return f".{name}.tofcorr-{uuid.uuid4().hex[:8]}.part{suffix}"
+def temporary_name(suffix: str = "") -> str:
+    """Return a hidden name, never used before, that ends as the final one does.
+
+    torch calls the folder inside an archive after its file: plain names serve all programs.
+    """
+    return f".tofcorr-{uuid.uuid4().hex[:8]}.part{suffix if suffix.isascii() else ''}"
 
 
 def refuse_existing(path: Path) -> None:
@@ -310,12 +305,12 @@ UNREADABLE = (
 # leaves the memory of its numbers as it was; zipfile reads it.
 _FOLDER = 0x10
 
-_MOST_BYTES = 500_000_000
+MOST_BYTES = 500_000_000
 """Most bytes of a file that is read whole, and of what an archive unpacks to. Chosen: a small
 archive can be made to unpack to any size; a table for a camera of 16 megapixels takes 268 MB."""
 
 
-def open_regular(path: Path | str, most_bytes: float = _MOST_BYTES) -> BinaryIO:
+def open_regular(path: Path | str, most_bytes: float = MOST_BYTES) -> BinaryIO:
     """Open a file to be read, unless it might never end.
 
     A pipe waits until somebody writes to it, and a device such as /dev/zero has no end.
@@ -398,7 +393,7 @@ def refuse_damaged(path: Path, what: str, content: bytes | None = None) -> None:
 
 def refuse_bomb(archive: zipfile.ZipFile) -> None:
     """Raise ValueError where an archive unpacks to more than any calibration holds."""
-    if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+    if sum(entry.file_size for entry in archive.infolist()) > MOST_BYTES:
         raise ValueError("it unpacks to too much")
 
 

@@ -158,7 +158,7 @@ def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
 def test_a_leftover_that_cannot_be_locked_is_named_and_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    left = tmp_path / files.temporary_name("run")
+    left = tmp_path / files.temporary_name()
     left.mkdir()
     others = [tmp_path / ".run.part", tmp_path / ".run.12345678.part", tmp_path / ".tofcorr"]
     for path in others:

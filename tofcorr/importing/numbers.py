@@ -11,11 +11,8 @@ import numpy as np
 
 from tofcorr import options
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import UNREADABLE, open_regular
+from tofcorr.files import MOST_BYTES, UNREADABLE, open_regular
 from tofcorr.options import one_line
-
-_LARGEST = 2**28
-"""Largest text of numbers read, bytes: a day of poses at 10 Hz takes 100 MB."""
 
 Line = tuple[int, list[str]]
 """The number of a line, counted from one, and its fields."""
@@ -27,7 +24,7 @@ def read_text(path: Path) -> str:
     Raises:
         CalibrationDataError: There is no such file, it is too large, or it is not text.
     """
-    return options.read_text(path, CalibrationDataError, _LARGEST).removeprefix("\ufeff")
+    return options.read_text(path, CalibrationDataError, MOST_BYTES).removeprefix("\ufeff")
 
 
 def lines_of(text: str) -> list[Line]:
