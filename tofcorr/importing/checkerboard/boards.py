@@ -269,8 +269,7 @@ def _to_subpixels(image: np.ndarray, corners: np.ndarray, half_window: float) ->
     window, scale = 2 * (max(2, round(2 * half_window)),), 2
     # Pixel centres are at integers, so enlarging shifts the origin by half a pixel.
     there = ((corners + 0.5) * scale - 0.5).astype(np.float32)
-    exact = float(np.finfo(np.float32).eps)
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, exact)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     larger = _enlarged(image, scale)
     refined = cv2.cornerSubPix(larger, np.ascontiguousarray(there), window, (-1, -1), stop)
     return _unscaled(refined, scale)
