@@ -50,15 +50,13 @@ def read_scene_camera(path: Path) -> tuple[GivenIntrinsics, float, PoseTrack]:
     """
 
     def numbers(name: str, image: dict[str, Any], key: str, count: int) -> np.ndarray:
-        return finite_numbers(image[key], f"{path}: '{key}' of image {name}", (count,))
+        return finite_numbers(image.get(key), f"{path}: '{key}' of image {name}", (count,))
 
     images = _read(path)
     first = next(iter(images))
     for key in ("cam_K", "depth_scale"):
-        lacking = next((name for name, image in images.items() if key not in image), None)
-        if lacking is not None:
-            raise CalibrationDataError(f"{path}: image {lacking} has no '{key}'.")
-        other = next((n for n, i in images.items() if i[key] != images[first][key]), None)
+        one = images[first].get(key)
+        other = next((n for n, i in images.items() if i.get(key) != one), None)
         if other is not None:
             raise CalibrationDataError(f"{path}: '{key}' of images {first} and {other} differ.")
     posed = {n: i for n, i in images.items() if "cam_R_w2c" in i and "cam_t_w2c" in i}

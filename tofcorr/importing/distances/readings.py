@@ -97,21 +97,18 @@ def open_distances(
     for path, track, table in zip(paths, tracks, tables, strict=True):
         if len(track) != len(table):
             raise CalibrationDataError(f"{path}: {len(track)} poses beside {len(table)} rows.")
-    typical = [float(np.nanmedian(table)) for table in tables]
+    readings, warnings = np.concatenate(tables), []
+    typical = float(np.nanmedian(readings))
     # No such sensor sees 20 m.
-    units = {1.0 if one >= 20 else 1000.0 for one in typical} if unit_mm is None else {unit_mm}
-    if len(units) > 1:
-        raise CalibrationDataError(f"Units differ: typically {typical}. State --depth-unit-mm.")
-    (unit,) = units
-    warnings = []
+    unit = unit_mm or (1.0 if typical >= 20 else 1000.0)
     if unit_mm is None:
         word = "millimetres" if unit == 1 else "metres"
-        read_as = f"Distances are typically {typical[0]:g} and read as {word}"
+        read_as = f"Distances are typically {typical:g} and read as {word}"
         warnings.append(f"{read_as}; state --depth-unit-mm {unit:g} if that is right.")
     if zones == (1, 1):
         warnings.append("One pixel: its ray is the optical axis; a turn about it cannot be found.")
     origin = ", ".join(map(str, sources)) if len(sources) < 3 else f"{sources[0]}, ..."
-    every = (unit * np.concatenate(tables) / 1000).astype(np.float32)
+    every = (unit * readings / 1000).astype(np.float32)
 
     def read(number: int) -> DepthImage:
         if not np.isfinite(every[number]).any():
