@@ -171,10 +171,9 @@ class PosedImport:
             stop = nearest(track.timestamp, times[images] - late)
         else:
             stop = find_stops(track, times[images] - late, _LAG_OF_STOPS + 2 * error)
-        take, moving = stop < 0, images[stop < 0]
-        if options.moving == "leave_out":
-            refused |= {names[int(k)]: "the tool was moving" for k in moving}
-            take = np.zeros(len(stop), dtype=bool)
+        moving = images[stop < 0]
+        take = (stop < 0) & (options.moving == "keep")
+        refused |= {names[int(k)]: "the tool was moving" for k in images[(stop < 0) & ~take]}
         # At most so many images of a stop, evenly spread, the middle first.
         for number in np.unique(stop[stop >= 0]):
             own = np.flatnonzero(stop == number)
@@ -232,14 +231,14 @@ class PosedImport:
         Raises:
             CalibrationDataError: A mistake explains it; the message names it, and both misfits.
         """
-        origin, farthest = self._source.origin, FoundWalls.OFF_WALL_MM
-        before = farthest if given is None else given.misfit_mm
-        if before <= FoundWalls.SUSPICIOUS_MM or self._source.targets is not None:
+        origin, most = self._source.origin, FoundWalls.SUSPICIOUS_MM
+        before = FoundWalls.OFF_WALL_MM if given is None else given.misfit_mm
+        if before <= most or self._source.targets is not None:
             return []
         left = {}
         for said, misfit in self._mistakes_undone(chosen):
             left[said] = misfit
-            if misfit <= FAR_BETTER * FoundWalls.SUSPICIOUS_MM:
+            if misfit <= FAR_BETTER * most:
                 break
         best = min(left, key=left.__getitem__)
         if left[best] <= FAR_BETTER * before:
@@ -248,9 +247,7 @@ class PosedImport:
         if given is None:
             return []
         seeing = f"{len(np.unique(given.image))} of {len(chosen.images)} images show a wall"
-        off = (
-            f"planes are off by {before:.0f} mm, up to {FoundWalls.SUSPICIOUS_MM:.0f} are expected"
-        )
+        off = f"planes are off by {before:.0f} mm, up to {most:.0f} are expected"
         return [f"{seeing}, and {off}. Do images and poses belong together?"]
 
     def _mistakes_undone(self, chosen: Chosen) -> Iterator[tuple[str, float]]:
@@ -301,25 +298,25 @@ class PosedImport:
         At 0.1 m/s and 10 mm a plane, the mean of 200 tells 1 to 2 ms, a fifth of what matters.
         """
         assert self._times is not None
-        hand_eye, walls = torch.from_numpy(found.tool_from_camera), torch.from_numpy(found.walls)
-        times, points, on = [], [], []
-        step = max(1, -(-len(moving) // 200))
-        for k in through(moving[::step].tolist(), "refining the lag", "view"):
-            pose = torch.from_numpy(self._track.at(self._times[k : k + 1] - lag.seconds))
-            if not bool(pose.isfinite().all()) or not self._images.planes(k):
-                continue
-            seen = seen_planes([self._images.planes(k)], pose, 1)
-            off, nearest = distances(*seen.in_world(exact(hand_eye)), walls).min(dim=1)
-            # A tool at 1 m/s is off by 0.1 m after 0.1 s of lag.
-            near = off < 1 / 10
-            times += [self._times[k]] * int(near.sum())
-            points.append(se3.transformed(hand_eye, seen.points[near]).numpy())
-            on.append(found.walls[nearest[near].numpy()])
-        if not times:
+        some = moving[:: max(1, -(-len(moving) // 200))]
+        planes = [
+            self._images.planes(k) for k in through(some.tolist(), "refining the lag", "view")
+        ]
+        if sum(map(len, planes)) < 10:
             return lag
-        return refine_lag(
-            self._track, np.array(times), np.concatenate(points), np.concatenate(on), lag
-        )
+        times, walls = self._times[some], torch.from_numpy(found.walls)
+        hand_eye = exact(torch.from_numpy(found.tool_from_camera))
+        seen = seen_planes(planes, torch.from_numpy(self._track.at(times)), 1)
+
+        def losses(late: float) -> np.ndarray:
+            pose = torch.from_numpy(self._track.at(times - late))
+            moved = replace(seen, world_from_tool=pose[seen.image])
+            off = distances(*moved.in_world(hand_eye), walls).min(dim=1).values
+            # In units of 10 mm: the error of a camera that is not calibrated yet. A tool at 1 m/s
+            # is off by 0.1 m after 0.1 s of lag: what is farther is on no wall.
+            return (100 * off.clamp(max=1 / 10)).square().log1p().numpy()
+
+        return refine_lag(losses, lag)
 
     def _writer(self, found: FoundWalls) -> partial[RecordingWriter]:
         """Begin the recording, with the names of frames as its format has them.
