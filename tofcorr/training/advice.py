@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.recording import CHUNK_PIXELS, FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, concatenate
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance
 from tofcorr.fit.problem import Fit
@@ -84,25 +84,22 @@ class PosePool:
         design = copy(design)
         design.ray_directions = rays = design.ray_directions[::step, ::step]
         design.pixel_functions = design.pixel_functions[:, ::step, ::step]
-        accumulator = MomentAccumulator(design)
         # Squares of four pixels a side; only their contrast matters.
         rows, columns = (torch.arange(size) // 4 for size in rays.shape[:2])
-        bright, parts = (rows[:, None] + columns) % 2, []
+        bright = (rows[:, None] + columns) % 2
         planes = plane_in_frame(self.normal_world, self.offset, self.world_from_tool)
         normal, offset = plane_in_frame(*planes, tool_from_camera.expand(len(planes[1]), 4, 4))
-        for chunk in torch.arange(len(offset)).split(max(1, CHUNK_PIXELS // bright.numel())):
-            distance = ray_plane_distance(rays, normal[chunk], offset[chunk])
-            cosine = -torch.einsum("hwa,ba->bhw", rays, normal[chunk])
-            batch = FrameBatch(
-                indices=chunk,
-                radial_distance=distance,
-                amplitude=self.brightness[chunk][:, bright].exp() * cosine / distance.square(),
-                valid=distance.isfinite() & (cosine > 0),
-                normal_tool=planes[0][chunk],
-                offset_tool=planes[1][chunk],
-            )
-            parts.append(accumulator(batch, torch.full_like(distance, pixel_share * step**2)))
-        return concatenate(parts)
+        distance = ray_plane_distance(rays, normal, offset)
+        cosine = -torch.einsum("hwa,ba->bhw", rays, normal)
+        batch = FrameBatch(
+            indices=torch.arange(len(offset)),
+            radial_distance=distance,
+            amplitude=self.brightness[:, bright].exp() * cosine / distance.square(),
+            valid=distance.isfinite() & (cosine > 0),
+            normal_tool=planes[0],
+            offset_tool=planes[1],
+        )
+        return MomentAccumulator(design)(batch, torch.full_like(distance, pixel_share * step**2))
 
 
 def draw_views(
