@@ -40,8 +40,8 @@ def _pinhole_matrix(rows: Matrix3) -> Matrix3:
 
 def _opencv_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
     if len(coefficients) not in DISTORTION_LENGTHS:
-        lengths = ", ".join(map(str, DISTORTION_LENGTHS))
-        raise ValueError(f"expected {lengths} coefficients as of OpenCV, got {len(coefficients)}")
+        given = f"got {len(coefficients)} in OpenCV's order"
+        raise ValueError(f"expected 0, 4, 5, 8, 12 or 14 coefficients, {given}")
     return coefficients
 
 

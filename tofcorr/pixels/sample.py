@@ -357,7 +357,7 @@ def usable_pixels(
     rays = dataset.ray_directions()
     if options.outlier_window_mm is not None:
         if dataset.planes_are_estimated:
-            said = "outlier_window_mm compares with planes, and these are estimated from the depth"
+            said = "outlier_window_mm compares with the recorded planes, which are estimated"
             advice = "use weights.robust or mask: ransac instead"
             raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
         window = options.outlier_window_mm / 1000
