@@ -4,7 +4,7 @@
 each of its effects stands with all those that may be there in its place.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -172,7 +172,7 @@ def _with_names(found: NamedEffects, evidence: Evidence) -> NamedEffects:
     sizes = found.models.sizes_of(chosen)
     large = _large_enough(study, evidence, sizes) if found.tested else ()
     sets = {
-        name: _in_place_of(name, chosen, joint, tests.cover)
+        name: _in_place_of(name, large, joint, tests.cover)
         for name in sorted(large, key=lambda name: -order[name])
     }
     sets = {n: own for n, own in sets.items() if found.probability_of_any(*own) > tests.named_from}
@@ -220,26 +220,28 @@ def _large_enough(study: Study, evidence: Evidence, sizes: Mapping[str, float]) 
 
 
 def _in_place_of(
-    name: str, model: Model, joint: Mapping[Model, float], cover: float
+    name: str, named: Collection[str], joint: Mapping[Model, float], cover: float
 ) -> dict[str, float]:
-    """Return the credible set of the effect that stands in the place of a named one.
+    """Return the credible set of a named effect: itself, and what may be there in its place.
+
+    One of the set is there with the probability `cover`, given the others named and that there is
+    something more. Each adds the probability of the models that none before it has.
 
     Args:
-        name: The effect named.
-        model: The most probable set of effects, it among them.
+        name: The effect.
+        named: All effects named.
         joint: The probability of each set of effects.
-        cover: Probability that the set holds, given the other effects.
+        cover: How probable it must be that one of the set is there.
     """
-    rest = {other for other in model if other != name}
-    rivals = {
-        next(iter(set(one) - rest)): own
-        for one, own in joint.items()
-        if len(one) == len(model) and rest < set(one)
-    }
-    total, members, held = sum(rivals.values()), {name: rivals[name]}, rivals[name]
-    for other in sorted(rivals.keys() - {name}, key=lambda one: (-rivals[one], one)):
-        if held >= cover * total:
-            break
-        members[other] = rivals[other]
-        held += rivals[other]
-    return {member: own / total for member, own in members.items()}
+    rest = set(named) - {name}
+    left = {one: own for one, own in joint.items() if rest < set(one)}
+    total, members = sum(left.values()), dict[str, float]()
+    while left and sum(members.values()) < cover:
+        added = dict.fromkeys(sorted(set().union(*left) - rest), 0.0)
+        for one, own in left.items():
+            for other in set(one) - rest:
+                added[other] += own / total
+        new = max(added, key=added.__getitem__) if members else name
+        members[new] = added[new]
+        left = {one: own for one, own in left.items() if new not in one}
+    return members
