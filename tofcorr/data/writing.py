@@ -251,27 +251,24 @@ def write_recording(
     path: Path | str,
     *,
     rows: FrameTable | Iterable[FrameRow],
-    depth: np.ndarray,
-    amplitude: np.ndarray | None = None,
-    mask: np.ndarray | None = None,
-    raw: np.ndarray | None = None,
     truth: Mapping[str, np.ndarray | Mapping[str, Any]] | None = None,
-    **of_header: Any,  # noqa: ANN401 - as for RecordingWriter
+    **given: Any,  # noqa: ANN401 - as for RecordingWriter
 ) -> None:
     """Write a recording whose arrays are in memory or memory-mapped.
 
-    The first axis of each array is the frame. `truth` goes to `truth/`, arrays as `.npy` and
-    mappings as `.yaml`. The other arguments and the errors are those of `RecordingWriter`.
+    The first axis of each array (`depth`, `amplitude`, `mask`, `raw`) is the frame. `truth` goes to
+    `truth/`, arrays as `.npy` and mappings as `.yaml`. The other arguments and the errors are those
+    of `RecordingWriter`.
     """
     rows = rows.rows() if isinstance(rows, FrameTable) else list(rows)
-    images = {"depth": depth, "amplitude": amplitude, "mask": mask, "raw": raw}
-    given = {name: array for name, array in images.items() if array is not None}
-    for name, array in given.items():
+    images = {name: given.pop(name, None) for name in IMAGE_ARRAYS}
+    images = {name: array for name, array in images.items() if array is not None}
+    for name, array in images.items():
         if len(array) != len(rows):
             raise CalibrationDataError(f"{path}: {len(array)} frames of {name}, {len(rows)} rows.")
-    with RecordingWriter(path, **of_header) as writer:
+    with RecordingWriter(path, **given) as writer:
         for frame, row in enumerate(rows):
-            writer.append(row=row, **{name: array[frame] for name, array in given.items()})
+            writer.append(row=row, **{name: array[frame] for name, array in images.items()})
         for name, value in (truth or {}).items():
             writer.add_truth(name, value)
 

@@ -87,7 +87,7 @@ class PoseTrack:
         return cls(world_from_tool=poses[kept], timestamp=time, names=own, source=source)
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """Return the poses at some times, shape (N, 4, 4); NaN outside the track.
+        """Return the poses at some times, shape (N, 4, 4); NaN outside the track, if it has times.
 
         Between two poses the translation moves on a straight line at constant speed, and the
         rotation about a fixed axis at constant angular speed.
@@ -95,9 +95,10 @@ class PoseTrack:
         Args:
             times: Shape (N,), seconds on the clock of the track.
         """
-        assert self.timestamp is not None
+        poses = np.tile(self.world_from_tool[0], (len(times), 1, 1))
+        if self.timestamp is None:
+            return poses
         clipped = np.clip(times, self.timestamp[0], self.timestamp[-1])
-        poses = np.tile(self.world_from_tool[0], (len(clipped), 1, 1))
         if len(self) > 1:
             poses[:, :3, :3] = self._rotation(clipped).as_matrix()
             for axis, along in enumerate(self.world_from_tool[:, :3, 3].T):

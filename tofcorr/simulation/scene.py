@@ -1,6 +1,7 @@
 """The target: a flat wall, uniform or with a checkerboard, and its reflectivity in each pixel."""
 
 from collections.abc import Mapping
+from itertools import product
 from typing import Annotated, Literal, Self
 
 import torch
@@ -109,12 +110,8 @@ def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Ten
     # Coordinates first, so that each is contiguous in memory: twice as fast.
     at, down, right = (each[crossed].T.contiguous() for each in (in_squares, *steps))
     inside = (torch.arange(subsamples, dtype=at.dtype) + 0.5) / subsamples - 0.5
-    total = torch.zeros_like(at[0])
-    for share_down in inside:
-        line = at + share_down * down
-        for share_right in inside:
-            total += _bright((line + share_right * right).T)
-    share_bright[crossed] = total / subsamples**2
+    places = (at + a * down + b * right for a, b in product(inside, inside))
+    share_bright[crossed] = sum(_bright(place.T) for place in places) / subsamples**2
     contrast = target.reflectivity_bright - target.reflectivity_dark
     return target.reflectivity_dark + contrast * share_bright
 

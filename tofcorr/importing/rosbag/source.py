@@ -429,12 +429,12 @@ def _base_from_tool(
         CalibrationDataError: A frame is missing, they are not connected, or do not move.
     """
     up, down = _chain(parents, base, source), _chain(parents, tool, source)
-    common = next((name for name in down if name in up), None)
-    if common is None:
+    if up[-1] != down[-1]:
         roots = f"'{base}' (under '{up[-1]}') with '{tool}' (under '{down[-1]}')"
         raise CalibrationDataError(f"{source}: tf does not connect {roots}. Record /tf_static?")
-    to_tool = down[: down.index(common)][::-1]
-    to_base = up[: up.index(common)][::-1]
+    to_tool, to_base = (
+        [c for c in one[::-1] if c not in two] for one, two in ((down, up), (up, down))
+    )
     moving = [child for child in (*to_tool, *to_base) if tracks[child].timestamp is not None]
     if not moving:
         raise CalibrationDataError(f"{source}: '{tool}' is static in '{base}': name --tool-frame.")
@@ -450,9 +450,7 @@ def _base_from_tool(
     def product(children: Iterable[str]) -> torch.Tensor:
         whole = torch.eye(4, dtype=torch.float64).expand(len(times), 4, 4)
         for child in children:
-            track = tracks[child]
-            pose = track.at(times) if child in moving else track.world_from_tool[-1]
-            whole = whole @ torch.from_numpy(pose)
+            whole = whole @ torch.from_numpy(tracks[child].at(times))
         return whole
 
     poses = se3.inverse(product(to_base)) @ product(to_tool)

@@ -95,12 +95,8 @@ class WigglingEffect(SignalEffect):
             if sine == 0 and cosine == 0:
                 continue
             phasor = torch.complex(sine, cosine) / scale * fundamental * own
-            same = state.orders == order
-            if bool(same.any()):
-                state.signal = state.signal + same[:, None, None] * phasor
-            else:
-                state.orders = torch.cat([state.orders, state.orders.new_tensor([order])])
-                state.signal = torch.cat([state.signal, phasor[None]])
+            state.orders = torch.cat([state.orders, state.orders.new_tensor([order])])
+            state.signal = torch.cat([state.signal, phasor[None]])
 
     def _waves(self, turn: Tensor, inputs: EffectInputs) -> list[Tensor]:
         """Return e^(j n phase) for each number of periods, then the first one times u."""
