@@ -55,6 +55,6 @@ def test_a_scene_without_poses_with_two_cameras_or_none_is_refused(
     cameras = json.loads(path.read_text())
     cameras["1"]["cam_K"][0] = 99.0
     path.write_text(json.dumps(cameras))
-    assert "'cam_K' of images 0 and 1 differ" in run_import("bop", folder, out=out).text
+    assert "'cam_K' or 'depth_scale' of 3 images differ" in run_import("bop", folder, out=out).text
     path.unlink()
     assert "scene_camera.json: there is no such file" in run_import("bop", folder, out=out).text

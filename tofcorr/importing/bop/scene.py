@@ -1,20 +1,34 @@
 """Scenes in BOP's layout, whose poses are the camera's own."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.frames.source import open_folder
 from tofcorr.importing.images import DepthCoding
 from tofcorr.importing.intrinsics import GivenIntrinsics, intrinsics_from_mapping
-from tofcorr.importing.numbers import finite_numbers, read_text
+from tofcorr.importing.numbers import read_text
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.posed import import_posed
 from tofcorr.importing.robot_images import PosedOptions
+from tofcorr.options import Number, Options, PositiveNumber, Vector3, refused_in_words
+
+_Nine = Annotated[tuple[Number, ...], Field(min_length=9, max_length=9)]
+
+
+class _View(Options):
+    """What `scene_camera.json` says of an image; other keys are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    matrix: _Nine = Field(alias="cam_K")
+    unit_mm: PositiveNumber = Field(alias="depth_scale")
+    rotation: _Nine | None = Field(default=None, alias="cam_R_w2c")
+    translation: Vector3 | None = Field(default=None, alias="cam_t_w2c")
 
 
 def import_scene(
@@ -48,41 +62,20 @@ def read_scene_camera(path: Path) -> tuple[GivenIntrinsics, float, PoseTrack]:
         CalibrationDataError: It cannot be read, images have different intrinsics or units, or there
             are no poses.
     """
-
-    def numbers(name: str, image: dict[str, Any], key: str, count: int) -> np.ndarray:
-        return finite_numbers(image.get(key), f"{path}: '{key}' of image {name}", (count,))
-
-    images = _read(path)
-    first = next(iter(images))
-    for key in ("cam_K", "depth_scale"):
-        one = images[first].get(key)
-        other = next((n for n, i in images.items() if i.get(key) != one), None)
-        if other is not None:
-            raise CalibrationDataError(f"{path}: '{key}' of images {first} and {other} differ.")
-    posed = {n: i for n, i in images.items() if "cam_R_w2c" in i and "cam_t_w2c" in i}
+    with refused_in_words(_View, str(path), CalibrationDataError):
+        views = TypeAdapter(dict[NonNegativeInt, _View]).validate_json(read_text(path))
+    lenses = {(view.matrix, view.unit_mm) for view in views.values()}
+    if len(lenses) != 1:
+        said = f"'cam_K' or 'depth_scale' of {len(views)} images differ"
+        raise CalibrationDataError(f"{path}: expected images of one camera; {said}.")
+    posed = {name: view for name, view in views.items() if view.rotation and view.translation}
     if not posed:
         raise CalibrationDataError(f"{path}: no image has a pose ('cam_R_w2c', 'cam_t_w2c').")
     poses = np.tile(np.eye(4), (len(posed), 1, 1))
-    for pose, (name, image) in zip(poses, posed.items(), strict=True):
+    for pose, view in zip(poses, posed.values(), strict=True):
         # The pose is inverted; its translation is in millimetres.
-        rotation = numbers(name, image, "cam_R_w2c", 9).reshape(3, 3).T
-        translation = numbers(name, image, "cam_t_w2c", 3) / 1000
-        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ translation
-    (unit,) = numbers(first, images[first], "depth_scale", 1)
-    if unit <= 0:
-        raise CalibrationDataError(f"{path}: 'depth_scale' must be positive, got {unit:g}.")
-    matrix = numbers(first, images[first], "cam_K", 9).tolist()
-    track = PoseTrack.checked(poses, str(path), names=[f"{int(name):06d}" for name in posed])
-    return intrinsics_from_mapping({"K": matrix}, str(path)), float(unit), track
-
-
-def _read(path: Path) -> dict[str, dict[str, Any]]:
-    text = read_text(path)
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CalibrationDataError(f"{path}: not readable JSON ({error}).") from None
-    whole = isinstance(content, dict) and bool(content)
-    if not whole or not all(n.isdecimal() and isinstance(i, dict) for n, i in content.items()):
-        raise CalibrationDataError(f"{path}: expected an object with one entry an image number.")
-    return content
+        rotation = np.reshape(np.array(view.rotation), (3, 3)).T
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ np.array(view.translation) / 1000
+    track = PoseTrack.checked(poses, str(path), names=[f"{name:06d}" for name in posed])
+    ((matrix, unit_mm),) = lenses
+    return intrinsics_from_mapping({"K": matrix}, str(path)), unit_mm, track
