@@ -152,11 +152,8 @@ def read_grey(path: Path) -> np.ndarray:
     """
     if path.suffix.lower() in (".npy", ".exr"):
         return read_array(path)
-    image = read_image(path)
-    if image.ndim == 3 and image.shape[2] in (3, 4):
-        code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
-        return np.asarray(cv2.cvtColor(image, code))
-    return _one_channel(image, path)
+    grey = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    return _one_channel(read_image(path, grey), path)
 
 
 def _one_channel(array: np.ndarray, path: Path) -> np.ndarray:
@@ -167,15 +164,15 @@ def _one_channel(array: np.ndarray, path: Path) -> np.ndarray:
     return array
 
 
-def read_image(path: Path) -> np.ndarray:
-    """Decode an image file without conversion, shape (H, W) or (H, W, channels).
+def read_image(path: Path, how: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
+    """Decode an image file, as it is unless said otherwise, shape (H, W) or (H, W, channels).
 
     Raises:
         RefusedViewError: The file cannot be read, or is no image.
     """
     try:
         with open_regular(path) as file:
-            image = decoded(file.read())
+            image = decoded(file.read(), how)
     except OSError as error:
         reason = error.strerror or error
         raise RefusedViewError(f"{path.name} cannot be read ({reason})") from None
@@ -184,10 +181,10 @@ def read_image(path: Path) -> np.ndarray:
     return image
 
 
-def decoded(content: bytes) -> np.ndarray | None:
-    """Decode the bytes of an image file; None if they are none."""
+def decoded(content: bytes, how: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
+    """Decode the bytes of an image file by OpenCV's flags; None if they are none."""
     try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        return cv2.imdecode(np.frombuffer(content, np.uint8), how)
     except cv2.error:  # Of no bytes too.
         return None
 
