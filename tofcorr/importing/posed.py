@@ -116,7 +116,9 @@ class PosedImport:
             self._changes = self._times[self._readable], change[self._readable][1:]
         lag = self._first_lag()
         chosen = self._choose(lag)
-        _refuse_equal_poses(chosen.world_from_tool, self._track.source)
+        if 1000 * np.ptp(chosen.world_from_tool, axis=0).max() < 1:  # And by a milliradian.
+            said = "all poses are the same to a millimetre"
+            raise CalibrationDataError(f"{self._track.source}: {said}.")
         found, warnings = self._walls(chosen)
         if lag is not None and options.lag_s == "auto":
             refined = self._refined(lag, chosen.moving, found)
@@ -376,16 +378,6 @@ class PosedImport:
                     pose_id=f"stop {stop}" if stop >= 0 else f"image {number}",
                 )
                 yield row, image.depth, image.amplitude, mask
-
-
-def _refuse_equal_poses(world_from_tool: np.ndarray, origin: str) -> None:
-    """Refuse poses (N, 4, 4) that are the same to a millimetre and a milliradian.
-
-    Raises:
-        CalibrationDataError: As said.
-    """
-    if 1000 * np.ptp(world_from_tool, axis=0).max() < 1:
-        raise CalibrationDataError(f"{origin}: all poses are the same to a millimetre.")
 
 
 def _amplitudes(image: DepthImage) -> np.ndarray:

@@ -160,12 +160,10 @@ def find_stops(track: PoseTrack, times: np.ndarray, margin: float) -> np.ndarray
     here, ends = track.at(times), track.timestamp[[0, -1]]
     before, after = (track.at(np.clip(times + shift, *ends)) for shift in (-margin, margin))
     still = _near(here, before) & _near(here, after)
-    number = np.full(len(times), -1)
-    current, last = -1, -1
-    for k in np.flatnonzero(still):
-        moved = last < 0 or not _near(here[k : k + 1], here[last : last + 1])[0]
-        current += moved or not still[last : k + 1].all()
-        number[k], last = current, k
+    number, at_rest = np.full(len(times), -1), np.flatnonzero(still)
+    follows = np.diff(at_rest, prepend=-2) == 1
+    follows[1:] &= _near(here[at_rest[1:]], here[at_rest[:-1]])
+    number[at_rest] = np.cumsum(~follows) - 1
     return number
 
 
