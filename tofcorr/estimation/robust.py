@@ -124,19 +124,15 @@ def outlying_images(frames: np.ndarray, rms: np.ndarray) -> list[dict[str, Any]]
         the logarithm of its error is above the median.
     """
     usable = np.isfinite(rms) & (rms > 0)
-    logarithm = np.log(rms[usable])
-    if len(logarithm) < 3:
-        return []
-    deviation = logarithm - np.median(logarithm)
+    frames, rms, logarithm = frames[usable], rms[usable], np.log(rms[usable])
+    deviation = logarithm - np.median(logarithm) if len(logarithm) > 2 else np.zeros(1)
     spread = sigma_from_mad(float(np.median(np.abs(deviation))))
-    if not spread > 0:
-        return []
-    found = [
-        {"frame": int(frame), "rms_mm": float(1e3 * error), "z": float(z)}
-        for frame, error, z in zip(frames[usable], rms[usable], deviation / spread, strict=True)
-        if 2 * z > 7  # Iglewicz and Hoaglin (1993) advise 3.5.
+    z = deviation / (spread or np.inf)
+    return [
+        {"frame": int(frames[k]), "rms_mm": float(1e3 * rms[k]), "z": float(z[k])}
+        for k in np.argsort(-z)
+        if 2 * z[k] > 7  # Iglewicz and Hoaglin (1993) advise 3.5.
     ]
-    return sorted(found, key=lambda outlier: -outlier["z"])
 
 
 def deviation(
