@@ -512,24 +512,18 @@ def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> N
             scripted).
     """
     if depth.dim() not in (2, 3) or list(depth.shape[-2:]) != [height, width]:
-        raise ValueError(
-            f"depth: expected shape ({height}, {width}) of the camera, or a batch of it; got "
-            f"{list(depth.shape)}. Was the frame cropped, binned or transposed?"
-        )
+        got = f"got {list(depth.shape)}. Was the frame cropped, binned or transposed?"
+        raise ValueError(f"depth: expected shape ({height}, {width}), or a batch of it; {got}")
     if list(amplitude.shape) != list(depth.shape):
-        raise ValueError(
-            f"amplitude: expected depth's shape {list(depth.shape)}, got {list(amplitude.shape)}."
-        )
+        wanted = f"expected depth's shape {list(depth.shape)}"
+        raise ValueError(f"amplitude: {wanted}, got {list(amplitude.shape)}.")
     if depth.dtype != torch.float32 or amplitude.dtype != torch.float32:
-        raise ValueError(
-            f"depth and amplitude: expected float32, got {_numbers(depth)} and "
-            f"{_numbers(amplitude)}. Convert depth to metres and both to float32."
-        )
+        got = f"got {_numbers(depth)} and {_numbers(amplitude)}"
+        advice = "Convert depth to metres and both to float32."
+        raise ValueError(f"depth and amplitude: expected float32, {got}. {advice}")
     if torch.is_grad_enabled() and (depth.requires_grad or amplitude.requires_grad):
-        raise ValueError(
-            "a corrector writes in place and gives no gradients: call it under torch.no_grad(), or "
-            "use tofcorr.DepthCorrection, which is differentiable."
-        )
+        advice = "call it under torch.no_grad(), or use tofcorr.DepthCorrection"
+        raise ValueError(f"a corrector writes in place and gives no gradients: {advice}.")
 
 
 def _numbers(tensor: Tensor) -> str:
