@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_recordings import frame_rows, write_small_recording
 
-from tofcorr.data.recording import Recording, pose_numbers
+from tofcorr.data.recording import Recording, pose_numbers, repeat_numbers
 from tofcorr.pixels.dataset import Dataset, SplitOptions, split_frames
 
 
@@ -44,6 +44,17 @@ def test_a_robot_that_creeps_does_not_stand_still(tmp_path: Path) -> None:
     rows = [replace(row, world_from_tool=pose, pose_id=None) for pose in poses]
     recording = Recording.open(write_small_recording(tmp_path / "creeping", rows=rows))
     assert pose_numbers(recording).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_frames_of_another_exposure_or_target_are_no_repeats(tmp_path: Path) -> None:
+    """Their errors differ too: the noise of a pixel was 6 and 10 mm where 4 is true."""
+    row = replace(frame_rows(np.random.default_rng(3))[0], pose_id="one", target="white")
+    times, targets = (1e-3, 5e-4, 1e-3, 1e-3, 5e-4, 1e-3), ("white",) * 5 + ("board",)
+    given = zip(times, targets, strict=True)
+    rows = [replace(row, integration_time=time, target=target) for time, target in given]
+    recording = Recording.open(write_small_recording(tmp_path / "one", rows=rows))
+    assert pose_numbers(recording).tolist() == [0] * 6
+    assert repeat_numbers(recording).tolist() == [0, 1, 0, 0, 1, 2]
 
 
 def test_no_stop_is_fitted_and_held_out_at_once(tmp_path: Path) -> None:

@@ -286,6 +286,23 @@ def pose_numbers(recording: Recording) -> np.ndarray:
     return pose
 
 
+def repeat_numbers(recording: Recording) -> np.ndarray:
+    """Return a number for each frame, shape (N,), int; frames that differ by noise alone share it.
+
+    They are of one pose, target and integration time: errors change with it, pixel by pixel.
+
+    Returns:
+        Numbers from 0 on, in the order of the first frame of each.
+    """
+    table = recording.frames
+    _, target = np.unique(table.target, return_inverse=True)
+    keys = np.column_stack([pose_numbers(recording), target])
+    if table.integration_time is not None:
+        keys = np.column_stack([keys, np.nan_to_num(table.integration_time)])
+    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return first.argsort().argsort()[number]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameBatch:
     """Some frames of a recording.

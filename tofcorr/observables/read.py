@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import torch
 
-from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
+from tofcorr.data.recording import Recording, iterate_frames, repeat_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING, tiles_of
 from tofcorr.estimation.robust import sigma_from_mad
@@ -28,15 +28,9 @@ _MOST_REPEATS, _MOST_OF_POSE = 30, 4000
 
 
 def pose_groups(recording: Recording) -> list[np.ndarray]:
-    """Return the numbers of the frames of every pose and target, in the order of the first frame.
-
-    One array of frame numbers a group; together they hold every frame once.
-    """
-    groups: dict[tuple[int, str], list[int]] = {}
-    pairs = zip(pose_numbers(recording), recording.frames.target, strict=True)
-    for frame, (pose, target) in enumerate(pairs):
-        groups.setdefault((int(pose), str(target)), []).append(frame)
-    return [np.array(frames) for frames in groups.values()]
+    """Return the numbers of the frames of each set of repeats, in the order of the first frame."""
+    numbers = repeat_numbers(recording)
+    return [np.flatnonzero(numbers == number) for number in range(numbers.max() + 1)]
 
 
 class Observed:

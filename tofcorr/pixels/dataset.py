@@ -26,6 +26,7 @@ from tofcorr.data.recording import (
     frame_conditions,
     iterate_frames,
     pose_numbers,
+    repeat_numbers,
     valid_pixels,
 )
 from tofcorr.error_terms.base import Domain, Interval
@@ -134,9 +135,16 @@ class Dataset:
 
     def pose_groups(self) -> np.ndarray:
         """Return an integer a frame, shape (N,): frames taken without moving share it."""
+        return self._numbered(pose_numbers)
+
+    def repeat_groups(self) -> np.ndarray:
+        """Return an integer a frame, shape (N,): frames that differ by noise alone share it."""
+        return self._numbered(repeat_numbers)
+
+    def _numbered(self, numbers_of: Callable[[Recording], np.ndarray]) -> np.ndarray:
         groups, start = [], 0
         for recording in self.recordings:
-            group = pose_numbers(recording)
+            group = numbers_of(recording)
             groups.append(group + start)
             start += int(group.max()) + 1
         return np.concatenate(groups)

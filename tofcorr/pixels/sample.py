@@ -221,7 +221,8 @@ def estimate_noise(
 ) -> DistanceNoise:
     """Return the noise of a measured distance as a function of its amplitude.
 
-    It is estimated from frames of one pose. Without any, neighbouring pixels give an upper bound.
+    It is estimated from repeats, frames that differ by noise alone. Without any, neighbouring
+    pixels give an upper bound.
 
     Args:
         dataset: The recordings.
@@ -232,7 +233,7 @@ def estimate_noise(
     """
     dataset.require("amplitude", "the noise model")
     frames = np.asarray(frames)
-    poses = dataset.pose_groups()[frames]
+    poses = dataset.repeat_groups()[frames]
     _, group, count = np.unique(poses, return_inverse=True, return_counts=True)
     repeated = frames[count[group] > 1]
     if len(repeated):

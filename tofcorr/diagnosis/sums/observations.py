@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
+from tofcorr.data.recording import Recording, iterate_frames, pose_numbers, repeat_numbers
 from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.walls import name_walls
@@ -220,15 +220,8 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
 
 
 def same_exposure(observations: Observations) -> list[np.ndarray]:
-    """Return the frames of each pose, target and integration time, in the order of the recording.
-
-    Errors change with the integration time, pixel by pixel, and would count as noise.
-    """
-    time = observations.facts.integration_time
-    exposure = np.zeros(observations.num_frames) if time is None else np.nan_to_num(time.numpy())
-    target = np.unique(observations.recording.frames.target, return_inverse=True)[1]
-    keys = np.stack([observations.unit.numpy(), target, exposure], axis=1)
-    _, group = np.unique(keys, axis=0, return_inverse=True)
+    """Return the frames of each set of repeats, in the order of the recording."""
+    group = repeat_numbers(observations.recording)
     return [np.flatnonzero(group == number) for number in range(group.max() + 1)]
 
 
