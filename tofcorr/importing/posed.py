@@ -35,6 +35,7 @@ from tofcorr.importing.timing import Lag, estimate_lag, far_lags, find_stops, pa
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
 from tofcorr.importing.walls.hand_eye import distances, exact
 from tofcorr.importing.walls.image_planes import ImagePlane, plane_masks, seen_planes
+from tofcorr.plausibility.finding import CAMERA, FAR_OFF
 from tofcorr.plausibility.mistakes import FAR_BETTER, IN_IMAGES, IN_POSES
 from tofcorr.progress import through
 
@@ -253,17 +254,24 @@ class PosedImport:
         return [f"{seeing}, and {off}. Do images and poses belong together?"]
 
     def _mistakes_undone(self, chosen: Chosen) -> Iterator[tuple[str, float]]:
-        """Yield each usual mistake, with advice, and the misfit that it leaves when undone."""
+        """Yield each usual mistake, with advice, and the misfit that it leaves when undone.
+
+        A unit is not tried in which the tool moves less, or the camera sees less far, than errors
+        of a camera: any planes then coincide.
+        """
         listed = [IN_POSES[name] for name in _OF_POSES]
         for cause, advice, undo in listed if self._changes is None else listed[:4]:
-            yield f"{cause}: {advice}.", self._misfit(chosen, undo)
+            if np.ptp(undo(chosen.world_from_tool)[:, :3, 3], axis=0).max() >= CAMERA:
+                yield f"{cause}: {advice}.", self._misfit(chosen, undo)
         cause, advice, mirrored = IN_IMAGES["mirrored"]
         left = self._misfit(chosen, depth=lambda image: mirrored(image.depth))
         yield f"{cause}: {advice}.", left
+        first = self._images.read(int(chosen.images[0]))
         for factor in (1 / 1000, 1 / 10, 10, 1000):
             said = f"all distances are multiplied by {factor:g}: is --depth-unit-mm right?"
-            yield said, self._misfit(chosen, depth=lambda image, k=factor: k * image.depth)
-        if self._images.read(int(chosen.images[0])).amplitude is not None:
+            if factor * np.ma.median(np.ma.masked_invalid(first.depth)) >= FAR_OFF:
+                yield said, self._misfit(chosen, depth=lambda image, k=factor: k * image.depth)
+        if first.amplitude is not None:
             said = "depth and amplitude are exchanged: swap --depth and --amplitude."
             yield said, self._misfit(chosen, depth=_amplitudes)
         for late in far_lags(self._track, *self._changes) if self._changes else ():
