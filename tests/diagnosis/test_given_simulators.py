@@ -3,6 +3,7 @@
 What it says of its own error, hand-eye transform and parameters counts.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from tofcorr.diagnosis.given import (
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import twin_frames
 
@@ -195,6 +197,40 @@ def test_other_cameras_and_depths_are_refused_in_a_sentence(
         with pytest.raises(CalibrationDataError, match=words) as refusal:
             rendered_error(own, observations, OPTIONS)
         assert str(refusal.value).count(". ") == 0
+
+
+@pytest.mark.parametrize(
+    "added",  # Pixels of the principal point in x and y, and per cent of the focal lengths.
+    [
+        (0.0, 0.0, 0.0, 0.0),
+        (0.5, 0.5, 0.0, 0.0),
+        (0.5, -0.5, 0.0, 0.0),
+        (0.0, 1.0, 0.0, 0.0),
+        (0.0, 0.0, 2.0, 2.0),
+        (0.0, 0.0, 3.0, 0.0),
+        (-0.4, 0.0, 0.0, -3.0),
+    ],
+)
+def test_pixels_that_look_beside_where_the_camera_matrix_says_are_named_with_size(
+    added: tuple[float, ...],
+    observations: Observations,
+    options: SimulatorOptions,
+    rendered: Render,
+) -> None:
+    """Frames of another renderer, 5 to 9 mm off by its pixel centres, had nothing odd."""
+    recording = observations.recording
+    matrix = np.array(recording.camera.matrix)
+    matrix[:2] += np.c_[matrix[:2, :2] * added[2:] / 100, added[:2]]
+    camera = replace(recording.camera, matrix=tuple(map(tuple, matrix.tolist())))
+    rays = ray_directions(camera).numpy()
+    poses = recording.frames.world_from_tool @ options.hand_eye.tool_from_camera().numpy()
+    walls = zip(poses, recording.frames.normal_world, recording.frames.offset, strict=True)
+    depth = [-(n @ pose[:3, 3] + d) / (rays @ pose[:3, :3].T @ n) for pose, n, d in walls]
+    noise = np.random.default_rng(1).normal(scale=0.002, size=np.shape(depth))
+    frames = rendered(depth=(np.array(depth) + noise).astype(np.float32))
+    limits = " ".join(rendered_error(frames, observations, OPTIONS).limits)
+    numbers = map(float, re.findall(r"([+-][0-9.]+)(?: px|%)", limits))
+    assert [*numbers] == pytest.approx([one for one in added if one], rel=0.05)
 
 
 def test_what_a_function_returned_is_refused_by_what_it_is(nothing_missing: Recording) -> None:

@@ -27,15 +27,22 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.rerun.simulator import twin_distance
 from tofcorr.diagnosis.sums.base import SimulatorError
 from tofcorr.diagnosis.sums.noise import PixelNoise, brightness_of, estimate_noise
-from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
+from tofcorr.diagnosis.sums.observations import (
+    Observations,
+    observe,
+    planes_in_camera,
+    predicted_distance,
+    seen_points,
+)
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.estimation.linear import pose_products, robust_covariance
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import judged
 from tofcorr.plausibility.checks.geometry import agreement, shape
-from tofcorr.plausibility.finding import CAMERA
+from tofcorr.plausibility.finding import CAMERA, SIGMAS, WORTH_A_WORD
 from tofcorr.plausibility.look import Look
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import default_hand_eye
@@ -235,14 +242,50 @@ def rendered_error(
     if missing > len(matches) / 2:
         return simulated_elsewhere(frames, observations, options)
     error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
+    limits = [_looks_beside(frames)] if rendered.true_depth is None else []
+    if missing:
+        limits.append(
+            f"{rendered.path}: {missing} of {len(matches)} recorded frames were not "
+            "rendered (no pose within 1 mm and 1 mrad); they are left out."
+        )
     known = SimulatorError.exact(error, pose, sigma)
-    if not missing:
-        return known
-    limit = (
-        f"{rendered.path}: {missing} of {len(matches)} recorded frames were not "
-        "rendered (no pose within 1 mm and 1 mrad); they are left out."
+    return replace(known, limits=tuple(filter(None, limits)))
+
+
+def _looks_beside(frames: Observations) -> str:
+    """Say by how much frames look beside where their camera matrix says; empty: they do not.
+
+    Planes and hand-eye transform of a simulator are exact, so that a shift of the principal point
+    and other focal lengths show beside errors of distance t and place in the image. With the unit
+    ray r, the normal n and p = r / r_z, t changes by -t r_z (r - n / n.r) times 1 / f a pixel of
+    the principal point, and times p for a focal length in proportion, across and down.
+    """
+    pose, camera = torch.from_numpy(frames.recording.tool_from_camera), frames.recording.camera
+    truth, slope, _ = seen_points(frames, pose)
+    aside = frames.rays - planes_in_camera(frames, pose)[0][frames.frame] / slope[:, None]
+    focal = torch.tensor([camera.matrix[0][0], camera.matrix[1][1]]).double()
+    place = frames.rays[:, :2] / frames.rays[:, 2:]
+    change = -(truth * frames.rays[:, 2])[:, None] * aside[:, :2]
+    columns = torch.cat([change / focal, change * place], dim=1)
+    left = (frames.measured - truth)[:, None]
+    others = [torch.ones_like(left), truth[:, None], place, place.square(), left]
+    sums = pose_products(torch.cat([columns, *others], dim=1), frames.frame)
+    sums = torch.cat([sums.sum(0)[None], sums.sum(0) - sums])  # Of all frames, and without each.
+    found = torch.linalg.solve(sums[:, :-1, :-1], sums[:, :-1, -1:])[:, :4, 0]
+    spread = robust_covariance(found[1:]).diagonal().sqrt()
+    moved = (columns * found[0]).square().mean(0).sqrt()
+    sure = (moved >= WORTH_A_WORD) & (found[0].abs() >= SIGMAS * spread)
+    if not bool(sure.any()):
+        return ""
+    named = ("{:+.2f} px in x", "{:+.2f} px in y", "{:+.1%} of fx", "{:+.1%} of fy")
+    zipped = zip(named, found[0].tolist(), sure.tolist(), strict=True)
+    said = ", ".join(words.format(value) for words, value, known in zipped if known)
+    size = 1e3 * float((columns @ found[0]).square().mean().sqrt())
+    return (
+        f"{frames.recording.path}: its frames agree with their planes if the camera matrix of "
+        f"recording.yaml changes by {said}; as it is, they are {size:.1f} mm off. Does the "
+        "renderer count pixel centres otherwise?"
     )
-    return replace(known, limits=(limit,))
 
 
 def _pixel_by_pixel(

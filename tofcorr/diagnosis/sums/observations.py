@@ -266,7 +266,7 @@ def seen_points(
         incidence, (M,); and the point in the world, (M, 3), metres.
     """
     frame, rays = observations.frame, observations.rays
-    normal, offset = _planes_in_camera(observations, tool_from_camera)
+    normal, offset = planes_in_camera(observations, tool_from_camera)
     slope = by_frame(rays, normal[:, :, None], frame)[:, 0]
     distance = -offset[frame] / slope
     pose = observations.facts.world_from_tool @ tool_from_camera
@@ -279,7 +279,7 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tu
 
     The twist acts from the right, tool_from_camera exp(twist), translation first.
     """
-    planes, offset = _planes_in_camera(observations, tool_from_camera)
+    planes, offset = planes_in_camera(observations, tool_from_camera)
     # One vector of all pixels after another: elementwise operations are fastest so.
     normal, rays = planes.T[:, observations.frame], observations.rays.T.contiguous()
     # A camera that moves by t and turns by w changes its height over the plane by n . t, and the
@@ -290,9 +290,7 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tu
     return distance, torch.cat([-normal / slope, by_rotation]).T
 
 
-def _planes_in_camera(
-    observations: Observations, tool_from_camera: Tensor
-) -> tuple[Tensor, Tensor]:
+def planes_in_camera(observations: Observations, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
     """Return normal (F, 3) and offset (F,) of each frame's plane in the camera's coordinates."""
     facts = observations.facts
     pose = facts.world_from_tool @ tool_from_camera
@@ -342,7 +340,7 @@ def predicted_images(
     rows: slice = slice(None),
 ) -> Tensor:
     """Return the distance of the plane in all pixels of some frames and rows; NaN where none."""
-    normal, offset = (x[part] for x in _planes_in_camera(observations, tool_from_camera))
+    normal, offset = (x[part] for x in planes_in_camera(observations, tool_from_camera))
     return ray_plane_distance(ray_directions(observations.recording.camera)[rows], normal, offset)
 
 
