@@ -19,4 +19,4 @@ def test_poses_count_by_their_weights_and_unknown_pixels_not_at_all() -> None:
     drawn = torch.tensor([[2.0, 0.0], [0.0, 2.0]]).double()
     gaps = excess_gaps(observations, left, share, 0.001, drawn)
     assert gaps.tolist() == pytest.approx([(32e-6 / 4) ** 0.5, 8e-6**0.5, 8e-6**0.5])
-    assert excess_gaps(observations, left, share, 0.1).tolist() == [0.0]
+    assert excess_gaps(observations, left, share, 0.1, drawn[:0]).tolist() == [0.0]

@@ -94,7 +94,7 @@ def test_two_effects_are_both_named(tmp_path: Path) -> None:
 def test_nothing_is_named_where_nothing_is_missing(
     nothing_study: Study, nothing_named: NamedEffects
 ) -> None:
-    assert nothing_named.names == nothing_named.with_probes == ()
+    assert nothing_named.names == nothing_named.probes == ()
     assert not _judged(nothing_study, nothing_named).unknown
 
 

@@ -70,7 +70,7 @@ from tofcorr.estimation.linear import solvable
 from tofcorr.files import staged_folder
 from tofcorr.observables.compare import Observables
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
+from tofcorr.pixels.dataset import Dataset, opened, resolved_planes, thread_number
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
@@ -111,11 +111,8 @@ def diagnose(
     """
     # First of all: what cannot be written is refused before any work.
     with staged_folder(out) if out is not None else nullcontext() as folder:
-        if not isinstance(recording, Recording):
-            recording = Recording.open(Path(recording))
-        options = (
-            DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
-        )
+        (recording,) = opened(recording)
+        options = resolve_options(DiagnosisOptions, {} if config is None else config)
         with (
             thread_number(options.threads),
             stages("diagnosing", 5 if folder is None else 6) as begin,
@@ -191,10 +188,9 @@ def prepare(
     fit = fit_base(model, observations, known)
     observations = fit.model.observations
     as_given = None if known is None else known.residual(observations)
-    generator = torch.Generator().manual_seed(options.seed)
     inputs = effect_inputs(observations, fit.tool_from_camera)
     inputs = filtered_inputs(inputs, observations, fit)
-    study = build_study(options, observations, fit, inputs, generator)
+    study = build_study(options, observations, fit, inputs)
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
     outliers = outliers_of(study)
@@ -244,9 +240,8 @@ def _with_base_pattern(study: Study) -> Study:
     kind = CATALOGUE[term.kind]
     pattern = kind.for_recording(study.inputs)
     assert isinstance(pattern, MapEffect)
-    residual = study.residual_of(())
     spread = None if term.spread_mm == "auto" else term.spread_mm / 1000
-    fitted = FittedMap(study, pattern, residual, prior_sd=spread, least_sd=TINY)
+    fitted = FittedMap(study, pattern, study.residual_of(()), prior_sd=spread, least_sd=TINY)
     study = without_map(study, fitted.values, {kind.name, *kind.contains})
     return replace(study, pattern=pattern.with_coefficients(fitted.whole()))
 
@@ -274,8 +269,7 @@ def conclude(
     begin("measuring the gap")
     parts, explained = parts_of(study, named, residual), None
     if residual is not None:
-        once = torch.ones_like(resamples[:1])
-        explained = explained_squares(parts, torch.cat([once, resamples]))
+        explained = explained_squares(parts, resamples)
     gap = measure_gap(study, named, resamples, explained)
     shares = attribute(parts, gap, resamples)
     begin("judging what remains")

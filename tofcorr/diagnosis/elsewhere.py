@@ -34,7 +34,6 @@ from tofcorr.diagnosis.sums.study import (
     relinearised,
     with_poses_reestimated,
 )
-from tofcorr.error_terms.base import Interval
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.effects.base import EffectInputs
 
@@ -85,13 +84,8 @@ def simulated_elsewhere(
     fit = fit_base(BaseModel(frames, base, hand_eye_free=False), frames, known)
     kinds = {n: kind for n, kind in CATALOGUE.items() if not kind.missing(here)}
     lacking += [n for n, k in kinds.items() if k.missing(there) and not issubclass(k, MapEffect)]
-    study = build_study(
-        options.model_copy(update={"catalogue": tuple(kinds), "leave_out": ()}),
-        frames,
-        fit,
-        there,
-        torch.Generator().manual_seed(options.seed),
-    )
+    every = options.model_copy(update={"catalogue": tuple(kinds), "leave_out": ()})
+    study = build_study(every, frames, fit, there)
     error, uncertain, misfit = _carried(study, real, here)
     outside, warnings = torch.zeros_like(error, dtype=torch.bool), []
     if scale != 1.0:
@@ -106,18 +100,18 @@ def simulated_elsewhere(
             "be told."
         )
     seen = fit.model.domain
-    ranges = (
-        ("distance in metres", here.radial_distance, seen.radial_distance),
-        (
-            "amplitude",
-            real.amplitude,
-            seen.amplitude,
-        ),
-    )
-    for name, values, interval in ranges:
+    ranges = (here.radial_distance, seen.radial_distance), (real.amplitude, seen.amplitude)
+    for values, interval in ranges:
         if values is not None and interval is not None:
-            beyond, words = _beyond(name, values, interval)
-            outside, warnings = outside | beyond, [*warnings, *words]
+            # A low polynomial hardly leaves its course within a twentieth beyond its range.
+            reach = (interval.high - interval.low) / 20
+            outside |= (values < interval.low - reach) | (values > interval.high + reach)
+    share = float(outside.double().mean())
+    if 1000 * share > 1:
+        warnings.append(
+            f"{100 * share:.1f} % of the recording's pixels lie beyond the simulator's distances "
+            "or amplitudes; they are left out."
+        )
     first = (
         f"The simulator saw other poses: its error was fitted to its own {frames.num_frames} "
         f"frames, to {1000 * misfit:.1f} mm on held-out ones, and carried to the recording's "
@@ -158,29 +152,6 @@ def _amplitude_scale(
     return ratio if max(ratio, 1 / max(ratio, TINY)) > 1.5 else 1.0
 
 
-def _beyond(name: str, real: Tensor, simulated: Interval) -> tuple[Tensor, list[str]]:
-    """Return which pixels lie beyond the simulator's range of a variable, and a warning.
-
-    A range counts as covered by a twentieth beyond its ends: a low polynomial hardly leaves its
-    course there. A thousandth of the pixels may be gross errors.
-
-    Args:
-        name: Of the variable, for the warning.
-        real: Values of the recording, shape (M,).
-        simulated: Range of the simulator's frames.
-    """
-    low, high = simulated
-    reach = (high - low) / 20
-    beyond = (real < low - reach) | (real > high + reach)
-    share = float(beyond.double().mean())
-    if 1000 * share <= 1:
-        return beyond, []
-    return beyond, [
-        f"{100 * share:.1f} % of the recording's pixels lie beyond the simulator's range of "
-        f"{name} ({low:.3g} to {high:.3g}); they are left out."
-    ]
-
-
 def _carried(study: Study, real: Observations, here: EffectInputs) -> tuple[Tensor, Tensor, float]:
     """Fit base terms and effects to a simulator's frames; predict them at other pixels.
 
@@ -216,10 +187,9 @@ def _carried(study: Study, real: Observations, here: EffectInputs) -> tuple[Tens
     # The matrix is singular to rounding where the frames determine a coefficient very well.
     variance, turn = torch.linalg.eigh(covariance[carried][:, carried])
     uncertain = torch.cat(columns, dim=1) @ (turn * variance.clamp(min=0.0).sqrt())
-    directions = uncertain @ torch.linalg.eigh(uncertain.T @ uncertain)[1]
-    # Beyond the largest two dozen none changes a finding.
-    largest = directions.square().mean(0).argsort(descending=True)[:24]
-    return error, directions[:, largest], max(left, 0.0) ** 0.5
+    # Beyond the largest two dozen directions none changes a finding; they come last.
+    largest = torch.linalg.eigh(uncertain.T @ uncertain).eigenvectors[:, -24:]
+    return error, uncertain @ largest, max(left, 0.0) ** 0.5
 
 
 def _needed(study: Study) -> list[str]:

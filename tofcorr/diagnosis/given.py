@@ -18,7 +18,6 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import IMAGE_ARRAYS
 from tofcorr.data.recording import (
-    HEADER_FILE,
     Recording,
     planes_in_tool,
 )
@@ -91,16 +90,9 @@ def open_simulator(sim: Simulator | None, recording: Recording) -> OpenSimulator
         CalibrationDataError: The folder is not a recording, or the function does not return frames
             of the recording's shape.
     """
-    if sim is None:
-        return None
-    if isinstance(sim, Recording):
+    if sim is None or isinstance(sim, Recording):
         return sim
     if isinstance(sim, str | Path) and Path(sim).is_dir():
-        if not (Path(sim) / HEADER_FILE).exists():
-            raise ConfigError(
-                f"{sim}: a simulator is a YAML file, the name of a shipped configuration, or the "
-                f"folder of a recording; this folder has no {HEADER_FILE}."
-            )
         return Recording.open(sim)
     if callable(sim):
         return frames_of(sim(recording), recording)
@@ -346,10 +338,6 @@ def refuse_other_camera(real: Recording, simulated: Recording) -> None:
         )
 
 
-# Where `simulation.simulator` keeps its options in a recording.
-_OPTIONS_OF_SIMULATE = "truth/options.yaml"
-
-
 def refuse_mistaken_geometry(simulated: Recording) -> None:
     """Refuse frames that a usual mistake keeps from agreeing with their own planes.
 
@@ -388,7 +376,7 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
 
 def _refuse_guess(simulated: Recording) -> None:
     """Refuse a transform that `tofcorr simulate` wrote as a guess, however close it is."""
-    path = simulated.path / _OPTIONS_OF_SIMULATE
+    path = simulated.path / "truth/options.yaml"  # `simulation.simulator` writes it.
     if not path.exists():
         return
     try:

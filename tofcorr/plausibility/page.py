@@ -51,7 +51,7 @@ def page_text(
     name: str,
     figures: Mapping[str, Figure],
     filters: Mapping[str, Callable[..., Any]],
-    **values: Any,  # noqa: ANN401 - whatever the template reads
+    **values: object,
 ) -> str:
     """Return a page, made by the template of this name in a package.
 

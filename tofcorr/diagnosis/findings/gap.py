@@ -43,9 +43,7 @@ def resampled(units: int, count: int, generator: torch.Generator) -> Tensor:
     return counts.scatter_add(1, picked, torch.ones_like(counts))
 
 
-def studentised(
-    total: Tensor, count: Tensor, resamples: Tensor, *, least_error: float = 0.2
-) -> Tensor:
+def studentised(total: Tensor, count: Tensor, resamples: Tensor) -> Tensor:
     r"""Draw a ratio of sums over units from its studentised bootstrap (Efron and Tibshirani 1993).
 
     In a resample b the ratio differs from that of all units, r, by t_b standard errors of its own.
@@ -54,22 +52,21 @@ def studentised(
     .. math:: r - t_b \, \mathrm{se}(r) .
 
     With few units they reach farther than the ratios of the resamples, above all upwards, as they
-    must: large squares are rare, and a sample without one seems more certain than it is.
+    must: large squares are rare, and a sample without one seems more certain than it is. A resample
+    of few poses that happen to be alike would seem to know everything: its standard error is a
+    fifth of that of all units at least (chosen).
 
     Args:
         total: Numerator of every unit, shape (U,).
         count: Denominator of every unit, shape (U,).
         resamples: How often each resample holds each unit, shape (B, U).
-        least_error: Least standard error in a resample over that of all units, no unit. Chosen: a
-            resample of few poses that happen to be alike would otherwise seem to know everything.
 
     Returns:
         Shape (B,).
     """
-    whole = torch.ones_like(resamples[:1])
-    ratio, error = _ratio(total, count, whole)
+    ratio, error = _ratio(total, count, torch.ones_like(resamples[:1]))
     own, own_error = _ratio(total, count, resamples)
-    least = (least_error * error).clamp(min=torch.finfo(total.dtype).tiny)
+    least = (error / 5).clamp(min=torch.finfo(total.dtype).tiny)
     return ratio - (own - ratio) * error / own_error.maximum(least)
 
 
@@ -220,10 +217,8 @@ def _drawn_again(named: NamedEffects, resamples: Tensor) -> dict[Model, Tensor]:
     generator = torch.Generator().manual_seed(named.study.options.seed + 5)
     probability = named.models.posterior(resamples, generator).T
     drawn = torch.multinomial(probability, 1, generator=generator)[:, 0]
-    own = [
-        tuple(name for name in named.models.models[number] if name not in named.models.probes)
-        for number in drawn.tolist()
-    ]
+    effects = named.models.effects
+    own = [effects[number] for number in drawn.tolist()]
     return {model: torch.tensor([each == model for each in own]) for model in dict.fromkeys(own)}
 
 
@@ -319,7 +314,7 @@ def judge_remainder(study: Study, named: NamedEffects, gap: Gap) -> OpenSet:
         gap: Before and after them.
     """
     options, tiny, poses = study.options, OpenSet.least_variance, study.sums.num_units
-    theta = named.study.sums.ols.solve(named.with_probes)
+    theta = named.study.sums.ols.solve((*named.columns, *named.probes))
     known = len(named.study.sums.layout.of(named.columns))
     left = named.study.residual - named.study.times(named.columns, theta[:known])
     after = coherence(named.study, left)
@@ -378,7 +373,8 @@ def _fingerprint(
             images if these do. Chosen.
     """
     clauses = [named.study.candidates.probes[name].trace for name in named.probes]
-    share = after.between / max(after.total, OpenSet.least_variance)
+    whole = max(after.within, 0.0) + max(after.between, 0.0)
+    share = after.between / max(whole, OpenSet.least_variance)
     if share > mostly:
         clauses.append("shifts whole images")
     elif share < 1 - mostly and after.within > 0:

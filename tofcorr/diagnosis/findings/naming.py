@@ -106,11 +106,6 @@ class NamedEffects:
         """The effects named that have columns."""
         return self.columns_of(self.names)
 
-    @property
-    def with_probes(self) -> tuple[str, ...]:
-        """The columns of the model: those of the effects named, then of probes."""
-        return (*self.columns, *self.probes)
-
     def columns_of(self, model: Model) -> tuple[str, ...]:
         """Return the effects of a model that have columns, probes left out."""
         return tuple(name for name in model if name in self.study.candidates.effects)
@@ -195,8 +190,7 @@ def _beside(study: Study, model: Model, evidence: Evidence) -> Study:
 def _without_probes(models: Models, probability: Tensor) -> dict[Model, float]:
     """Return the probability of each set of effects, whatever else may be there."""
     joint: dict[Model, float] = {}
-    for model, own in zip(models.models, probability.tolist(), strict=True):
-        effects = tuple(name for name in model if name not in models.probes)
+    for effects, own in zip(models.effects, probability.tolist(), strict=True):
         joint[effects] = joint.get(effects, 0.0) + own
     return joint
 

@@ -64,8 +64,8 @@ class Outliers:
 
         Fewer are worth one too where they hold more of the squared error than the noise does.
         """
-        many = self.deleted + self.reduced >= self.worth_a_warning
-        if not (many or self.deleted * self.size**2 > self.noise**2):
+        rare = self.deleted + self.reduced < self.worth_a_warning
+        if rare and self.deleted * self.size**2 <= self.noise**2:
             return ""
         said, reason = [], ""
         if self.wrapped_by is not None:
@@ -247,10 +247,9 @@ def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
     gap = missed_distance(study)
     if gap <= LARGEST_GAP:
         return
-    odd, remedy = " ".join(f"- {one.sentence}" for one in inspection.findings), ""
-    if inspection.outlying:  # A training leaves them out by itself.
-        frames = in_words(tuple(inspection.outlying))
-        remedy = f"Leave {frames} out of the recording, or mend them. "
+    odd = " ".join(f"- {one.sentence}" for one in inspection.findings)
+    outlying = tuple(inspection.outlying)  # A training leaves them out by itself.
+    remedy = f"Leave {in_words(outlying)} out of the recording, or mend them. " if outlying else ""
     size = f"by {1e3 * gap:.0f} mm" if gap < 1 else "by more than a metre"
     raise CalibrationDataError(
         f"{study.observations.recording.path}: even for a camera fitted to them distances and "
@@ -262,7 +261,7 @@ def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
 
 
 def missed_distance(study: Study) -> float:
-    """Return by how much distances and planes disagree, metres; infinite: not a number.
+    """Return by how much distances and planes disagree, metres; NaN: not a number.
 
     That is the larger of two: the error of each pose beside all others, and the spread of the
     distances about those to the planes, with no error model but a constant. A fit without a pose
@@ -277,9 +276,7 @@ def missed_distance(study: Study) -> float:
     observations = study.observations
     off = observations.measured - predicted_distance(observations, study.fit.tool_from_camera)
     spread = float(sigma_from_mad((off - off.median()).abs().median()))
-    if not (math.isfinite(square) and math.isfinite(spread)):
-        return math.inf
-    return max(math.sqrt(max(square - study.fit.floor**2, 0.0)), spread)
+    return float(np.maximum(math.sqrt(max(square - study.fit.floor**2, 0.0)), spread))
 
 
 def headline_of_given(as_given: float | None) -> str | None:

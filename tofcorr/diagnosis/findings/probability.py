@@ -286,6 +286,11 @@ class Models:
     probes: frozenset[str]
 
     @property
+    def effects(self) -> list[Model]:
+        """Each model without its probes."""
+        return [tuple(n for n in model if n not in self.probes) for model in self.models]
+
+    @property
     def total(self) -> Tensor:
         """Log predictive density of all poses, shape (N,)."""
         return self.densities.sum(1)
@@ -301,7 +306,7 @@ class Models:
 
     def sizes_of(self, effects: Model) -> Mapping[str, float]:
         """Return the prior sizes of the best model with exactly these effects and any probes."""
-        own = [set(model) - self.probes == set(effects) for model in self.models]
+        own = [model == effects for model in self.effects]
         level = torch.where(torch.tensor(own), self.total - self._prices, -torch.inf)
         return self.sizes[int(level.argmax())]
 

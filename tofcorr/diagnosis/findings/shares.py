@@ -115,7 +115,7 @@ def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Sh
             members[HAND_EYE], offsets[HAND_EYE] = (*range(model.num_hand_eye),), _bent(study)
         members[_OF_CONSTANT] = (model.num_geometry,)
         start = model.num_geometry + 1
-        for term in model.terms:
+        for term in model.error_model.terms():
             name, end = _cause_of(term), start + len(term.symbols)
             members[name] = (*members.get(name, ()), *range(start, end))
             start = end
@@ -333,19 +333,17 @@ def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
     return coefficients @ (2 * gram[:-1, -1] - gram[:-1, :-1] @ coefficients.sum(0))
 
 
-def parts_of(
-    study: Study, named: NamedEffects, residual: Tensor | None, *, least_of_term: float = 1e-4
-) -> Parts:
+def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Parts:
     """Return the parts of the residual of a simulator as given.
+
+    A base term changes only if that closes a tenth of the target gap. The hand-eye transform needs
+    as much as a second effect: it resembles most what models miss.
 
     Args:
         study: The recording, before any effect was named.
         named: The effects named.
         residual: Of the simulator as given, shape (M,), metres; None: that of the base model, of
             which only effects are causes.
-        least_of_term: A base term changes only if that closes this, metres. Chosen: what no one
-            calls a gap. The hand-eye transform needs as much as a second effect: it resembles most
-            what models miss.
     """
     model, sums, tests = study.fit.model, named.study.sums.ols, study.options.tests
     fitted, columns = sums.of(named.columns), named.study.columns_of(named.columns)
@@ -367,7 +365,8 @@ def parts_of(
     everything = torch.cat([*columns, shared[:, None], torch.ones_like(shared[:, None])], dim=1)
     gap = study.left_out_mean_square(()) - study.fit.floor**2
     second = max((tests.further_mm / 1000) ** 2, tests.material_share * gap)
-    pose, least = sums.scale * study.sums.count, min(second, least_of_term**2)
+    pose = sums.scale * study.sums.count
+    least = min(second, (study.options.target_gap_mm / 10_000) ** 2)
     return Parts(
         causes=tuple(causes),
         products=study.observations.products(everything, everything * weight[:, None]),
@@ -384,17 +383,13 @@ def parts_of(
     )
 
 
-def hidden_shares(
-    parts: Parts, refitted: Refitted, unexplained: float, *, ridge_limit: float = 1e-9
-) -> list[float]:
+def hidden_shares(parts: Parts, refitted: Refitted, unexplained: float) -> list[float]:
     """Return by how much each cause's share may be too small or too large, 95 %.
 
     Args:
         parts: What each cause contributes.
         refitted: The same, fitted to all poses.
         unexplained: The share that is unexplained.
-        ridge_limit: Added to the diagonal of a cause's products, as a share of its mean, so that
-            they are regular.
     """
     centred, whole, widths = refitted.centred, float(refitted.products[-2, -2]), []
     if whole <= 0:
@@ -404,9 +399,8 @@ def hidden_shares(
         known = square = float(centred[-1, -1])
         if cause.kind == "parameter":
             own = [*cause.members, *([] if cause.fixed is None else [cause.fixed])]
-            gram, right = centred[own][:, own], centred[own, -1]
-            ridge = ridge_limit * gram.diagonal().mean() * torch.eye(len(own), dtype=torch.float64)
-            known = min(float(right @ torch.linalg.solve(gram + ridge, right)), square)
+            inverse, right = torch.linalg.pinv(centred[own][:, own]), centred[own, -1]
+            known = min(float(right @ inverse @ right), square)
         widths.append(reach * math.sqrt(max(known, 0.0)))
     return widths
 
@@ -516,12 +510,14 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
 
 
 def explained_squares(parts: Parts, weights: Tensor) -> Tensor:
-    """Return what all parts together explain of the residual as given in resamples, (B, 3), m^2.
+    """Return what all parts together explain of the residual as given, (1 + B, 3), m^2.
 
+    Of all poses, then in every resample.
     The first is the mean square explained. What is explained and what is left together lie between
     the other two: the mean square of the residual less that of the noise, which is known to
     `FLOOR_ERROR`.
     """
+    weights = torch.cat([torch.ones_like(weights[:1]), weights])
     explained = torch.stack([parts.refitted(own).values.sum() for own in weights])
     whole, noise = weights @ parts.products[:, -2, -2], weights @ parts.noise
     limits = [whole - noise * (1 + sign * FLOOR_ERROR) ** 2 for sign in (1, -1)]

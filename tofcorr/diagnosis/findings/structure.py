@@ -63,11 +63,6 @@ class Coherence:
     form: str
     noise_share: float = 0.0
 
-    @property
-    def total(self) -> float:
-        """Within and between images together, m^2."""
-        return max(self.within, 0.0) + max(self.between, 0.0)
-
 
 def coherence(study: Study, residual: Tensor) -> Coherence:
     """Measure the structure of a residual, shape (M,), metres."""
@@ -110,20 +105,18 @@ def _shared(study: Study, residual: Tensor, cells: Tensor) -> float:
     return float(products / pairs.clamp(min=TINY))
 
 
-def without_pose(study: Study, residual: Tensor, *, ridge: float = 1e-3) -> tuple[Tensor, float]:
+def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
     """Subtract each pose's offset and tilts; return their mean square too, less that of noise.
 
     Args:
         study: The recording.
         residual: Shape (M,), metres.
-        ridge: Added to the pose equations, 1 / m^2, so that a pose of few pixels can be solved for.
     """
     inner, score = study.pose_equations(residual)
-    inner = inner + ridge * torch.eye(3, dtype=torch.float64)
-    surface = study.pose_surface(torch.linalg.solve(inner, score))
-    covariance = torch.linalg.inv(inner)[study.unit_of_pixel]
+    covariance = torch.linalg.pinv(inner, hermitian=True)
+    surface = study.pose_surface((covariance @ score[:, :, None])[:, :, 0])
     pose, share = study.pose, study.fit.share
-    noise = ((pose[:, None, :] @ covariance)[:, 0] * pose).sum(1)
+    noise = ((pose[:, None, :] @ covariance[study.unit_of_pixel])[:, 0] * pose).sum(1)
     between = float((share * (surface**2 - noise)).sum() / share.sum())
     return residual - surface, between
 

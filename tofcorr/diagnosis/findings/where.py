@@ -24,7 +24,6 @@ from tofcorr.geometry.se3 import by_frame
 from tofcorr.simulation.effects.base import is_clock
 
 Interval = tuple[float, float]
-StageName = Literal["as_given", "recalibrated", "with_effects"]
 
 
 def interval_of(draws: Sequence[float], estimate: float) -> Interval:
@@ -97,7 +96,7 @@ class Stage:
         offsets: Mean residual of each pose, shape (U,), metres.
     """
 
-    name: StageName
+    name: Literal["as_given", "recalibrated", "with_effects"]
     gap: Estimated | None = None
     regions: tuple[Region, ...] = ()
     tiles: np.ndarray = field(default_factory=lambda: np.full(TILES, np.nan))
@@ -231,9 +230,6 @@ def find_where(
     binned: Sequence[Binned],
     chosen: Sequence[str] | None = (),
     residual: Tensor | None = None,
-    *,
-    least_left: float = 0.1,
-    rounding: float = 1e-9,
 ) -> Stage:
     """Test all covariates and the image map for a bias; return the stage with what was found.
 
@@ -245,11 +241,6 @@ def find_where(
         binned: The covariates in bins.
         chosen: Effects of the model whose residual is tested; None: `residual` is, of no fit.
         residual: Of what was not fitted, shape (M,), metres.
-        least_left: Least standard deviation of a sum that the model was fitted to, over that of
-            residuals that it was not. Chosen: what the model absorbs so far shows no bias, and how
-            far is known to 2 %.
-        rounding: Relative difference of two statistics that counts as none: a bin of few poses has
-            flips that give what was observed. Chosen, far above the rounding of sums.
     """
     if residual is None:
         residual = left_out_residual(study, chosen or ())
@@ -282,11 +273,13 @@ def find_where(
     sums, total, counts = sums[:-1], total[:-1], counts[:-1]
     spread = sums.square().sum(1).sqrt()
     enough = ((counts > 0).sum(1) >= min(4, sums.shape[1])) & (spread > 0)
-    spread = torch.maximum(total[:, 1:].square().mean(1).sqrt(), least_left * spread)
+    # What the model absorbs to a tenth shows no bias: how far it does is known to 2 %.
+    spread = torch.maximum(total[:, 1:].square().mean(1).sqrt(), spread / 10)
     scaled = torch.where(enough[:, None], total.abs() / spread.clamp(min=TINY)[:, None], 0.0)
     observed, largest = scaled[:, 0], scaled[:, 1:].amax(0)
-    as_large = (largest >= (1 - rounding) * observed[:, None]).sum(1).double()
-    p_values = (1 + as_large) / (len(largest) + 1)
+    # A bin of few poses has flips that give what was observed, but for rounding.
+    as_large = (largest > observed[:, None]) | torch.isclose(largest, observed[:, None])
+    p_values = (1 + as_large.sum(1).double()) / (len(largest) + 1)
     critical, weight = float(torch.quantile(largest, 1 - LEVEL)), counts.sum(1).clamp(min=TINY)
     bias, half = total[:, 0] / weight, critical * spread / weight
     found = []

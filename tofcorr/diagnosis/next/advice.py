@@ -86,8 +86,7 @@ def _other_conditions(study: Study, known: dict[str, Tensor]) -> list[Change]:
         ("with a lamp on", "ambient", 1.0, strong),
         ("in the dark", "ambient", 0.0, 0.0),
     )
-    known_rows = (row for row in rows if row[1] in known)
-    return changes + [(words, name, a * known[name] + b) for words, name, a, b in known_rows]
+    return changes + [(said, n, a * known[n] + b) for said, n, a, b in rows if n in known]
 
 
 def _other_poses(study: Study, sources: Tensor, *, tilt: float = 0.35) -> list[Change]:
@@ -217,13 +216,12 @@ def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str
             needed = noncentrality(study, len(study.candidates.maps[name].coefficients))
             detectable = (needed / float(study.weight.sum())) ** 0.5
             found[name] = max(detectable, study.material_mm / 1000)
-            continue
-        found[name] = None
-        if 1 - absorbed_share(study, name) < LEAST_LEFT:
-            continue
-        size = len(range(*study.sums.layout.effects[name]))
-        drawn = torch.randn(64, size, generator=generator, dtype=torch.float64)
-        found[name] = _of_columns(study, name, drawn)
+        elif 1 - absorbed_share(study, name) < LEAST_LEFT:
+            found[name] = None
+        else:
+            size = len(range(*study.sums.layout.effects[name]))
+            drawn = torch.randn(64, size, generator=generator, dtype=torch.float64)
+            found[name] = _of_columns(study, name, drawn)
     return found
 
 
@@ -334,8 +332,7 @@ def _advised(study: Study, candidates: Candidates, question: Question) -> str:
         numbers = ", ".join(map(str, alike))
         listed.append(f"{count} {words} (like frame{'s' * (len(alike) > 1)} {numbers})")
     advice = f", record {number} more frames: {'; '.join(listed)}. It could then be detected"
-    columns = len(total) - len(known)
-    raw = signal(study, effect) / (columns * ols.scale * float(study.sums.count.sum()))
+    raw = signal(study, effect) / (len(own) * ols.scale * float(study.sums.count.sum()))
     needed = noncentrality(study, len(own))
     now, then = ((raw * needed / max(one, TINY)) ** 0.5 for one in (before, after))
     if before > 0 and now < 1:  # A metre is no error of a depth camera.

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 STAGE_COLOURS = {"as_given": GREY, "recalibrated": RED, "with_effects": BLUE}
 """The colour of a stage in every figure."""
-_LIGHT_BLUE = "#8fbbd9"
 _KIND_COLOURS = {"parameter": GREY, "effect": RED, "unexplained": "#bbbbbb"}
 
 
@@ -60,14 +59,12 @@ def stage_bars(result: "DiagnosisResult") -> Figure:
         (f"+ {effect_words(result.evidence.study, name)}", size, BLUE)
         for name, size in result.gap_steps
     ]
-    bars[-1:-1] = steps[:-1]
-    if steps:  # Its bar is that of the stage. Three lines would touch the next bar's.
-        bars[-1] = (f"{steps[-1][0].split(' (')[0]}:\n{bars[-1][0]}", *bars[-1][1:])
+    if steps:  # The last one is the stage with the effects.
+        bars[-1:] = steps
     if result.degraded is not None:
-        bars.append(("degraded frames", result.degraded.gap, _LIGHT_BLUE))
-    figure, axes = _bars(
-        bars, 1e3, "gap, mm (root mean square, noise taken off)", lambda size: f"{mm(size)} mm"
-    )
+        bars.append(("degraded frames", result.degraded.gap, "#8fbbd9"))
+    label, limits = "gap, mm (root mean square, noise taken off)", (-math.inf, math.inf)
+    figure, axes = _bars(bars, 1e3, label, lambda size: f"{mm(size)} mm", limits)
     floor = 1e3 * result.gap.floor
     if floor < axes.get_xlim()[1]:  # A card tells a larger one.
         axes.axvline(floor, color="black", linestyle=":", linewidth=1, label="noise of one pixel")
@@ -86,11 +83,7 @@ def attribution_bars(result: "DiagnosisResult") -> Figure:
 
 
 def _bars(
-    bars: Sequence[Bar],
-    scale: float,
-    label: str,
-    words: Callable[[float], str],
-    limits: Interval = (-math.inf, math.inf),
+    bars: Sequence[Bar], scale: float, label: str, words: Callable[[float], str], limits: Interval
 ) -> tuple[Figure, Axes]:
     """Draw bars from top to bottom, their lengths in words in a column at the right.
 

@@ -368,18 +368,12 @@ def render(result: DiagnosisResult) -> str:
         **result.to_mapping(),
         result=result,
         study=study,
-        options=result.options,
-        gap=result.gap,
-        recording=study.observations.recording,
         shown=stages_shown(result),
         pose_errors=pose_errors(result),
         closed={name: named.closed_gap(name)[1] for name in named.ranking},
         catalogue=CATALOGUE,
         stage_words=STAGE_WORDS,
-        torch_version=torch.__version__,
-        numpy_version=np.__version__,
-        hand_eye_free=study.fit.model.hand_eye_free,
-        saturated_missing=result.observables.real_dropouts.saturated_missing,
+        libraries=f"torch {torch.__version__}, NumPy {np.__version__}",
     )
 
 
@@ -416,11 +410,10 @@ def write_events(result: DiagnosisResult, folder: Path | str) -> None:
         result: What was found.
         folder: Usually REPORT/tb; made if it is missing.
     """
-    gap, known_stages = result.gap, [one for one in result.stages if one.gap is not None]
-    numbers = {f"stage_mm/{stage.name}": 1e3 * (stage.gap or 0.0) for stage in known_stages}
+    gap, probabilities = result.gap, result.evidence.named.probabilities
+    numbers = {f"stage_mm/{s.name}": 1e3 * s.gap for s in result.stages if s.gap is not None}
     numbers |= {f"gap_mm/{part}": 1e3 * getattr(gap, part) for part in ("before", "after", "floor")}
-    named = result.evidence.named
-    numbers |= {f"probability/{name}": own for name, own in named.probabilities.items()}
+    numbers |= {f"probability/{name}": own for name, own in probabilities.items()}
     numbers |= {f"share/{cause.cause}": cause.share for cause in result.shares}
     curves: dict[str, list[float]] = {}
     for stage in stages_shown(result):

@@ -40,7 +40,6 @@ _LABELS = {
     "amplitude": "amplitude, counts",
     "phase_quarter_deg": "four times the phase, deg",
     **{each.covariate: each.label for each in map(condition, CONDITIONS)},
-    "frame": "frame number",
     **{f"{place}_{axis}_m": f"{place} {axis}, m" for place in ("target", "tool") for axis in "xyz"},
 }
 
@@ -169,15 +168,13 @@ def write_verdict(
 def _without_causes(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     poses = gap.as_given is None and remainder.scatter**2 > 0.5 * gap.whole**2
     scatter = f"Poses of camera or target that scatter by {mm(remainder.scatter)} mm"
+    small = gap.whole < named.study.options.target_gap_mm / 1000
     said = (
         (remainder.unknown and gap.as_given is not None, "No parameter and no effect explains it."),
         (remainder.unknown, f"None of the effects tested explains it{_nearest(named)}."),
         (gap.whole.interval[0] <= 0, "It may be noise alone."),
         (poses, f"{scatter} would explain it."),
-        (
-            gap.whole < named.study.options.target_gap_mm / 1000,
-            "That is too small to show a cause.",
-        ),
+        (small, "That is too small to show a cause."),
         (True, "None of the effects tested is probable."),
     )
     return next(sentence for holds, sentence in said if holds)
@@ -201,19 +198,16 @@ def _nearest(named: NamedEffects) -> str:
 
 
 def _something_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
-    names = {name: effect_words(named.study, name) for name in named.names}
-    *first, last = names.values()
+    *first, last = (effect_words(named.study, name) for name in named.names)
     many = f"{', '.join(first)} and {last}" if first else last
     start, advice = "With ", "add"
     if gap.as_given is not None:
         before = sized(gap.before).split(" [")[0]
         start, advice = f"Recalibration leaves {before}; with ", "calibrate it and add"
-    sentence = f"{start}{many} added, {sized(gap.after)} remain"
+    end = f": {advice} {many}"
     if remainder.unknown:
-        sentence += ", which none of the effects tested explains."
-    else:
-        sentence += f": {advice} {many}."
-    return sentence
+        end = ", which none of the effects tested explains"
+    return f"{start}{many} added, {sized(gap.after)} remain{end}."
 
 
 def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:

@@ -1,7 +1,6 @@
 """The findings put to the test: simulator run again, corrections trained on it, poses held out."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
@@ -32,11 +31,7 @@ from tofcorr.simulation.simulator import twin_frames
 
 
 def excess_gaps(
-    observations: Observations,
-    left: Tensor,
-    share: Tensor,
-    noise: Tensor | float,
-    resamples: Tensor | None = None,
+    observations: Observations, left: Tensor, share: Tensor, noise: Tensor | float, drawn: Tensor
 ) -> Tensor:
     """Return the root mean square beyond the noise, of all poses and of resamples of them, metres.
 
@@ -45,7 +40,7 @@ def excess_gaps(
         left: Measured less expected, shape (M,), metres; what is not finite does not count.
         share: Weights, shape (M,).
         noise: Standard deviation of the pixels, shape (M,) or one number, metres.
-        resamples: How often each resample holds each pose, shape (B, U); None: there are none.
+        drawn: How often each resample holds each pose, shape (B, U).
 
     Returns:
         Shape (1 + B,), all poses first; 0 where noise explains more.
@@ -53,9 +48,7 @@ def excess_gaps(
     share = share * left.isfinite()
     squares = share * (left.nan_to_num(0.0, 0.0, 0.0) ** 2 - noise**2)
     sums = torch.stack([observations.per_pose(values) for values in (squares, share)], dim=1)
-    drawn = torch.ones(1, len(sums), dtype=torch.float64)
-    if resamples is not None:
-        drawn = torch.cat([drawn, resamples])
+    drawn = torch.cat([torch.ones(1, len(sums), dtype=torch.float64), drawn])
     square, weight = (drawn @ sums).unbind(dim=1)
     return (square / weight.clamp(min=TINY)).clamp(min=0.0).sqrt()
 
@@ -92,16 +85,12 @@ def noisy_frames(recording: Recording, simulator: SimulatorOptions, seed: int) -
     )
 
 
-def _in_memory(
-    recording: Recording,
-    distance: Tensor,
-    **changes: Any,  # noqa: ANN401 - of any field
-) -> Recording:
+def _in_memory(recording: Recording, distance: Tensor, **changes: object) -> Recording:
     """Return a recording of other radial distances, shape (F, H, W), metres, and changed fields."""
     if recording.depth_kind == "z":
         distance = z_depth_from_radial_distance(distance, ray_directions(recording.camera))
-    changes |= {"raw": None, "true_depth": None, "planes": "recorded"}
-    return replace(recording, depth=distance.float().numpy(), **changes)
+    depth, whole = distance.float().numpy(), {"raw": None, "true_depth": None, "planes": "recorded"}
+    return replace(recording, depth=depth, **whole, **changes)
 
 
 def recording_of(
@@ -151,17 +140,18 @@ def check_in_simulator(found: Evidence) -> Closure:
     """Run the simulator without and with the effects, and compare the recording with both."""
     study = found.study
     frames = simulated_frames(study.observations.recording)
-    gaps = []
+    gaps, none = [], torch.zeros(0, study.sums.num_units, dtype=torch.float64)
     for model in _compared(found):
         left = study.observations.measured - _held_out(model, frames)
         share, sigma = study.fit.share, study.fit.sigma
-        gaps.append(float(excess_gaps(study.observations, left, share, sigma)))
+        gaps.append(float(excess_gaps(study.observations, left, share, sigma, none)))
     return Closure(without_effects=gaps[0], with_effects=gaps[-1], frames=len(frames))
 
 
 def _compared(found: Evidence) -> list[Evidence]:
     """Return the model without effects, and with them if they add something."""
-    return [found.without_effects(), *([found] if found.named.names else [])]
+    bare = replace(found, named=replace(found.named, names=(), study=found.study))
+    return [bare, found] if found.named.names else [bare]
 
 
 def _held_out(found: Evidence, frames: list[int]) -> Tensor:

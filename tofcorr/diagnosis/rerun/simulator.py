@@ -25,7 +25,7 @@ from tofcorr.diagnosis.sums.shared_noise import MOST_PIXELS
 from tofcorr.diagnosis.sums.study import FittedMap, Study, fitted_coefficients
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
-from tofcorr.geometry.rays import ray_directions, unambiguous_range
+from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.geometry.se3 import RigidTransform
 from tofcorr.observables.compare import Observables
 from tofcorr.pixels.sample import thinned
@@ -131,11 +131,6 @@ class Evidence:
             effects.append(effect.with_coefficients(values))
         return effects
 
-    def without_effects(self) -> "Evidence":
-        """Return the same of the base model alone."""
-        bare = replace(self.named, names=(), study=self.study)
-        return replace(self, named=bare)
-
     def fitted_to(self, units: Tensor) -> "Evidence":
         """Return the same model fitted to some poses alone, bool (U,)."""
         columns, named = self.named.columns, self.named
@@ -171,9 +166,9 @@ class Evidence:
         """
         observations, pose = self.observations, self.tool_from_camera
         distance = twin_distance(observations, self.simulator, pose, generator, frames)
-        if self.rendered:
-            assert self.study.fit.known is not None
-            distance = distance + self.study.fit.known.error
+        known = self.study.fit.known
+        if known is not None and self.given is None:
+            distance = distance + known.error
         for _, numbers in self.tables[1]:
             columns = self.study.fit.model.error_columns(predicted_distance(observations, pose))
             distance = distance + columns[:, numbers] @ self.coefficients[numbers]
@@ -204,7 +199,7 @@ def _tables(found: Evidence) -> tuple[MeasuredErrorOptions, list[Numbered]]:
     """
     observations, model, given = found.study.observations, found.study.fit.model, found.given
     already = MeasuredErrorOptions() if given is None else given.sensor.delays.measured
-    terms: list[Any] = model.terms
+    terms: list[Any] = model.error_model.terms()
     counts = len(model.error_model.signal_terms), len(model.error_model.pixel_terms)
     reads = [*map(_variable_of, terms[: counts[0]])]
     reads += ["pixel"] * counts[1] + [None] * (len(terms) - sum(counts))
@@ -236,7 +231,11 @@ def _tables(found: Evidence) -> tuple[MeasuredErrorOptions, list[Numbered]]:
     distance = CurveTable(**curve(at, total("distance", at, at), already.distance))
     amplitude = already.amplitude
     if variable is not None and variable in reads and seen is not None:
-        at = _dense_where_dark(seen if variable == "amplitude" else seen * measured**2)
+        bright = seen if variable == "amplitude" else seen * measured**2
+        low, high = float(bright.min()), float(bright.max())
+        # An amplitude that never changes still needs knots that do. Dark pixels need most.
+        reach = max(high - low, max(abs(low), 1.0) / 1000)
+        at = low + reach * torch.linspace(0.0, 1.0, 2 * _LEAST_KNOTS, dtype=torch.float64) ** 2
         values = total(variable, torch.ones_like(at), at)
         own = curve(at, values, amplitude) | {"variable": variable}
         amplitude = AmplitudeTable.model_validate(own)
@@ -254,14 +253,6 @@ def _tables(found: Evidence) -> tuple[MeasuredErrorOptions, list[Numbered]]:
     held = ("distance", "pixel", *([] if variable is None else [variable]))
     beyond = [(term, numbers) for read, term, numbers in numbered if read not in held]
     return already.model_copy(update=tables), beyond
-
-
-def _dense_where_dark(values: Tensor) -> Tensor:
-    """Return the knots of a curve over amplitudes: it bends most at dark pixels."""
-    low = float(values.min())
-    # An amplitude that never changes still needs knots that do.
-    reach = max(float(values.max()) - low, max(abs(low), 1.0) / 1000)
-    return low + reach * torch.linspace(0.0, 1.0, 2 * _LEAST_KNOTS, dtype=torch.float64) ** 2
 
 
 def _variable_of(term: SignalTerm) -> str | None:
@@ -347,20 +338,6 @@ def twin_distance(
         NaN in frames left out and where the simulated camera has no distance.
     """
     measured = torch.full_like(observations.measured, torch.nan)
-    for frame, image in twin_images(observations, simulator, tool_from_camera, generator, frames):
-        start, end = observations.frame_ends[frame]
-        measured[start:end] = image.reshape(-1)[observations.pixel[start:end]]
-    return measured
-
-
-def twin_images(
-    observations: Observations,
-    simulator: SimulatorOptions,
-    tool_from_camera: Tensor,
-    generator: torch.Generator | None,
-    frames: list[int] | None,
-) -> Iterator[tuple[int, Tensor]]:
-    """Yield the number of each frame, and its distances (H, W), metres, as `twin_distance` does."""
     chosen = list(range(observations.num_frames)) if frames is None else frames
     states = twin_frames(
         simulator,
@@ -370,7 +347,10 @@ def twin_images(
         reflectivity="pattern" if observations.amplitude is None else "from_recording",
         indices=chosen,
     )
-    return ((frame, one.measured_distance) for frame, one in zip(chosen, states, strict=True))
+    for frame, state in zip(chosen, states, strict=True):
+        start, end = observations.frame_ends[frame]
+        measured[start:end] = state.measured_distance.reshape(-1)[observations.pixel[start:end]]
+    return measured
 
 
 def whole_patterns(found: Evidence) -> dict[str, Tensor]:
@@ -394,34 +374,30 @@ def whole_patterns(found: Evidence) -> dict[str, Tensor]:
 
 def _of_all_pixels(found: Evidence, effect: MapEffect) -> Tensor:
     """Return the value of each cell from all pixels, shape (cells,), metres."""
-    study, named = found.study, found.named
-    observations, camera = study.observations, study.observations.recording.camera
+    study, named, observations = found.study, found.named, found.study.observations
     names = tuple(name for name in named.names if name != effect.name)
     others = replace(found, named=replace(named, names=names))
     spread = FittedMap(study, effect, study.residual_of(named.columns)).prior_sd
-    frames, usable = simulated_frames(observations.recording), observations.usable
+    frames, pose = simulated_frames(observations.recording), others.tool_from_camera
+    number, pixel = observations.usable[frames].flatten(1).nonzero(as_tuple=True)
+    whole = observations.choosing(torch.tensor(frames)[number], pixel)
+    left = whole.measured - twin_distance(whole, others.simulator, pose, None, frames)
+    whole, left = whole.at(left.isfinite()), left[left.isfinite()]
+    surface = torch.cat([torch.ones_like(left)[:, None], whole.rays[:, :2]], dim=1)
+    for frame in whole.frame.unique().tolist():
+        part = slice(*whole.frame_ends[frame])
+        tilt = torch.linalg.lstsq(surface[part], left[part, None]).solution
+        left[part] -= (surface[part] @ tilt)[:, 0]
     seen, count = observations.frame, observations.num_frames
     weights = torch.bincount(seen, study.fit.weight, count)
-    weights = weights / torch.bincount(seen, minlength=count).clamp(min=1)
-    pose = others.tool_from_camera
-    x, y, _ = ray_directions(camera).reshape(-1, 3).T
-    surface = torch.stack([torch.ones_like(x), x, y], dim=1)
-    cells = effect.cells_of(torch.arange(camera.height * camera.width))
+    weight = (weights / torch.bincount(seen, minlength=count).clamp(min=1))[whole.frame]
+    # Three standard deviations of noise and map: flying pixels are farther off.
+    farthest = 3 * (1 / weight + spread**2).sqrt()
+    left = weight * left.clamp(-farthest, farthest)
     sums, total = torch.zeros(2, len(effect.coefficients), dtype=torch.float64)
-    for frame, expected in twin_images(observations, others.simulator, pose, None, frames):
-        left = (observations.distance_images[frame].double() - expected).flatten()
-        used = usable[frame].flatten() & left.isfinite()
-        if not bool(used.any()):
-            continue
-        own, left = surface[used], left[used]
-        left = left - own @ torch.linalg.lstsq(own, left[:, None]).solution[:, 0]
-        weight = weights[frame]
-        # Three standard deviations of noise and map: flying pixels are farther off.
-        farthest = 3 * float(1 / weight + spread**2) ** 0.5
-        left = weight * left.clamp(-farthest, farthest)
-        for cell in cells[used].unbind(1):
-            sums.index_add_(0, cell, left)
-            total.index_add_(0, cell, weight.expand_as(left))
+    for cell in effect.cells_of(whole.pixel).unbind(1):
+        sums.index_add_(0, cell, left)
+        total.index_add_(0, cell, weight)
     return sums / (total + spread**-2)
 
 

@@ -49,7 +49,6 @@ from tofcorr.diagnosis.sums.observations import (
     with_walls_moved,
 )
 from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, whole_images
-from tofcorr.error_terms.base import Term
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.regularisation import penalties_of
@@ -59,22 +58,18 @@ from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.geometry import se3
 from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from, resolved_planes
 from tofcorr.plausibility.look import Look
-from tofcorr.simulation.effects.base import EffectInputs
+from tofcorr.simulation.effects.base import CatalogueEffect, EffectInputs
 
 
-def unknown_amplitude_columns(
-    observations: Observations, inputs: EffectInputs, *, amplitude_error: float = 0.02
-) -> Tensor:
-    """Return the columns, shape (M, K), metres at one prior standard deviation.
+def unknown_amplitude_columns(observations: Observations, inputs: EffectInputs) -> Tensor:
+    """Return the columns, shape (M, K), metres at one prior standard deviation: that of an effect.
 
-    K is 0 where the amplitude is known.
+    Lindner and Kolb (2007) and Fuchs and May (2007) report errors of one to three centimetres by
+    amplitude. K is 0 where the amplitude is known.
 
     Args:
         observations: The pixels.
         inputs: What effects may depend on.
-        amplitude_error: Prior standard deviation of the error at the root mean square of a column,
-            metres. Lindner and Kolb (2007) and Fuchs and May (2007) report errors of one to three
-            centimetres by amplitude.
     """
     if inputs.amplitude is not None:
         return torch.zeros(len(inputs.pixel), 0, dtype=torch.float64)
@@ -83,7 +78,7 @@ def unknown_amplitude_columns(
     if exposure is not None and bool((exposure > 0).all()):
         bright = bright * inputs.of_frame(exposure / exposure.mean())
     forms = torch.stack([bright, bright**2, bright * (inputs.rows**2 + inputs.columns**2)], dim=1)
-    forms = amplitude_error * forms / forms.square().mean(0).sqrt()
+    forms = CatalogueEffect.prior * forms / forms.square().mean(0).sqrt()
     # Four targets at most get columns of their own; all frames of rarer ones share the last.
     names = list(observations.recording.frames.target)
     common = sorted(set(names), key=lambda name: (-names.count(name), name))
@@ -112,10 +107,8 @@ def definite_base(
         dropped = ", ".join(term.kind for term in base.terms if term not in kept)
         warnings = [
             f"{recording.path}: amplitude.npy is missing; the base model has no amplitude term "
-            f"({dropped} left out). An error that depends on the amplitude cannot be named. What "
-            "could be one, by distance, incidence, exposure and place in the image, is not counted "
-            "for other effects; on a patterned target it also raises the noise floor, an upper "
-            "bound therefore."
+            f"({dropped} left out). An error by the amplitude cannot be named, nor another effect "
+            "where it could be one; on a patterned target it also raises the noise floor."
         ]
         base = ErrorModelOptions(terms=kept)
     dataset, columns = Dataset((recording,)), base.with_columns()
@@ -193,14 +186,9 @@ class BaseModel:
         return other
 
     @property
-    def terms(self) -> list[Term]:
-        """All terms with columns, in their order."""
-        return self.error_model.terms()
-
-    @property
     def groups(self) -> set[str]:
         """Groups of the terms, as in `Term.group`."""
-        return {term.group for term in self.terms}
+        return {term.group for term in self.error_model.terms()}
 
     @property
     def num_hand_eye(self) -> int:
@@ -524,8 +512,7 @@ def filtered_inputs(inputs: EffectInputs, observations: Observations, fit: BaseF
     inputs = replace(inputs, distance_images=images)
     if inputs.amplitude is None or inputs.modulation_frequency is None:
         return inputs
-    noise = inputs.amplitude * fit.sigma / inputs.metres_per_radian
-    return replace(inputs, amplitude_noise=noise)
+    return replace(inputs, amplitude_noise=inputs.amplitude * fit.sigma / inputs.metres_per_radian)
 
 
 def _with_plane(inputs: EffectInputs, observations: Observations, part: slice) -> Tensor:
@@ -540,12 +527,9 @@ def _with_plane(inputs: EffectInputs, observations: Observations, part: slice) -
     off = measured.double() - plane
     use = observations.on_target[part] & (measured > 0)
     step = max(1, off[0].numel() // _COARSE_PIXELS)
-
-    def median(values: Tensor) -> Tensor:
-        """Return the median of the used pixels of each image, (F, 1, 1); NaN without any."""
-        some = torch.where(use, values, torch.nan).flatten(1)[:, ::step]
-        return some.nanmedian(1).values[:, None, None]
-
-    away = (off - median(off)).abs()
-    beside = (measured > 0) & (away < 6 * sigma_from_mad(median(away)))
+    some = torch.where(use, off, torch.nan).flatten(1)[:, ::step]
+    # Of each image; NaN without any used pixel.
+    centre = some.nanmedian(1, keepdim=True).values
+    limit = 6 * sigma_from_mad((some - centre).abs().nanmedian(1, keepdim=True).values)
+    beside = (measured > 0) & ((off - centre[:, None]).abs() < limit[:, None])
     return torch.where(beside, plane.float(), inputs.distance_images[part])

@@ -29,7 +29,7 @@ import torch
 from numpy.polynomial.chebyshev import chebgauss
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.base import BaseFit, unknown_amplitude_columns
+from tofcorr.diagnosis.sums.base import BaseFit
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.pixels.dataset import in_threads
@@ -130,10 +130,6 @@ class Sums:
         gram, score, _ = self.of(names)
         curved = (gram @ coefficients[:, :, None])[..., 0]
         return self.square - (coefficients * (2 * score - curved)).sum(1) / self.scale
-
-    def left_out_squares(self, names: Sequence[str]) -> Tensor:
-        """Return the sum of squares of each unit, predicted by all others, shape (U,), m^2."""
-        return self.squares_at(names, self.left_out_coefficients(names))
 
     def left_out_coefficients(self, names: Sequence[str], *shares: float) -> Tensor:
         """Return for every unit the coefficients that all others give, shape (U, K).
@@ -282,19 +278,6 @@ def _pose_sd(sums: PoseSums, chosen: Sequence[str]) -> Tensor:
     freedom = max(0.3, 1.0 - min(count, 12) / sums.num_units)
     spread = sigma_from_mad(own.abs().median(dim=0).values) ** 2 / freedom
     return (spread - noise.median(dim=0).values).clamp(min=2e-5**2).sqrt()
-
-
-def base_columns(
-    observations: Observations, fit: BaseFit, inputs: EffectInputs
-) -> tuple[Tensor, Tensor]:
-    """Return the columns of the base model, (M, K), and their prior precision, (K, K)."""
-    uncertain = unknown_amplitude_columns(observations, inputs)
-    if fit.known is not None:
-        uncertain = torch.cat([fit.known.uncertain, uncertain], dim=1)
-    # The ordinary weights of a pose add up to one value with a variance of OLS_SD^2.
-    prior = fit.model.prior_precision(observations.num_units / OLS_SD**2)
-    prior = torch.block_diag(prior, torch.eye(uncertain.shape[1], dtype=torch.float64))
-    return torch.cat([fit.model.linearised(fit.tool_from_camera)[1], uncertain], dim=1), prior
 
 
 def pose_columns(inputs: EffectInputs, *, arm: float = 0.3) -> Tensor:

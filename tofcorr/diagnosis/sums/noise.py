@@ -44,6 +44,7 @@ from tofcorr.estimation.noise import (
     tiles_of,
 )
 from tofcorr.estimation.robust import sigma_from_mad
+from tofcorr.plausibility.finding import FAR_OFF
 
 FLOOR_ERROR = 0.05
 """Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares
@@ -156,19 +157,16 @@ def gap_weight(sigma: Tensor) -> Tensor:
     return 1 / (1 + (sigma / _USUAL_SIGMA) ** 2)
 
 
-def common_of_neighbours(
-    observations: Observations, residual: Tensor, *, most: float = 0.1
-) -> Tensor:
+def common_of_neighbours(observations: Observations, residual: Tensor) -> Tensor:
     """Return what each residual has in common with equally bright neighbours, shape (M,), metres.
 
     This is the median of the pixels of one image that lie in the same square and on the same side
     of that square's median brightness. A gross error of a single pixel does not change it.
-    Saturation of a bright patch does, however large it is.
+    Saturation of a bright patch does, however large it is, up to `FAR_OFF`.
 
     Args:
         observations: The pixels.
         residual: Of the pixels, shape (M,), metres.
-        most: Largest common value, metres. Chosen.
     """
     camera, pixel = observations.recording.camera, observations.pixel
     # A gross error of one pixel cannot move the median of 32.
@@ -178,7 +176,7 @@ def common_of_neighbours(
     group = observations.frame * (across * down) + tile
     brightness = brightness_of(observations)
     group = 2 * group + (brightness > _group_median(group, brightness)).long()
-    return _group_median(group, residual).clamp(-most, most)
+    return _group_median(group, residual).clamp(-FAR_OFF, FAR_OFF)
 
 
 def _group_median(group: Tensor, values: Tensor) -> Tensor:

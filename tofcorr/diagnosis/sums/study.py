@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base import BaseFit
+from tofcorr.diagnosis.sums.base import BaseFit, unknown_amplitude_columns
 from tofcorr.diagnosis.sums.linear_system import (
     BASE,
+    OLS_SD,
     PoseSums,
-    base_columns,
     draw_folds,
     pose_columns,
     pose_sums,
@@ -155,20 +155,6 @@ class CandidateEffects:
     missing: Mapping[str, list[str]]
 
 
-def candidate_effects(options: DiagnosisOptions, inputs: EffectInputs) -> CandidateEffects:
-    """Return the effects asked for, sorted by how they are tested, and the probes."""
-    wanted = options.catalogue if options.catalogue is not None else tuple(CATALOGUE)
-    kinds = {name: CATALOGUE[name] for name in wanted if name not in options.leave_out}
-    missing = {name: wants for name, kind in kinds.items() if (wants := kind.missing(inputs))}
-    known = {n: kind.for_recording(inputs) for n, kind in kinds.items() if n not in missing}
-    return CandidateEffects(
-        effects={n: each for n, each in known.items() if not isinstance(each, MapEffect)},
-        maps={n: each for n, each in known.items() if isinstance(each, MapEffect)},
-        probes=probes_for(inputs),
-        missing=missing,
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class Study:
     """A recording under diagnosis. Functions that change the model return another study.
@@ -249,7 +235,7 @@ class Study:
 
     def left_out_squares(self, names: Sequence[str]) -> Tensor:
         """Return the ordinary sum of squares of each pose, predicted by all others, (U,), m^2."""
-        return self.sums.ols.left_out_squares(names)
+        return self.sums.ols.squares_at(names, self.sums.ols.left_out_coefficients(names))
 
     def left_out_mean_square(self, names: Sequence[str]) -> float:
         """Return the mean of `left_out_squares` over all pixels, m^2."""
@@ -268,22 +254,33 @@ class Study:
 
 
 def build_study(
-    options: DiagnosisOptions,
-    observations: Observations,
-    fit: BaseFit,
-    inputs: EffectInputs,
-    generator: torch.Generator,
+    options: DiagnosisOptions, observations: Observations, fit: BaseFit, inputs: EffectInputs
 ) -> Study:
     """Sum up the columns of base model and candidates; draw folds and sign flips."""
     tests, num_units = options.tests, observations.num_units
+    generator = torch.Generator().manual_seed(options.seed)
     folds = draw_folds(num_units, tests.folds, generator)
     flips = torch.randint(0, 2, (tests.flips, num_units), generator=generator)
-    candidates = candidate_effects(options, inputs)
+    wanted = options.catalogue if options.catalogue is not None else tuple(CATALOGUE)
+    kinds = {name: CATALOGUE[name] for name in wanted if name not in options.leave_out}
+    missing = {name: wants for name, kind in kinds.items() if (wants := kind.missing(inputs))}
+    known = {n: kind.for_recording(inputs) for n, kind in kinds.items() if n not in missing}
+    candidates = CandidateEffects(
+        effects={n: each for n, each in known.items() if not isinstance(each, MapEffect)},
+        maps={n: each for n, each in known.items() if isinstance(each, MapEffect)},
+        probes=probes_for(inputs),
+        missing=missing,
+    )
     sources = {**candidates.effects, **candidates.probes}
     found = in_threads(lambda source: source.scaled_columns(inputs), sources.values())
-    base, prior = base_columns(observations, fit, inputs)
-    columns = {BASE: base, **dict(zip(sources, found, strict=True))}
-    pose = pose_columns(inputs)
+    # What is uncertain of the simulator's own error, or stands in for the amplitude.
+    further = [] if fit.known is None else [fit.known.uncertain]
+    further.append(unknown_amplitude_columns(observations, inputs))
+    # The ordinary weights of a pose add up to one value with a variance of OLS_SD^2.
+    prior = fit.model.prior_precision(num_units / OLS_SD**2)
+    prior = torch.block_diag(prior, torch.eye(sum(own.shape[1] for own in further)).double())
+    base = torch.cat([fit.model.linearised(fit.tool_from_camera)[1], *further], dim=1)
+    columns, pose = {BASE: base, **dict(zip(sources, found, strict=True))}, pose_columns(inputs)
     sums = pose_sums(observations, columns, pose, fit, prior)
     return Study(
         options=options,
@@ -464,25 +461,18 @@ def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor
     return {n: own * effects[n].prior_sd() for n, own in zip(known, parts, strict=True)}
 
 
-def without_absorbed(
-    study: Study, *, not_judged: float = 0.95, worth_saying: float = 0.5
-) -> tuple[Study, list[str]]:
+def without_absorbed(study: Study) -> tuple[Study, list[str]]:
     """Return the study without the effects that estimated planes absorb, and a warning.
 
-    The effects left out are among `missing`: they need measured planes. A study of measured planes
-    stays as it is.
-
-    Args:
-        study: The recording.
-        not_judged: An effect is not judged if estimated planes absorb more than this share of what
-            measured planes would leave of it: a twentieth of an effect looks like others. Chosen.
-        worth_saying: Above this share a warning names the effect. Chosen: its smallest detectable
-            size has grown by more than a factor of 1.4.
+    An effect is not judged if estimated planes leave less than a twentieth of what measured planes
+    would: so much looks like others. It is among `missing`, and needs measured planes. Above a half
+    a warning names the effect: its smallest detectable size has grown by a factor of 1.4. A study
+    of measured planes stays as it is.
     """
     if not study.observations.num_walls:
         return study, []
     shares = {name: absorbed_by_planes(study, name) for name in study.candidates.effects}
-    hidden = {n: [MEASURED_PLANES.words] for n, share in shares.items() if share > not_judged}
+    hidden = {n: [MEASURED_PLANES.words] for n, share in shares.items() if 20 * (1 - share) < 1}
     if hidden:
         known = study.candidates
         effects = {name: effect for name, effect in known.effects.items() if name not in hidden}
@@ -497,7 +487,7 @@ def without_absorbed(
     partly = [
         f"{name} ({100 * share:.0f} %)"
         for name, share in shares.items()
-        if worth_saying < share <= not_judged
+        if share > 0.5 and name not in hidden
     ]
     count, missing = study.observations.num_walls, study.candidates.missing
     unjudged = [name for name, wants in missing.items() if MEASURED_PLANES.words in wants]
@@ -555,7 +545,10 @@ class FittedMap:
         self._study, self._effect = study, effect
         # Of large images few cells hold a chosen pixel.
         self._used, self._cells = effect.cells_of(study.inputs.pixel).unique(return_inverse=True)
-        self._observed = _without_pose(study, residual)
+        # The most probable offset and tilts of each pose are taken off.
+        inner, score = study.pose_equations(residual)
+        pose = torch.linalg.solve(inner + torch.diag(study.sums.pose_sd**-2), score)
+        self._observed = residual - study.pose_surface(pose)
         self._sums = self._per_pose(self._cells, study.fit.weight * self._observed)
         self.prior_sd = max(self._agreed(), least_sd) if prior_sd is None else prior_sd
 
@@ -616,10 +609,3 @@ class FittedMap:
         pairs = zip(self._systems, kept, strict=True)
         of_folds = torch.stack([self._solved(whole - own, right) for own, right in pairs])
         return of_folds[self._fold[:, None], self._cells].sum(-1)
-
-
-def _without_pose(study: Study, residual: Tensor) -> Tensor:
-    """Subtract the most probable offset and tilts of each pose, shape (M,)."""
-    inner, score = study.pose_equations(residual)
-    guess = torch.linalg.solve(inner + torch.diag(study.sums.pose_sd**-2), score)
-    return residual - study.pose_surface(guess)
