@@ -141,20 +141,14 @@ def _cause_of(term: Term) -> str:
 
 def _bent(study: Study) -> Tensor | None:
     """Return what a change of the hand-eye transform adds beyond its columns, (M,), metres."""
-    if study.fit.known is None:
+    known, pose = study.fit.known, study.fit.tool_from_camera
+    if known is None:
         return None
-    poses = study.fit.tool_from_camera, study.fit.known.tool_from_camera
-    here, there = (predicted_distance(study.observations, pose) for pose in poses)
-    twist = twist_of(study)
+    here, there = (
+        predicted_distance(study.observations, p) for p in (pose, known.tool_from_camera)
+    )
+    twist = known.twist_to(pose)
     return here - there - study.columns[BASE][:, : len(twist)] @ twist
-
-
-def twist_of(study: Study) -> Tensor:
-    """Return the change from the simulator's hand-eye transform to the fitted one; none if held."""
-    known = study.fit.known
-    if known is None or not study.fit.model.num_hand_eye:
-        return torch.zeros(0, dtype=torch.float64)
-    return known.twist_to(study.fit.tool_from_camera)
 
 
 def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | None:
@@ -349,11 +343,12 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
     fitted, columns = sums.of(named.columns), named.study.columns_of(named.columns)
     start = torch.zeros(len(fitted[2]), dtype=torch.float64)
     # The gap as given is of all pixels alike; after recalibration noisy ones count less.
-    weight, shared = study.fit.trust, residual
-    if shared is None:
+    weight, shared, known = study.fit.trust, residual, study.fit.known
+    if shared is None or known is None:
         shared, weight = study.residual, study.fit.share
     else:
-        start[: model.num_hand_eye] = twist_of(study)
+        twist = known.twist_to(study.fit.tool_from_camera)
+        start[: model.num_hand_eye] = twist[: model.num_hand_eye]
         start[model.num_geometry : model.num_columns] = study.fit.coefficients
     causes = list[Share]()
     for cause in causes_of(study, named, parameters=residual is not None):

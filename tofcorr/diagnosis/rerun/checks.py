@@ -150,8 +150,7 @@ def check_in_simulator(found: Evidence) -> Closure:
 
 def _compared(found: Evidence) -> list[Evidence]:
     """Return the model without effects, and with them if they add something."""
-    bare = replace(found, named=replace(found.named, names=(), study=found.study))
-    return [bare, found] if found.named.names else [bare]
+    return [found.without_effects(), *([found] if found.named.names else [])]
 
 
 def _held_out(found: Evidence, frames: list[int]) -> Tensor:

@@ -131,6 +131,11 @@ class Evidence:
             effects.append(effect.with_coefficients(values))
         return effects
 
+    def without_effects(self) -> "Evidence":
+        """Return the same of the base model alone."""
+        bare = replace(self.named, names=(), study=self.study)
+        return replace(self, named=bare)
+
     def fitted_to(self, units: Tensor) -> "Evidence":
         """Return the same model fitted to some poses alone, bool (U,)."""
         columns, named = self.named.columns, self.named
