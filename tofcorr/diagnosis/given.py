@@ -180,8 +180,7 @@ def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
         real: The recording.
         simulated: The rendered frames, in any order.
     """
-    pairs = zip(_places(real), _places(simulated), strict=True)
-    places = [(torch.from_numpy(own), torch.from_numpy(other)) for own, other in pairs]
+    places = zip(_places(real), _places(simulated), strict=True)
     # By differences: the product of all places has no digits left for those that are near.
     exact = "donot_use_mm_for_euclid_dist"
     apart = [torch.cdist(own, other, compute_mode=exact) for own, other in places]
@@ -197,15 +196,15 @@ def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
     return [torch.from_numpy(np.flatnonzero(row)) for row in found]
 
 
-def _places(recording: Recording) -> list[np.ndarray]:
+def _places(recording: Recording) -> list[Tensor]:
     """Return position and turn of the tool, and normal and distance of the plane there, (F, ...).
 
     In metres and radians.
     """
-    pose = recording.frames.world_from_tool
-    normal, offset = (values.numpy() for values in planes_in_tool(recording))
+    pose = torch.from_numpy(recording.frames.world_from_tool)
+    normal, offset = planes_in_tool(recording)
     # A turn by a small angle changes a rotation matrix by sqrt(2) times the angle.
-    turn = pose[:, :3, :3].reshape(-1, 9) / np.sqrt(2)
+    turn = pose[:, :3, :3].reshape(-1, 9) / math.sqrt(2)
     return [pose[:, :3, 3], offset[:, None], turn, normal]
 
 

@@ -47,7 +47,6 @@ from tofcorr.diagnosis.sums.study import (
     FittedMap,
     Study,
     absorbed_share,
-    left_over,
     signal,
     with_residual,
 )
@@ -123,11 +122,10 @@ class Evidence:
         names = self.with_columns(sizes)
         members, normal = layout.of(names), self._normal(sizes)
         theta = torch.linalg.solve(normal, fitted.score[:, members].sum(0))
-        plain, base = study.sums.ols.total, torch.arange(layout.base)
         pixels, found = study.sums.ols.scale * float(study.sums.count.sum()), dict[str, float]()
         for name, (low, high) in layout.only(names).effects.items():
             own = torch.arange(*layout.effects[name])
-            left = left_over(plain, base, own, layout.prior_of(base))
+            left = study.unabsorbed[own][:, own]
             found[name] = max(float(theta[low:high] @ left @ theta[low:high]) / pixels, 0.0) ** 0.5
         if of_map := self.map_of(sizes):
             share = study.fit.share

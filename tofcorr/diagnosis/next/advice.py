@@ -251,7 +251,7 @@ def _of_columns(study: Study, name: str, drawn: Tensor) -> float:
         for matrix in (
             left_over(gls.total, members, own, prior),
             ols.total[own][:, own],
-            left_over(ols.total, members, own, prior),
+            study.unabsorbed[own][:, own],
         )
     )
     detectable = (size / pixels / signal * noncentrality(study, len(own))).sqrt()

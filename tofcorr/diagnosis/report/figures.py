@@ -27,7 +27,7 @@ from tofcorr.diagnosis.report.words import (
 from tofcorr.diagnosis.sums.study import absorption_table
 from tofcorr.estimation.robust import LEVEL
 from tofcorr.observables.figures import drawings as observable_drawings
-from tofcorr.plausibility.page import BLUE, FAINT, GREY, RED, line_across, panels
+from tofcorr.plausibility.page import BLUE, FAINT, GREY, RED, line_across, panels, plain_look
 
 if TYPE_CHECKING:
     from tofcorr.diagnosis.report.result import DiagnosisResult
@@ -161,6 +161,7 @@ def image_maps(result: "DiagnosisResult") -> Figure:
         axes.plot(columns, rows, "k.", markersize=3)
         bar = figure.colorbar(shown, ax=axes, orientation="horizontal", label="mean residual, mm")
         bar.ax.locator_params(nbins=5)
+        plain_look(bar.ax)
     return figure
 
 
@@ -196,8 +197,6 @@ def effect_forest(result: "DiagnosisResult") -> Figure:
     right.set_xlabel("probability\nthat it is there")
     right.set_xlim(0, 1)
     left.set_yticks(range(len(names)), [effect_words(study, name) for name in names])
-    for label, name in zip(left.get_yticklabels(), names, strict=True):
-        label.set_fontweight("bold" if name in result.effects else "normal")
     return figure
 
 
@@ -215,7 +214,7 @@ def absorption_map(result: "DiagnosisResult") -> Figure:
     axes.tick_params(labelsize=7)
     axes.set_ylabel("share of this effect ...")
     axes.set_xlabel("... that calibration, or else this effect, absorbs")
-    figure.colorbar(shown, ax=axes, label="share absorbed")
+    plain_look(figure.colorbar(shown, ax=axes, label="share absorbed").ax)
     return figure
 
 

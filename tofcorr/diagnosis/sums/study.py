@@ -216,6 +216,13 @@ class Study:
         """Return the columns of the base model and of some effects."""
         return [self.columns[BASE], *(self.columns[name] for name in names)]
 
+    @cached_property
+    def unabsorbed(self) -> Tensor:
+        """Gram matrix of all columns after regression on the base model, ordinary, (P, P)."""
+        gram, layout = self.sums.ols.total, self.sums.layout
+        base = torch.arange(layout.base)
+        return left_over(gram, base, torch.arange(len(gram)), layout.prior_of(base))
+
     def times(self, names: Sequence[str], coefficients: Tensor) -> Tensor:
         """Return what base model and some effects predict with coefficients (K,), (M,), metres."""
         parts = self.columns_of(names)
@@ -390,13 +397,13 @@ LEAST_LEFT = 1e-3
 rounding error. Chosen."""
 
 
-def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float:
-    """Return the share of an effect's signal that base model and other effects absorb.
+def absorbed_share(study: Study, name: str) -> float:
+    """Return the share of an effect's signal that the base model absorbs.
 
     The share is averaged over the effect's prior. 1 means that nothing of it can be observed.
     """
-    layout = study.sums.layout
-    total, left = signal(study, name), _left(study, name, layout.of(others))
+    total, own = signal(study, name), slice(*study.sums.layout.effects[name])
+    left = float(study.unabsorbed.diagonal()[own].sum())
     return float(np.clip(1.0 - left / total, 0.0, 1.0)) if total > 0 else 1.0
 
 
@@ -414,12 +421,6 @@ def signal(study: Study, name: str) -> float:
     """Return the sum of an effect's squares, averaged over its prior."""
     low, high = study.sums.layout.effects[name]
     return float(study.sums.ols.total.diagonal()[low:high].sum())
-
-
-def _left(study: Study, name: str, members: Tensor) -> float:
-    """Return what regression on columns (K,) leaves of an effect, averaged over its prior."""
-    ols, own = study.sums.ols, torch.arange(*study.sums.layout.effects[name])
-    return float(left_over(ols.total, members, own, ols.layout.prior_of(members)).trace())
 
 
 def left_over(gram: Tensor, members: Tensor, own: Tensor, prior: Tensor) -> Tensor:
@@ -443,13 +444,15 @@ def absorption_table(study: Study) -> np.ndarray:
         remains the share that each other effect (column) absorbs; NaN of itself and where nothing
         remains. Shape (E, 1 + E).
     """
-    names = tuple(study.candidates.effects)
+    names, layout, gram = tuple(study.candidates.effects), study.sums.layout, study.unabsorbed
+    members = [torch.arange(*layout.effects[name]) for name in names]
     table = np.full((len(names), 1 + len(names)), np.nan)
-    for row, name in enumerate(names):
-        own = table[row, 0] = absorbed_share(study, name)
-        for column, other in enumerate(names, start=1):
-            if other != name and 1 - own > LEAST_LEFT:
-                table[row, column] = (absorbed_share(study, name, [other]) - own) / (1 - own)
+    for row, (name, own) in enumerate(zip(names, members, strict=True)):
+        table[row, 0] = absorbed_share(study, name)
+        for column, other in enumerate(members, start=1):
+            if column != row + 1 and 1 - table[row, 0] > LEAST_LEFT:
+                left = left_over(gram, other, own, layout.prior_of(other)).trace()
+                table[row, column] = 1 - float(left / gram.diagonal()[own].sum())
     return table
 
 
@@ -504,10 +507,12 @@ def absorbed_by_planes(study: Study, name: str) -> float:
     """Return the share that estimated planes absorb of what measured planes would leave."""
     model, everything = study.fit.model, torch.arange(study.sums.layout.base)
     planes = (everything >= model.num_hand_eye) & (everything < model.num_geometry)
-    measured = _left(study, name, everything[~planes])
+    kept, layout, gram = everything[~planes], study.sums.layout, study.sums.ols.total
+    own = torch.arange(*layout.effects[name])
+    measured = float(left_over(gram, kept, own, layout.prior_of(kept)).trace())
     if measured <= LEAST_LEFT * signal(study, name):
         return 0.0
-    return 1.0 - _left(study, name, everything) / measured
+    return 1.0 - float(study.unabsorbed.diagonal()[own].sum()) / measured
 
 
 class FittedMap:
