@@ -6,6 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -24,7 +25,7 @@ from tofcorr.diagnosis.report.words import (
     share_words,
     stages_shown,
 )
-from tofcorr.diagnosis.sums.study import absorption_table
+from tofcorr.diagnosis.sums.study import LEAST_LEFT, Study, absorbed_share, left_over
 from tofcorr.estimation.robust import LEVEL
 from tofcorr.observables.figures import drawings as observable_drawings
 from tofcorr.plausibility.page import BLUE, FAINT, GREY, RED, line_across, panels, plain_look
@@ -198,6 +199,26 @@ def effect_forest(result: "DiagnosisResult") -> Figure:
     right.set_xlim(0, 1)
     left.set_yticks(range(len(names)), [effect_words(study, name) for name in names])
     return figure
+
+
+def absorption_table(study: Study) -> np.ndarray:
+    """Return what calibration and every other effect absorb of every effect with columns.
+
+    Returns:
+        The share of each effect (row) that base model and hand-eye transform absorb, then of what
+        remains the share that each other effect (column) absorbs; NaN of itself and where nothing
+        remains. Shape (E, 1 + E).
+    """
+    names, layout, gram = tuple(study.candidates.effects), study.sums.layout, study.unabsorbed
+    members = [torch.arange(*layout.effects[name]) for name in names]
+    table = np.full((len(names), 1 + len(names)), np.nan)
+    for row, (name, own) in enumerate(zip(names, members, strict=True)):
+        table[row, 0] = absorbed_share(study, name)
+        for column, other in enumerate(members, start=1):
+            if column != row + 1 and 1 - table[row, 0] > LEAST_LEFT:
+                left = left_over(gram, other, own, layout.prior_of(other)).trace()
+                table[row, column] = 1 - float(left / gram.diagonal()[own].sum())
+    return table
 
 
 def absorption_map(result: "DiagnosisResult") -> Figure:

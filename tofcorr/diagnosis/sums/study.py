@@ -436,26 +436,6 @@ def left_over(gram: Tensor, members: Tensor, own: Tensor, prior: Tensor) -> Tens
     return gram[..., own[:, None], own] - cross.mT @ torch.linalg.solve(inner, cross)
 
 
-def absorption_table(study: Study) -> np.ndarray:
-    """Return what calibration and every other effect absorb of every effect with columns.
-
-    Returns:
-        The share of each effect (row) that base model and hand-eye transform absorb, then of what
-        remains the share that each other effect (column) absorbs; NaN of itself and where nothing
-        remains. Shape (E, 1 + E).
-    """
-    names, layout, gram = tuple(study.candidates.effects), study.sums.layout, study.unabsorbed
-    members = [torch.arange(*layout.effects[name]) for name in names]
-    table = np.full((len(names), 1 + len(names)), np.nan)
-    for row, (name, own) in enumerate(zip(names, members, strict=True)):
-        table[row, 0] = absorbed_share(study, name)
-        for column, other in enumerate(members, start=1):
-            if column != row + 1 and 1 - table[row, 0] > LEAST_LEFT:
-                left = left_over(gram, other, own, layout.prior_of(other)).trace()
-                table[row, column] = 1 - float(left / gram.diagonal()[own].sum())
-    return table
-
-
 def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor]:
     """Return the coefficients of chosen effects in their own units, by name."""
     known = [name for name in chosen if name in study.candidates.effects]
