@@ -165,7 +165,7 @@ TABLES: dict[str, Damage] = {
 }
 CELLS: dict[str, Damage] = {
     r"frame 4, column 'qx': expected a finite number": cells(4, qx="nan"),
-    r"frame 3, column 'ty': .*number, got 'left'": cells(3, ty="left"),
+    r"frame 3, column 'ty': .*number of metres, .*got 'left'": cells(3, ty="left"),
     r"frame 3, column 'ty': .*got '1_0'": cells(3, ty="1_0"),
     r"frame 1, column 'tz': .*got an empty cell": cells(1, tz=""),
     r"frame 3, column 'd': expected a finite number": cells(3, d="1e999"),

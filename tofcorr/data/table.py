@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
-from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions, Value, condition
+from tofcorr.conditions import OPTIONAL_CONDITIONS, Condition, Conditions, Value, condition
 from tofcorr.data.arrays import LARGEST_DISTANCE
 from tofcorr.errors import CalibrationDataError, is_control
 from tofcorr.files import open_regular
@@ -101,24 +102,18 @@ def read_table(path: Path) -> FrameTable:
         raise CalibrationDataError(f"{path}: column {_names(missing)} is missing.")
     if not cells["frame"]:
         raise CalibrationDataError(f"{path}: a recording of no frame.")
-    for frame, cell in enumerate(cells["frame"]):
-        # Only plain digits: int() also accepts '1_0' and ' 7'.
-        if not (cell.isascii() and cell.isdigit() and len(cell) < 19 and int(cell) == frame):
+    for frame, (cell, name) in enumerate(zip(cells["frame"], cells["target"], strict=True)):
+        if not re.fullmatch(f"0*{frame}", cell):
             raise _wrong(path, frame, "frame", f"{frame} (counting up from zero)", cell)
-    for frame, name in enumerate(cells["target"]):
         if not name or any(map(is_control, name)):
             raise _wrong(path, frame, "target", "a name such as 'white'", name)
-
-    number = {name: _finite(cells[name], name, path) for name in NUMBERS}
+    number = {name: _numbers(cells, name, path) for name in NUMBERS}
     translation, quaternion, normal = (
         np.stack([number[name] for name in names], axis=1)
         for names in (TRANSLATION, QUATERNION, NORMAL)
     )
     _check_unit_length(quaternion, "quaternion qx,qy,qz,qw", path)
     length = _check_unit_length(normal, "normal nx,ny,nz", path)
-    for name in (*TRANSLATION, "d"):
-        far = np.abs(number[name]) > LARGEST_DISTANCE
-        _refuse(far, cells[name], name, f"metres, at most {LARGEST_DISTANCE:g}", path)
     # kornia normalises them, and has the scalar first.
     rotation = quaternion_to_rotation_matrix(torch.from_numpy(quaternion[:, [3, 0, 1, 2]]))
     return FrameTable(
@@ -128,7 +123,11 @@ def read_table(path: Path) -> FrameTable:
         offset=number["d"] / length,
         target=np.array(cells["target"]),
         pose_id=np.array(cells["pose_id"]) if "pose_id" in cells else None,
-        **_optional_numbers(cells, path),
+        **{
+            each.name: each.si_per_unit * _numbers(cells, each.column, path, each)
+            for each in OPTIONAL_CONDITIONS
+            if each.column in cells
+        },
     )
 
 
@@ -191,37 +190,28 @@ def _read_cells(path: Path) -> dict[str, list[str]]:
     return {name: [line[i].strip() for line in lines[1:]] for i, name in enumerate(names)}
 
 
-def _numbers(cells: list[str], name: str, path: Path) -> np.ndarray:
-    """Parse a column; empty cells give NaN."""
-    values = np.full(len(cells), np.nan)
-    for frame, cell in enumerate(cells):
-        try:
-            values[frame] = float(cell or "nan")
-        except ValueError:
-            raise _wrong(path, frame, name, "a number", cell) from None
-        if "_" in cell:  # Python's float() reads 1_0 as ten.
-            raise _wrong(path, frame, name, "a number", cell)
+def _numbers(
+    cells: dict[str, list[str]], name: str, path: Path, known: Condition | None = None
+) -> np.ndarray:
+    """Parse a column; of one that a recording may lack, which is `known`, empty cells give NaN."""
+    values = np.array([_number(cell) for cell in cells[name]])
+    metres = name in (*TRANSLATION, "d")
+    most, unit = (LARGEST_DISTANCE, " of metres") if metres else (LARGEST_NUMBER, "")
+    least = SMALLEST_POSITIVE if known and known.positive else -most
+    wrong = ~((values >= least) & (values <= most) | (np.isnan(values) & (known is not None)))
+    expected = f"a {'positive' if least > 0 else 'finite'} number{unit}, at most {most:g}"
+    for frame in np.flatnonzero(wrong)[:1]:
+        raise _wrong(path, int(frame), name, expected, cells[name][frame])
     return values
 
 
-def _finite(cells: list[str], name: str, path: Path) -> np.ndarray:
-    values = _numbers(cells, name, path)
-    _refuse(~np.isfinite(values), cells, name, "a finite number", path)
-    _refuse(np.abs(values) > LARGEST_NUMBER, cells, name, f"at most {LARGEST_NUMBER:g}", path)
-    return values
-
-
-def _optional_numbers(cells: dict[str, list[str]], path: Path) -> dict[str, np.ndarray]:
-    found = {}
-    for each in OPTIONAL_CONDITIONS:
-        if each.column in cells:
-            values = _numbers(cells[each.column], each.column, path)
-            wrong = np.abs(values) > LARGEST_NUMBER  # NaN is an empty cell.
-            wrong |= each.positive & (values <= SMALLEST_POSITIVE)
-            expected = f"a {'positive' if each.positive else 'finite'} number or nothing"
-            _refuse(wrong, cells[each.column], each.column, expected, path)
-            found[each.name] = values * each.si_per_unit
-    return found
+def _number(cell: str) -> float:
+    """Return the number in a cell; NaN if it is empty, infinity if it holds something else."""
+    try:
+        # Python's float() reads 1_0 as ten.
+        return float(cell.replace("_", "?") or "nan")
+    except ValueError:
+        return np.inf
 
 
 def _check_unit_length(vectors: np.ndarray, name: str, path: Path) -> np.ndarray:
@@ -232,12 +222,6 @@ def _check_unit_length(vectors: np.ndarray, name: str, path: Path) -> np.ndarray
             f"{path}: frame {frame}: the {name} has length {length[frame]:.6g}, not 1 to 0.001."
         )
     return length
-
-
-def _refuse(wrong: np.ndarray, cells: list[str], name: str, expected: str, path: Path) -> None:
-    """Refuse the first frame at which a column is wrong, if there is one."""
-    for frame in np.flatnonzero(wrong)[:1]:
-        raise _wrong(path, int(frame), name, expected, cells[frame])
 
 
 def _wrong(path: Path, frame: int, column: str, expected: str, got: str) -> CalibrationDataError:
