@@ -9,7 +9,7 @@ import click
 
 from tofcorr.cli.shared import LazyGroup, config_options, out_option
 from tofcorr.files import ReplacedFile
-from tofcorr.importing.command_line import NumberList, intrinsics_options, option, take_intrinsics
+from tofcorr.importing.command_line import intrinsics_options, number_list, option, take_intrinsics
 from tofcorr.importing.registry import IMPORTERS
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tofcorr.training.calibration import TrainingOptions
 
 _TRAINING = "training.calibration:TrainingOptions"
-_POSE = {"type": NumberList(7), "metavar": "X,Y,Z,QX,QY,QZ,QW"}
+_POSE = {"type": number_list(7), "metavar": "X,Y,Z,QX,QY,QZ,QW"}
 _PAIR = {"nargs": 2, "type": float}
 _DISTANCES = "Distances to the wall at which the camera will be used, metres."
 _START = "The tool's pose where the camera looks squarely at the wall; else poses are relative."

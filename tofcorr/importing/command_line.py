@@ -21,30 +21,21 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
-class NumberList(click.ParamType):
-    """Numbers separated by commas.
+def number_list(*counts: int) -> Callable[[str], tuple[float, ...]]:
+    """Return an option's type: numbers separated by commas, as many as one of `counts`."""
 
-    Args:
-        counts: How many numbers are allowed.
-    """
-
-    name = "numbers"
-
-    def __init__(self, *counts: int) -> None:
-        self._counts = counts
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        """Return a tuple of numbers, or refuse the text."""
-        if not isinstance(value, str):
-            return value
+    def numbers(text: str) -> tuple[float, ...]:
         try:
-            numbers = tuple(float(number) for number in value.split(","))
+            found = tuple(map(float, text.split(",")))
         except ValueError:
-            self.fail(f"expected numbers separated by commas, got '{value}'.", param, ctx)
-        if len(numbers) not in self._counts:
-            wanted = " or ".join(map(str, self._counts))
-            self.fail(f"expected {wanted} numbers, got {len(numbers)}.", param, ctx)
-        return numbers
+            said = f"expected numbers separated by commas, got '{text}'."
+            raise click.BadParameter(said) from None
+        if len(found) not in counts:
+            wanted = " or ".join(map(str, counts))
+            raise click.BadParameter(f"expected {wanted} numbers, got {len(found)}.")
+        return found
+
+    return numbers
 
 
 def _adding(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
@@ -70,9 +61,9 @@ pose_format_option = option(
 intrinsics_options = _adding(
     option("--intrinsics", "YAML, JSON, ROS camera_info, OpenCV, text of 3x3, or a shipped name."),
     option("--calibrate", "Calibrate the intrinsics from the boards.", is_flag=True),
-    option("--focal", "Focal length F or FX,FY, pixels.", type=NumberList(1, 2)),
-    option("--centre", "Principal point CX,CY, pixels.", type=NumberList(2)),
-    option("--distortion", "With --focal: K1,K2,P1,P2[,K3...].", type=NumberList(4, 5, 8, 12, 14)),
+    option("--focal", "Focal length F or FX,FY, pixels.", type=number_list(1, 2)),
+    option("--centre", "Principal point CX,CY, pixels.", type=number_list(2)),
+    option("--distortion", "With --focal: K1,K2,P1,P2[,K3...].", type=number_list(4, 5, 8, 12, 14)),
 )
 """Adds the options that say where the camera intrinsics come from."""
 
@@ -81,7 +72,7 @@ _NONE = "Numbers that mean 'no return', besides NaN."
 _TURNS = "Degrees clockwise by which images are turned to fit the intrinsics."
 coding_options = _adding(
     option("--depth-unit-mm", _COUNTS, "unit_mm", type=float),
-    option("--invalid", _NONE, default="0,65535", type=NumberList(*range(1, 9))),
+    option("--invalid", _NONE, default="0,65535", type=number_list(*range(1, 9))),
     option("--big-endian", "The two bytes of each number are swapped.", is_flag=True),
     option("--rotate", _TURNS, default="0", type=click.Choice(["0", "90", "180", "270"])),
 )
@@ -141,7 +132,7 @@ def take_coding(given: dict[str, Any]) -> "DepthCoding":
     from tofcorr.importing.images import DepthCoding
 
     values = {key: given.pop(key) for key in DepthCoding.model_fields}
-    return DepthCoding.from_mapping(values | {"rotate": int(values["rotate"])}, _command_name())
+    return DepthCoding.from_mapping(values | {"rotate": int(values["rotate"])}, command_name())
 
 
 def take_posed_options(given: dict[str, Any], camera_frame: str = "") -> "PosedOptions":
@@ -166,10 +157,10 @@ def take_posed_options(given: dict[str, Any], camera_frame: str = "") -> "PosedO
     if given["lag_s"] is None:
         del given["lag_s"]
     own = {key: given.pop(key) for key in PosedOptions.model_fields if key in given}
-    return PosedOptions.from_mapping(own, _command_name())
+    return PosedOptions.from_mapping(own, command_name())
 
 
-def _command_name() -> str:
+def command_name() -> str:
     """Return what messages call the command that is run."""
     return f"tofcorr import {click.get_current_context().info_name}"
 

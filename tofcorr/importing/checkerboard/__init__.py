@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from tofcorr.importing.command_line import (
+    command_name,
     depth_kind_option,
     intrinsics_options,
     option,
@@ -18,25 +19,6 @@ from tofcorr.importing.command_line import (
     recording_out_option,
     take_intrinsics,
 )
-
-
-class BoardType(click.ParamType):
-    """A board as COLUMNSxROWS, or with its kind in front; options of `CheckerboardOptions`."""
-
-    name = "board"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        """Return the board, or refuse the text."""
-        if not isinstance(value, str):
-            return value
-        from tofcorr.errors import ConfigError
-        from tofcorr.importing.checkerboard.boards import read_board
-
-        try:
-            return read_board(value)
-        except ConfigError as error:
-            self.fail(str(error), param, ctx)
-
 
 _BOARD = (
     "Inner corners (not squares), such as 5x7; or charuco:5x7:4X4_50:0.75 (squares, markers, their "
@@ -51,7 +33,7 @@ _MARGIN = "How far the mask extends beyond the outermost inner corners; 1: edge 
 @recording_out_option
 @option("--depth", "Names of the depth images.", "depth_pattern", default="{view}_depth.png")
 @option("--infrared", "Names of the infrared images.", "infrared_pattern", default="{view}_ir.png")
-@option("--board", _BOARD, required=True, type=BoardType())
+@option("--board", _BOARD, required=True, metavar="BOARD")
 @option("--square-mm", "Side of a square or tag, mm.", required=True, type=float)
 @option("--depth-unit-mm", "Millimetres per count; 0 counts mean no return.", default=1.0)
 @depth_kind_option
@@ -66,12 +48,23 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     The board's corners in the infrared image give the plane of each view; the measured depth is
     compared with it. Views that cannot be used are left out; import.json in the recording says why.
     """
+    given["amplitude_pattern"] = given["infrared_pattern"]
+    given["coding"] = {"unit_mm": given.pop("depth_unit_mm"), "invalid": ()}
+    print_report(import_boards(folder, out, given), out)
+
+
+def import_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """Import images of a board, by what click has read of the options of one of the commands.
+
+    Raises:
+        ConfigError: A value is not allowed.
+    """
+    from tofcorr.importing.checkerboard.boards import read_board
     from tofcorr.importing.checkerboard.importer import CheckerboardOptions, import_checkerboard
 
     intrinsics = take_intrinsics(given)
-    given |= given.pop("board")
+    given |= read_board(given.pop("board"))
     given["square_length"] = given.pop("square_mm") / 1000
-    given["amplitude_pattern"] = given["infrared_pattern"]
-    given["coding"] = {"unit_mm": given.pop("depth_unit_mm"), "invalid": ()}
-    options = CheckerboardOptions.from_mapping(given, "tofcorr import checkerboard")
-    print_report(import_checkerboard(folder, out, options, intrinsics), out)
+    own = {key: given[key] for key in CheckerboardOptions.model_fields if key in given}
+    options = CheckerboardOptions.from_mapping(own, command_name())
+    return import_checkerboard(folder, out, options, intrinsics)

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from tofcorr.importing.command_line import (
-    NumberList,
+    number_list,
     option,
     pose_format_option,
     posed_options,
@@ -26,7 +26,7 @@ _COUNTS = "Millimetres per count; left out: 1 for numbers typically above 20, el
 @pose_format_option
 @option("--wall", "Name of each wall; left out: the source's.", "names", multiple=True)
 @option("--zones", "COLUMNSxROWS of the sensor.", default="1x1")
-@option("--fov-deg", "Field of view of all zones, degrees: H,V.", type=NumberList(1, 2))
+@option("--fov-deg", "Field of view of all zones, degrees: H,V.", type=number_list(1, 2))
 @option("--depth-unit-mm", _COUNTS, "unit_mm", type=float)
 @posed_options
 def command(sources: tuple[Path, ...], out: Path, **given: Any) -> None:  # noqa: ANN401

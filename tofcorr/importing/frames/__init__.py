@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from tofcorr.errors import ConfigError
-from tofcorr.importing.checkerboard import BoardType
+from tofcorr.importing.checkerboard import import_boards
 from tofcorr.importing.command_line import (
     coding_options,
     intrinsics_options,
@@ -35,7 +35,7 @@ _TIMES = "List of 'time name' lines, where the images' names are no times."
 @option("--amplitude", _AMPLITUDE, "amplitude_pattern")
 @option("--grey", _GREY, "grey_pattern")
 @option("--poses", _POSES, type=click.Path(path_type=Path))
-@option("--board", _BOARD, type=BoardType())
+@option("--board", _BOARD, metavar="BOARD")
 @option("--square-mm", "With --board: side of a square or tag, mm.", type=float)
 @pose_format_option
 @option("--times", _TIMES, type=click.Path(path_type=Path))
@@ -76,21 +76,10 @@ def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any
 
 def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any]:
     """Import images of a board, without a robot."""
-    from tofcorr.importing.checkerboard.importer import CheckerboardOptions, import_checkerboard
-
-    amplitude = given["amplitude_pattern"]
-    corners = given["grey_pattern"] or amplitude
-    if corners is None or given["square_mm"] is None:
+    given["infrared_pattern"] = given.pop("grey_pattern") or given["amplitude_pattern"]
+    if given["infrared_pattern"] is None or given["square_mm"] is None:
         raise ConfigError("a board needs --square-mm, and --grey (or --amplitude) to find it in.")
-    mapping = given["board"] | {
-        "depth_pattern": given["depth_pattern"],
-        "infrared_pattern": corners,
-        "amplitude_pattern": amplitude,
-        "square_length": given["square_mm"] / 1000,
-        "coding": take_coding(given),
-        "depth_kind": given["depth_kind"],
-        "saturation_counts": given["saturation_amplitude"],
-        "modulation_frequency": given["modulation_frequency_hz"],
-    }
-    options = CheckerboardOptions.from_mapping(mapping, "tofcorr import frames")
-    return import_checkerboard(folder, out, options, take_intrinsics(given))
+    given["coding"] = take_coding(given)
+    given["saturation_counts"] = given.pop("saturation_amplitude")
+    given["modulation_frequency"] = given.pop("modulation_frequency_hz")
+    return import_boards(folder, out, given)
