@@ -72,16 +72,14 @@ class BoardPose:
                 corners surround all pixels; 1 is the outer edge of the squares; negative values
                 shrink the area.
         """
-        # The normal points to the camera: rays that meet the board have a negative cosine, and
-        # those almost parallel to it are left out.
-        meets = rays @ self.plane()[0] < -np.finfo(np.float32).eps
-        distance = self.distance(np.where(meets[..., None], rays, -self.plane()[0]))
-        on_plane = np.where(meets, distance, 0.0)[..., None] * rays
-        in_squares = (on_plane - self.translation) @ self.rotation[:, :2] / board.square_length
+        with np.errstate(divide="ignore", invalid="ignore"):  # Of rays along the plane.
+            distance = self.distance(rays)
+            on_plane = distance[..., None] * rays - self.translation
+            in_squares = on_plane @ self.rotation[:, :2] / board.square_length
         places = board.corner_points()[:, :2] / board.square_length
         low, high = places.min(axis=0), places.max(axis=0)
         beyond = np.maximum(low - in_squares, in_squares - high)
-        return meets & (beyond.max(axis=-1) <= margin)
+        return (distance > 0) & (beyond.max(axis=-1) <= margin)
 
 
 def estimate_pose(
