@@ -126,11 +126,16 @@ def refused_in_words(
         raise kind(f"{where}: {faults}") from None
 
 
+def did_you_mean(given: str, known: Iterable[str]) -> str:
+    """Return a sentence that asks whether what resembles a text was meant; empty: nothing does."""
+    close = get_close_matches(given, known, n=1)
+    return f" Did you mean '{close[0]}'?" if close else ""
+
+
 def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:
     path = one_line(".".join(str(part) for part in detail["loc"]) or "the file")
     if detail["type"] == "extra_forbidden":
-        close = get_close_matches(str(detail["loc"][-1]), _known_keys(cls, set()), n=1)
-        hint = f" Did you mean '{close[0]}'?" if close else ""
+        hint = did_you_mean(str(detail["loc"][-1]), _known_keys(cls, set()))
         return f"'{path}' is not a known key.{hint}"
     if detail["type"] == "missing":
         return f"'{path}' is missing."
@@ -446,7 +451,5 @@ def shipped_file(text: str, folder: str) -> Path:
     if not folder or os.path.lexists(path):
         return path
     names = shipped_names(folder)
-    close = get_close_matches(path.stem, names, n=1)
-    hint = f" Did you mean '{close[0]}'?" if close else ""
-    said = f"{text}: neither a file nor a configuration shipped for '{folder}'.{hint}"
-    raise ConfigError(f"{said} Shipped: {', '.join(names)}.")
+    said = f"{text}: neither a file nor a configuration shipped for '{folder}'."
+    raise ConfigError(f"{said}{did_you_mean(path.stem, names)} Shipped: {', '.join(names)}.")

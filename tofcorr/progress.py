@@ -1,7 +1,7 @@
 """How far long work has come: bars at a terminal, log lines for those who ask, TensorBoard's files.
 
 A bar is drawn on standard error if, and only if, that is a terminal and no log lines were asked
-for. In a log file nothing of it appears. tqdm is imported only where a bar is drawn.
+for. In a log file nothing of it appears.
 """
 
 import logging
@@ -49,14 +49,11 @@ def bar(total: int, what: str, unit: str = "frame") -> Iterator[Advance]:
     Yields:
         A function that takes the units done since its last call.
     """
-    start = time.perf_counter()
-    if drawn():
-        from tqdm import tqdm
+    from tqdm import tqdm  # Slow to import; few commands need it.
 
-        with tqdm(total=total, desc=what, unit=unit, leave=False, disable=None) as shown:
-            yield shown.update
-    else:
-        yield lambda done: None
+    start = time.perf_counter()
+    with tqdm(total=total, desc=what, unit=unit, leave=False, disable=not drawn()) as shown:
+        yield shown.update
     LOG.info("%s: %d %ss in %.1f s", what, total, unit, time.perf_counter() - start)
 
 
@@ -89,25 +86,18 @@ def stages(what: str, total: int) -> Iterator[Callable[[str], None]]:
     Yields:
         A function that is called with the name of each stage as it begins.
     """
-    shown = None
-    if drawn():
-        from tqdm import tqdm
+    from tqdm import tqdm
 
-        form = "{desc} {bar} {n_fmt}/{total_fmt} [{elapsed}]"
-        shown = tqdm(total=total, leave=False, disable=None, bar_format=form)
+    form = "{desc} {bar} {n_fmt}/{total_fmt} [{elapsed}]"
+    with tqdm(total=total, leave=False, disable=not drawn(), bar_format=form) as shown:
 
-    def begin(name: str) -> None:
-        LOG.info("%s: %s", what, name)
-        if shown is not None and drawn():
+        def begin(name: str) -> None:
+            LOG.info("%s: %s", what, name)
             shown.set_description_str(f"{what}: {name}")
             shown.update(1)
             shown.refresh()
 
-    try:
         yield begin
-    finally:
-        if shown is not None:
-            shown.close()
 
 
 @contextmanager

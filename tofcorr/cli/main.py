@@ -171,10 +171,8 @@ def configs_command(name: str | None) -> None:
 
 def _file(name: str) -> Path:
     """Return the shipped file of a name, with or without its folder."""
-    from difflib import get_close_matches
-
     from tofcorr.errors import ConfigError
-    from tofcorr.options import configs_folder, shipped_folders, shipped_names
+    from tofcorr.options import configs_folder, did_you_mean, shipped_folders, shipped_names
 
     every = [f"{folder}/{one}" for folder in shipped_folders() for one in shipped_names(folder)]
     matches = [one for one in every if name in (one, one.partition("/")[2])]
@@ -182,7 +180,6 @@ def _file(name: str) -> Path:
         raise ConfigError(f"'{name}' stands for {' and '.join(matches)}; name one of them.")
     if not matches:
         known = [*every, *(one.partition("/")[2] for one in every)]
-        close = get_close_matches(name, known, n=1)
-        hint = f" Did you mean '{close[0]}'?" if close else ""
-        raise ConfigError(f"no configuration '{name}' is shipped.{hint} List: tofcorr configs")
+        said = f"no configuration '{name}' is shipped.{did_you_mean(name, known)}"
+        raise ConfigError(f"{said} List: tofcorr configs")
     return configs_folder() / f"{matches[0]}.yaml"

@@ -145,15 +145,13 @@ def read_frames(array: np.ndarray, indices: np.ndarray) -> np.ndarray:
     if not isinstance(array, np.memmap):
         return array[indices]
     frames = np.empty((len(indices), *array.shape[1:]), dtype=array.dtype)
-    frame_bytes = array[:1].nbytes
     path = Path(str(array.filename))
-    # Consecutive frames are read at once.
-    starts = np.flatnonzero(np.diff(indices, prepend=-2) != 1)
-    stops = np.append(starts[1:], len(indices))
     try:
-        for start, stop in zip(starts, stops, strict=True):
-            part, place = frames[start:stop], array.offset + int(indices[start]) * frame_bytes
-            part[:] = np.fromfile(path, array.dtype, part.size, offset=place).reshape(part.shape)
+        for frame, index in zip(frames, indices.tolist(), strict=True):
+            place = array.offset + index * frame.nbytes
+            frame[...] = np.fromfile(path, array.dtype, frame.size, offset=place).reshape(
+                frame.shape
+            )
     except ValueError:
         raise CalibrationDataError(f"{path}: cannot be read (it became shorter).") from None
     except OSError as error:
@@ -186,8 +184,7 @@ class ArrayStream:
         self._dtype = dtype
         self._frame_shape = frame_shape
         self._file = path.open("w+b")
-        self._write_header(0)
-        self._header_bytes = self._file.tell()
+        self._write_header(0)  # NumPy leaves room for a count of 21 digits.
 
     def convert(self, frame: np.ndarray, where: str) -> np.ndarray:
         """Return the frame in the type of the file.
@@ -212,8 +209,6 @@ class ArrayStream:
         """Write the number of frames into the header and close the file."""
         self._file.seek(0)
         self._write_header(num_frames)
-        if self._file.tell() != self._header_bytes:  # NumPy leaves room for 21 digits.
-            raise OSError(0, "the array has too many frames for its header")
         self._file.close()
 
     def abandon(self) -> None:

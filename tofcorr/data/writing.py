@@ -388,10 +388,8 @@ def _write_points(
     points = (directions[seen] * depth[seen][:, None].astype(np.float64)).astype(np.float32)
     columns = {axis: points[:, k] for k, axis in enumerate("xyz")}
     columns |= {name: image[seen] for name, image in more.items()}
-    table = np.rec.fromarrays(
-        list(columns.values()),
-        dtype=[(name, values.dtype.newbyteorder("<")) for name, values in columns.items()],
-    )
+    kinds = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
+    table = np.rec.fromarrays(list(columns.values()), dtype=kinds)
     header = [
         "ply",
         "format binary_little_endian 1.0",

@@ -78,14 +78,15 @@ coding_options = _adding(
 )
 """Adds the options that say how the numbers of depth images are to be read."""
 
+_MOVING = "Also use images taken while the robot moved."
 _FULL = "Pixels at or above this amplitude are saturated and not used."
 posed_options = _adding(
     option("--eye-to-hand", "The camera stands still; the robot moves the target.", is_flag=True),
     depth_kind_option,
     option("--time-offset-s", "Added to the images' time stamps.", default=0.0),
-    option("--lag-s", "How much later images are stamped than poses; left out: found.", type=float),
+    option("--lag-s", "How much later images are stamped than poses; auto: found.", default="auto"),
     option("--pose-tolerance-s", "Largest time from an image to the nearest pose.", default=0.2),
-    option("--keep-moving", "Also use images taken while the robot moved.", is_flag=True),
+    option("--keep-moving", _MOVING, "moving", default="leave_out", flag_value="keep"),
     option("--images-per-stop", "At most so many images of one stop of the robot.", default=3),
     option("--tolerance-mm", "How far a pixel of a wall may be from its plane.", default=30.0),
     option("--base-frame", "Name of the base.", default="base"),
@@ -153,9 +154,6 @@ def take_posed_options(given: dict[str, Any], camera_frame: str = "") -> "PosedO
         "camera": given.pop("camera_frame") or camera_frame or "camera",
     }
     given["walls"] = {"tolerance_mm": given.pop("tolerance_mm")}
-    given["moving"] = "keep" if given.pop("keep_moving") else "leave_out"
-    if given["lag_s"] is None:
-        del given["lag_s"]
     own = {key: given.pop(key) for key in PosedOptions.model_fields if key in given}
     return PosedOptions.from_mapping(own, command_name())
 

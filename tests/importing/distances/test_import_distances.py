@@ -70,6 +70,6 @@ def test_rows_without_whole_readings_and_lists_of_other_lengths_are_refused(
         ((rows, *poses, *odd), "64 numbers are not whole readings of 15 zones"),
         ((rows, *poses, "--zones", "8x8"), "--fov-deg"),
         ((rows, *sensor), "name its poses with --poses"),
-        ((tmp_path, *sensor), "no file of distances"),
+        ((tmp_path, *sensor), "measurements.csv: there is no such file"),
     ):
         assert said in run_import("distances", *arguments, out=tmp_path / "out").text

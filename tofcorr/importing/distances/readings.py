@@ -17,11 +17,8 @@ from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.robot_images import RobotImages
 from tofcorr.importing.run import RefusedViewError
 
-_NAMES = {
-    "distances": ("measurements.csv", "distances.csv", "measurements.txt", "distances.txt"),
-    "poses": ("transforms.csv", "poses.csv", "poses.txt", "poses.npy", "transforms.txt"),
-}
-"""Files that a folder may hold, the first of them is read."""
+_FILES = {"distances": "measurements.csv", "poses": "transforms.csv"}
+"""What a folder holds."""
 
 
 def zones_of(text: str) -> tuple[int, int]:
@@ -142,14 +139,11 @@ def _wall_names(
 
 def _file_in(source: Path, what: str) -> Path:
     """Return the file itself, or the one of distances or poses in a folder."""
-    if not source.is_dir():
-        if what == "poses":
-            raise ConfigError(f"{source} is a file: name its poses with --poses.")
-        return source
-    found = next((source / name for name in _NAMES[what] if (source / name).exists()), None)
-    if found is None:
-        raise CalibrationDataError(f"{source}: no file of {what}: {', '.join(_NAMES[what])}.")
-    return found
+    if source.is_dir():
+        return source / _FILES[what]
+    if what == "poses":
+        raise ConfigError(f"{source} is a file: name its poses with --poses.")
+    return source
 
 
 def read_distances(path: Path, zones: tuple[int, int]) -> np.ndarray:

@@ -4,11 +4,11 @@ The order is that of the columns in a linear fit, and decides between effects th
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
 
 from tofcorr.errors import ConfigError
+from tofcorr.options import did_you_mean
 from tofcorr.simulation.effects.base import CatalogueEffect
 
 _EFFECTS = (
@@ -62,9 +62,8 @@ def build_effects(entries: Sequence[Mapping[str, Any]]) -> tuple[CatalogueEffect
         if name is None:
             raise ConfigError(f"{at}: 'name' is missing; known effects: {known}.")
         if name not in CATALOGUE:
-            close = get_close_matches(str(name), CATALOGUE, n=1)
-            hint = f"Did you mean '{close[0]}'?" if close else f"Known effects: {known}."
-            raise ConfigError(f"{at}: there is no effect '{name}'. {hint}")
+            hint = did_you_mean(str(name), CATALOGUE) or f" Known effects: {known}."
+            raise ConfigError(f"{at}: there is no effect '{name}'.{hint}")
         values = {key: value for key, value in entry.items() if key != "name"}
         effects.append(CATALOGUE[name].from_mapping(values, f"{at} ({name})"))
     return tuple(effects)
