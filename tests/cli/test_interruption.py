@@ -64,7 +64,8 @@ def test_what_a_second_interruption_kept_from_being_removed_is_removed_at_the_en
             monkeypatch.setattr(shutil, "rmtree", stop)
             raise KeyboardInterrupt
 
-    assert run(work).code == 130
+    said = run(work)
+    assert (said.code, said.err) == (130, "Interrupted; nothing half-written was left.\n")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from importing.checkerboard.rendered_board import BOARD, Placement, infrared, placement, project
 
-from tofcorr.importing.checkerboard.boards import Board
-
 FRONTAL, FAR = placement(0.5), placement(0.9, tilt_y=-30, aside=(0.1, 0.05))
 TILTED, NEAR = placement(0.6, tilt_x=35, roll=20), placement(0.4, tilt_x=-25, tilt_y=25, roll=80)
 
@@ -24,10 +22,3 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(where: Placement) -> None:
 def test_a_board_lit_from_one_side_only_is_found() -> None:
     falloff = np.geomspace(1.0, 0.01, 320)
     assert BOARD.find((infrared(TILTED) * falloff).astype(np.uint16)) is not None
-
-
-def test_without_a_board_or_with_another_nothing_is_found() -> None:
-    noise = np.random.default_rng(0).integers(100, 4000, (240, 320)).astype(np.uint16)
-    assert BOARD.find(noise) is None
-    assert BOARD.find(np.zeros((50, 64), np.uint16)) is None
-    assert Board(columns=6, rows=8, square_length=0.03).find(infrared(FRONTAL)) is None
