@@ -38,7 +38,7 @@ class TestOptions(Options):
             simulator's error was fitted at other poses, to which it is carried with a form error.
     """
 
-    odds: Share = 0.0003
+    odds: Share = 0.00015
     named_from: Share = 0.5
     cover: Share = 0.9
     level: Share = 0.05
