@@ -20,8 +20,8 @@ def jackknife_and_refits(scene: Scene) -> tuple[Covariance, torch.Tensor]:
     moments = scene.moments()
     optimum = minimise(MomentObjective(moments), scene.truth).parameters
     shifts = []
-    for left_out in range(moments.num_images):
-        rest = moments.images([k for k in range(moments.num_images) if k != left_out])
+    for left_out in range(len(moments.gram)):
+        rest = moments.images([k for k in range(len(moments.gram)) if k != left_out])
         refitted = minimise(MomentObjective(rest), optimum).parameters
         shifts.append(step_between(optimum, refitted))
     return jackknife_covariance(moments, optimum), torch.stack(shifts)

@@ -84,7 +84,7 @@ def test_a_column_of_zeros_changes_nothing_and_its_coefficient_stays_zero(
     # A condition that never changed: where rounding mixed its direction with others, its
     # coefficient came out as 5e120, and no number of the fit was finite any more.
     plain = make_scene(generator, EA).moments()
-    functions = torch.linspace(0.0, 1.0, plain.num_images, dtype=torch.float64)[:, None]
+    functions = torch.linspace(0.0, 1.0, len(plain.gram), dtype=torch.float64)[:, None]
     functions = torch.cat([functions, functions.square()], dim=1)
     expected = initial_parameters(plain.with_conditions(functions, ["h1", "w1"]))
     with_zeros = torch.cat([torch.zeros_like(functions[:, :1]), functions], dim=1)

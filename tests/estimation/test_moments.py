@@ -125,11 +125,7 @@ def test_moments_of_some_columns_are_those_of_the_smaller_model(generator: torch
     assert found.symbols == small.symbols
     bare = scene.moments().columns([])
     assert bare.gram.shape[-1] == 4
-    assert bare.num_coefficients == 0
-    with pytest.raises(ValueError, match="different error models"):
-        concatenate([scene.moments(EA), scene.moments(E0)])
-    with pytest.raises(ValueError, match="no frame was read"):
-        concatenate([])
+    assert len(bare.symbols) == 0
 
 
 def test_without_amplitudes_a_model_that_needs_none_is_unaffected(

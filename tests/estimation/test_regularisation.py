@@ -46,7 +46,7 @@ def moments_of(model: ErrorModel, batch: FrameBatch) -> ImageMoments:
 
 
 def zero(moments: ImageMoments) -> Parameters:
-    return replace(KNOWN, coefficients=torch.zeros(moments.num_coefficients, dtype=torch.float64))
+    return replace(KNOWN, coefficients=torch.zeros(len(moments.symbols), dtype=torch.float64))
 
 
 def test_penalised_fit_is_least_squares_with_the_roughness_as_further_rows(
@@ -97,14 +97,14 @@ def test_joined_priors_weigh_as_both_alone(generator: torch.Generator) -> None:
     model = spline_model(DOMAIN, 1e-3)
     moments = moments_of(model, batch)
     point = zero(moments).moved(
-        torch.randn(moments.num_coefficients, generator=generator, dtype=torch.float64)
+        torch.randn(len(moments.symbols), generator=generator, dtype=torch.float64)
     )
     one = smoothness(penalties_of(model), 100.0, zero(moments))
     other = smoothness(penalties_of(model), 5.0, point)
     assert one is not None
     assert other is not None
     first = replace(one, centre=point, factor=torch.eye(len(point.coefficients)).double())
-    here = point.moved(0.3 * torch.ones(moments.num_coefficients, dtype=torch.float64))
+    here = point.moved(0.3 * torch.ones(len(moments.symbols), dtype=torch.float64))
     both = first.joined(other).equations(here)
     apart = [first.equations(here), other.equations(here)]
     for joint, a, b in zip(both, *apart, strict=True):

@@ -13,12 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from tofcorr.comparison.options import (
-    BEFORE,
-    ComparedModel,
-    ComparisonOptions,
-    masks_of,
-)
+from tofcorr.comparison.options import BEFORE, ComparedModel, ComparisonOptions, masks_of
 from tofcorr.comparison.statistics import Estimate
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModelOptions
@@ -27,12 +22,7 @@ from tofcorr.estimation.planes import estimate_walls
 from tofcorr.fit.fitting import fit, hand_eye_alone
 from tofcorr.fit.problem import FitOptions, Problem, build_model, refuse_missing_inputs
 from tofcorr.fit.walls import FoundWalls, recorded_walls, walls_alone, with_every_wall
-from tofcorr.pixels.dataset import (
-    Dataset,
-    covered_domain,
-    hand_eye_is_free,
-    recorded_hand_eye,
-)
+from tofcorr.pixels.dataset import Dataset, covered_domain, hand_eye_is_free, recorded_hand_eye
 from tofcorr.pixels.passes import FittedModel, FrameErrors, held_out_errors, image_moments
 from tofcorr.pixels.sample import MaskOptions, usable_pixels
 from tofcorr.plausibility.finding import Inspection

@@ -12,13 +12,7 @@ from torch import Tensor, nn
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState, corrector_metadata
-from tofcorr.error_terms.base import (
-    EVERYTHING,
-    Domain,
-    Interval,
-    ScaledPolynomial,
-    SignalTerm,
-)
+from tofcorr.error_terms.base import EVERYTHING, Domain, Interval, ScaledPolynomial, SignalTerm
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.error_terms.signal_terms import unscale
@@ -475,14 +469,9 @@ class RuntimeSigma(nn.Module):
         noise, calibration = unknown, unknown
         seen = torch.isfinite(radial_distance) & (radial_distance > 0)
         if self.knows_noise:
-            weakness = 1.0 / amplitude.clamp(min=0.0)
-            a, b, c = self.noise[0], self.noise[1], self.noise[2]
-            # Zero times infinity at zero amplitude would be NaN.
-            variance = torch.full_like(amplitude, a)
-            if b > 0.0:
-                variance = variance + b * weakness
-            if c > 0.0:
-                variance = variance + c * weakness * weakness
+            # As `DistanceNoise` has it; the least amplitude, for zero times infinity would be NaN.
+            weakness = 1.0 / amplitude.clamp(min=2.0**-126)
+            variance = self.noise[0] + weakness * (self.noise[1] + self.noise[2] * weakness)
             noise = torch.where(seen, variance.sqrt(), unknown)
         if self.knows_calibration:
             distance = radial_distance.clamp(self.nearest, self.farthest)

@@ -19,6 +19,9 @@ from tofcorr.geometry.camera import DISTORTION_LENGTHS, CameraIntrinsics, DepthK
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.geometry.se3 import product, projected, transformed
 
+Transform = Tensor | np.ndarray | Sequence[Sequence[float]]
+"""Four rows of four."""
+
 
 class HandEye(nn.Module):
     r"""A rigid transform near an initial guess, optimised without constraints.
@@ -42,12 +45,7 @@ class HandEye(nn.Module):
 
     start: Tensor
 
-    def __init__(
-        self,
-        start: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
-        *,
-        fixed: bool = False,
-    ) -> None:
+    def __init__(self, start: Transform | None = None, *, fixed: bool = False) -> None:
         super().__init__()
         self.register_buffer("start", _rigid(torch.eye(4) if start is None else start))
         self.twist = nn.Parameter(torch.zeros(6, dtype=torch.float64), requires_grad=not fixed)
@@ -62,7 +60,7 @@ class HandEye(nn.Module):
         return product(self.start, se3.exp(self.twist))
 
     @torch.no_grad()
-    def rebase(self, transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> None:
+    def rebase(self, transform: Transform) -> None:
         """Set the transform (4, 4): it becomes `start`, and the twist becomes zero."""
         self.start.copy_(_rigid(transform))
         self.twist.zero_()
@@ -123,7 +121,7 @@ class CalibrationModel(nn.Module):
         return cosine * corrected + origin_to_plane[:, None, None]
 
 
-def _rigid(transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> Tensor:
+def _rigid(transform: Transform) -> Tensor:
     """Return a float64 copy of `transform`, after checking that it is rigid."""
     matrix = torch.as_tensor(transform, dtype=torch.float64).detach().clone()
     try:

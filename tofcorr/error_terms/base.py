@@ -313,22 +313,15 @@ class Term(DescribedModule, ABC):
         coefficients: Shape (K,), metres.
     """
 
-    __jit_unused_properties__: ClassVar[list[str]] = ["strength"]
-
     def __init__(self, options: BaseTermOptions, group: str, symbols: list[str]) -> None:
         super().__init__()
         self.options, self.group, self.symbols = options, group, symbols
         self.coefficients = nn.Parameter(torch.zeros(len(symbols), dtype=torch.float64))
 
-    @property
-    def strength(self) -> float | str:
-        """Weight of `roughness` in the loss: a number, or "auto": by cross-validation."""
-        return getattr(self.options, "strength", 0.0)
-
     def roughness(self) -> Tensor:
         """Return the rows F (R, K) whose squared product with the coefficients is penalised.
 
-        No rows: the term needs no penalty.
+        No rows: the term needs no penalty. The options of a term with rows hold its `strength`.
         """
         return torch.zeros(0, len(self.symbols), dtype=torch.float64)
 

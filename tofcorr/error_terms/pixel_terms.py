@@ -7,14 +7,7 @@ import torch
 from pydantic import PositiveFloat
 from torch import Tensor
 
-from tofcorr.error_terms.base import (
-    BaseTermOptions,
-    Domain,
-    Interval,
-    PixelMap,
-    PixelTerm,
-    powers,
-)
+from tofcorr.error_terms.base import BaseTermOptions, Domain, Interval, PixelMap, PixelTerm, powers
 from tofcorr.error_terms.signal_terms import rescale, unit_of_power, unscale
 from tofcorr.options import Degree
 

@@ -49,16 +49,6 @@ class ImageMoments:
     symbols: list[str]
 
     @property
-    def num_images(self) -> int:
-        """How many images there are."""
-        return len(self.gram)
-
-    @property
-    def num_coefficients(self) -> int:
-        """Coefficients of the error model."""
-        return len(self.symbols)
-
-    @property
     def planes(self) -> Float[Tensor, "N 4"]:
         """Each image's plane in the tool frame, normal and offset."""
         return torch.cat([self.normal_tool, self.offset_tool[:, None]], dim=1)
@@ -101,15 +91,7 @@ class ImageMoments:
 
 
 def concatenate(parts: Sequence[ImageMoments]) -> ImageMoments:
-    """Join the moments of several passes over the same design.
-
-    Raises:
-        ValueError: There is nothing to join, or the designs differ.
-    """
-    if not parts:
-        raise ValueError("There are no moments to join: no frame was read.")
-    if any(part.symbols != parts[0].symbols for part in parts):
-        raise ValueError("Moments of different error models cannot be joined.")
+    """Join the moments of several passes over the same design."""
     joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in _PER_IMAGE}
     return replace(parts[0], **joined)
 

@@ -49,7 +49,7 @@ def penalties_of(model: ErrorModel) -> list[Penalty]:
     for term, start in model.penalised():
         rows = term.roughness()
         factor = torch.nn.functional.pad(rows.double(), (start, size - start - rows.shape[1]))
-        found.append(Penalty(term.symbols[0], factor, term.strength))
+        found.append(Penalty(term.symbols[0], factor, term.options.strength))  # pyright: ignore
     return found
 
 
@@ -158,7 +158,7 @@ def time_constant(moments: ImageMoments, around: Parameters, time: Float[Tensor,
         gradient = torch.cat([equations.gradient, (decay @ each.gradient[:, column])[None]])
         return float(equations.loss - gradient @ solved(hessian, gradient, RESOLVED))
 
-    low, high = duration / max(moments.num_images - 1, 1), 3 * duration
+    low, high = duration / max(len(moments.gram) - 1, 1), 3 * duration
     grid = torch.linspace(math.log(low), math.log(high), 16).tolist()
     best = min(range(1, len(grid) - 1), key=lambda k: loss(grid[k]))
     bounds = grid[best - 1], grid[best + 1]

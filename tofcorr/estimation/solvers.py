@@ -17,12 +17,7 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from tofcorr.estimation.linear import RESOLVED, ROUNDING, Curvature
-from tofcorr.estimation.moments import (
-    LEAST_RESIDUAL,
-    ImageMoments,
-    MomentObjective,
-    Parameters,
-)
+from tofcorr.estimation.moments import LEAST_RESIDUAL, ImageMoments, MomentObjective, Parameters
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import planes_through
 from tofcorr.options import Options
@@ -179,7 +174,7 @@ def initial_parameters(
     points = moments.gram[:, [0, 1, 2, -1]][:, :, [0, 1, 2, -1]]
     normals, _ = planes_through(points, torch.zeros(3, dtype=torch.float64))
     rotation = rotation_from_normals(moments.normal_tool, normals, guess[:3, :3])
-    zero = torch.zeros(moments.num_coefficients, dtype=torch.float64)
+    zero = torch.zeros(len(moments.symbols), dtype=torch.float64)
     return with_linear_part(moments, Parameters(se3.assemble(rotation, guess[:3, 3]), zero))
 
 

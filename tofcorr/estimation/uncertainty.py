@@ -17,11 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.linear import (
-    Curvature,
-    left_out_steps,
-    robust_covariance,
-)
+from tofcorr.estimation.linear import Curvature, left_out_steps, robust_covariance
 from tofcorr.estimation.moments import (
     HAND_EYE_SYMBOLS,
     LEAST_RESIDUAL,
@@ -229,12 +225,7 @@ def observability(
         return Direction(float(variances[k]) ** 0.5, shares, both)
 
     return Observability(
-        [direction(k) for k in range(len(names))],
-        pairs,
-        posterior,
-        vectors,
-        precision,
-        variance,
+        [direction(k) for k in range(len(names))], pairs, posterior, vectors, precision, variance
     )
 
 

@@ -19,7 +19,6 @@ Hand-eye transform, coefficients and estimated walls are moved back together: on
 other, and only together do they put corrected points on the planes.
 """
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import repeat
@@ -34,11 +33,7 @@ from tofcorr.error_terms.base import Domain, Term
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import Curvature, solvable
-from tofcorr.estimation.moments import (
-    ImageMoments,
-    MomentObjective,
-    Parameters,
-)
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.planes import estimate_walls, joint_image_equations
 from tofcorr.estimation.regularisation import (
@@ -60,18 +55,14 @@ from tofcorr.fit.problem import Core, Fit, FitOptions, Problem, Shift, build_mod
 from tofcorr.fit.residual import fit_residual
 from tofcorr.fit.walls import recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights
-from tofcorr.pixels.dataset import Dataset, thread_number
+from tofcorr.pixels.dataset import Dataset, Frames, thread_number
 from tofcorr.pixels.passes import image_moments
-from tofcorr.pixels.sample import (
-    distance_to_plane,
-    estimate_noise,
-    pixels_of_image,
-)
+from tofcorr.pixels.sample import distance_to_plane, estimate_noise, pixels_of_image
 
 
 def fit(
     dataset: Dataset,
-    frames: Sequence[int] | np.ndarray,
+    frames: Frames,
     options: FitOptions,
     domain: Domain,
     watcher: Watcher | None = None,
@@ -231,7 +222,9 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
     held_out = [(poses % 6 == k).nonzero()[:, 0].tolist() for k in range(6)]
     penalties = with_strengths(penalties_of(model), moments, start, held_out)
     strengths = {one.name: float(one.strength) for one in penalties}
-    chosen = [strengths[t.symbols[0]] for t, _ in model.penalised() if t.strength == "auto"]
+    chosen = [
+        strengths[t.symbols[0]] for t, _ in model.penalised() if t.options.is_open("strength")
+    ]
     core = Core(
         options=options.with_found("strength", chosen),
         moments=moments,
@@ -249,7 +242,7 @@ def _start(problem: Problem, moments: ImageMoments, model: ErrorModel) -> Parame
         return problem.start(moments)
     others = [symbol for symbol in moments.symbols if symbol not in penalised]
     found = problem.start(moments.columns(others))
-    coefficients = torch.zeros(moments.num_coefficients, dtype=torch.float64)
+    coefficients = torch.zeros(len(moments.symbols), dtype=torch.float64)
     coefficients[[moments.symbols.index(symbol) for symbol in others]] = found.coefficients
     return replace(found, coefficients=coefficients)
 

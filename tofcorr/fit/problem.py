@@ -195,7 +195,7 @@ class Problem:
 
     def guess(self, moments: ImageMoments) -> Parameters:
         """Return the recorded hand-eye transform and no error: the centre of the prior."""
-        zero = torch.zeros(moments.num_coefficients, dtype=torch.float64)
+        zero = torch.zeros(len(moments.symbols), dtype=torch.float64)
         free = hand_eye_is_free(self.dataset, self.options.hand_eye)
         return Parameters(recorded_hand_eye(self.dataset), zero, free)
 
@@ -206,7 +206,7 @@ class Problem:
         columns; otherwise the better of the recorded transform and a closed form.
         """
         resumed = self.resumed
-        if resumed is not None and resumed.coefficients.numel() == moments.num_coefficients:
+        if resumed is not None and resumed.coefficients.numel() == len(moments.symbols):
             return resumed
         guess = self.guess(moments)
         candidates = [with_linear_part(moments, guess)]

@@ -49,13 +49,7 @@ from tofcorr.fit.linear_image import (
     wall_moves,
 )
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.options import (
-    Count,
-    NonNegativeNumber,
-    Number,
-    Options,
-    refused_in_words,
-)
+from tofcorr.options import Count, NonNegativeNumber, Number, Options, refused_in_words
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import off_the_wall, some_pixels
 from tofcorr.pixels.sample import pixels_of_image

@@ -1,6 +1,5 @@
 """Walls that nobody has measured: estimated with the calibration, or alone under a fitted model."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +10,7 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.planes import Walls
 from tofcorr.geometry.rays import planes_through
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, Frames
 from tofcorr.pixels.sample import pixels_of_image
 
 
@@ -77,7 +76,7 @@ def name_walls(dataset: Dataset) -> tuple[np.ndarray, list[str]]:
     return np.array([distinct.index(key) for key in keys]), names
 
 
-def recorded_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> FoundWalls:
+def recorded_walls(dataset: Dataset, frames: Frames) -> FoundWalls:
     """Return the walls that some frames show, as recorded.
 
     Raises:
@@ -122,9 +121,7 @@ def with_every_wall(dataset: Dataset, found: FoundWalls | None, model: Calibrati
     return walls_alone(dataset, frames, model).put_into(dataset)
 
 
-def walls_alone(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, model: CalibrationModel
-) -> FoundWalls:
+def walls_alone(dataset: Dataset, frames: Frames, model: CalibrationModel) -> FoundWalls:
     """Return the walls of some frames, each the plane of least squares through corrected points.
 
     Args:

@@ -1,10 +1,8 @@
 """The weight of each pixel in a fit: by its noise, and by its distance to the plane."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +11,7 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.estimation.moments import LEAST_RESIDUAL
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.robust import RobustLoss, robust_scale, robust_weights
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, Frames
 from tofcorr.pixels.sample import FramePixels, distance_to_plane, estimate_noise
 
 
@@ -49,9 +47,7 @@ class PixelWeights:
             distance = sample.distance_to_plane(self.model.hand_eye().detach(), error)
         return self._of(sample.pixels.amplitude, distance)
 
-    def updated(
-        self, dataset: Dataset, frames: Sequence[int] | np.ndarray, model: CalibrationModel
-    ) -> "PixelWeights":
+    def updated(self, dataset: Dataset, frames: Frames, model: CalibrationModel) -> "PixelWeights":
         """Return the weights under another model: one pass over a sample of the pixels."""
         found = replace(self, model=model)
         sample = []
@@ -94,7 +90,7 @@ class PixelWeights:
 
 
 def first_weights(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, noise: bool, loss: RobustLoss
+    dataset: Dataset, frames: Frames, noise: bool, loss: RobustLoss
 ) -> PixelWeights | None:
     """Return the weights before any fit; None if all pixels have the same.
 

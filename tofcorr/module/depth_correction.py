@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-import numpy as np
 import torch
 from pydantic import AfterValidator, InstanceOf
 from torch import Tensor
@@ -34,7 +33,7 @@ from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
 from tofcorr.module.fitting import FitReport, fit_to
 from tofcorr.options import Options, PositiveNumber, load_options, one_line, resolve_options
-from tofcorr.pixels.dataset import Dataset, Recordings, covered_domain, opened
+from tofcorr.pixels.dataset import Dataset, Frames, Recordings, covered_domain, opened
 from tofcorr.training.calibration import TrainingOptions
 
 FORMAT = "tofcorr-module"
@@ -179,10 +178,7 @@ class DepthCorrection(FrameCorrection):
         self.to(dtype)
 
     def batches(
-        self,
-        recordings: Recordings,
-        frames: Sequence[int] | np.ndarray | None = None,
-        frames_per_batch: int = 8,
+        self, recordings: Recordings, frames: Frames | None = None, frames_per_batch: int = 8
     ) -> Iterator[FrameBatch]:
         """Yield the frames of recordings in batches for `point_to_plane_loss`, read from disk.
 

@@ -36,6 +36,9 @@ from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import Options
 
+Frames = Sequence[int] | np.ndarray
+"""Numbers of frames."""
+
 
 @dataclass(frozen=True)
 class Dataset:
@@ -118,7 +121,7 @@ class Dataset:
             if name != "timestamp":  # Every recording has it.
                 recording.require(name, needed_by)
 
-    def conditions(self, frames: Sequence[int] | np.ndarray | None = None) -> Float[Tensor, "N C"]:
+    def conditions(self, frames: Frames | None = None) -> Float[Tensor, "N C"]:
         """Return the conditions of frames (N, C) in the order of `CONDITIONS`; NaN: unknown."""
         every = torch.cat([frame_conditions(recording.frames) for recording in self.recordings])
         return every if frames is None else every[torch.as_tensor(np.asarray(frames))]
@@ -151,7 +154,7 @@ class Dataset:
 
     def batches(
         self,
-        frames: Sequence[int] | np.ndarray | None = None,
+        frames: Frames | None = None,
         device: str = "cpu",
         chunk_pixels: int = CHUNK_PIXELS,
         image_dtype: torch.dtype = torch.float64,
@@ -166,9 +169,7 @@ class Dataset:
                     numbered = replace(numbered, valid=batch.valid & ~self.exclude(numbered))
                 yield numbered
 
-    def by_recording(
-        self, frames: Sequence[int] | np.ndarray | None
-    ) -> Iterator[tuple[Recording, int, np.ndarray]]:
+    def by_recording(self, frames: Frames | None) -> Iterator[tuple[Recording, int, np.ndarray]]:
         """Yield each recording concerned, the global number of its first frame, and its frames."""
         wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
         start = 0
@@ -295,7 +296,7 @@ def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
     return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(poses, num_folds)]
 
 
-def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Domain:
+def covered_domain(dataset: Dataset, frames: Frames) -> Domain:
     """Return image size, and the central 99.8 % of distances and amplitudes of usable pixels.
 
     A regular sample of 200 000 pixels, at least 50 a frame, is looked at.

@@ -24,7 +24,7 @@ from tofcorr.error_terms.model import Pixels
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, concatenate
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.pixels.dataset import Dataset, in_threads, thread_number
+from tofcorr.pixels.dataset import Dataset, Frames, in_threads, thread_number
 from tofcorr.pixels.sample import pixels_of_image
 
 ValueT = TypeVar("ValueT")
@@ -74,7 +74,7 @@ def _sharing() -> bool:
     return distributed.is_initialized() and not _alone.get()
 
 
-def own_share(frames: Sequence[int] | np.ndarray) -> np.ndarray:
+def own_share(frames: Frames) -> np.ndarray:
     """Return the frames that this process reads."""
     frames = np.asarray(frames)
     if not _sharing():
@@ -98,7 +98,7 @@ Weighting = Callable[[FrameBatch], Tensor]
 def image_moments(
     dataset: Dataset,
     design: Design,
-    frames: Sequence[int] | np.ndarray | None = None,
+    frames: Frames | None = None,
     weighting: Weighting | None = None,
     device: str = "cpu",
 ) -> ImageMoments:
@@ -186,7 +186,7 @@ class FittedModel:
 def frame_errors(
     dataset: Dataset,
     models: Mapping[str, CalibrationModel],
-    frames: Sequence[int] | np.ndarray | None = None,
+    frames: Frames | None = None,
     device: str = "cpu",
 ) -> dict[str, FrameErrors]:
     """Return the distances to the plane that models leave on the same frames; None: on all."""

@@ -1,6 +1,6 @@
 """Which pixels of a data set are used, and some of them: their errors and their noise."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,15 +16,8 @@ from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
 from tofcorr.options import Options
-from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
-from tofcorr.pixels.masks import (
-    Mask,
-    edges,
-    grazing,
-    off_largest_plane,
-    off_the_wall,
-    raw_errors,
-)
+from tofcorr.pixels.dataset import Dataset, Frames, recorded_hand_eye
+from tofcorr.pixels.masks import Mask, edges, grazing, off_largest_plane, off_the_wall, raw_errors
 
 
 def pixels_of_image(batch: FrameBatch, k: int, chosen: Int[Tensor, "M"]) -> Pixels:
@@ -83,9 +76,7 @@ class FramePixels:
         return ((self.normal_tool @ tool_from_camera[:3, :3]) * self.ray).sum(-1)
 
 
-def draw_pixels(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, number: int, seed: int
-) -> FramePixels:
+def draw_pixels(dataset: Dataset, frames: Frames, number: int, seed: int) -> FramePixels:
     """Draw pixels at random, the same ones every time, as many from each frame that has so many.
 
     Args:
@@ -159,10 +150,7 @@ class PixelSample:
     """
 
     def __init__(
-        self,
-        dataset: Dataset,
-        stages: Mapping[str, CalibrationModel],
-        frames: Sequence[int] | np.ndarray,
+        self, dataset: Dataset, stages: Mapping[str, CalibrationModel], frames: Frames
     ) -> None:
         camera = dataset.first.camera
         # Of four million pixels, which bounds the time, enough for narrow bins.
@@ -215,10 +203,7 @@ def errors_along_ray(
     return torch.where(batch.valid, 1e3 * residual / cosine, torch.nan), cosine
 
 
-def estimate_noise(
-    dataset: Dataset,
-    frames: Sequence[int] | np.ndarray,
-) -> DistanceNoise:
+def estimate_noise(dataset: Dataset, frames: Frames) -> DistanceNoise:
     """Return the noise of a measured distance as a function of its amplitude.
 
     It is estimated from repeats, frames that differ by noise alone. Without any, neighbouring
@@ -276,9 +261,7 @@ def _repeat_differences(
     return differences, amplitudes
 
 
-def _outside_window(
-    dataset: Dataset, half_width: float, frames: Sequence[int] | np.ndarray | None
-) -> Mask:
+def _outside_window(dataset: Dataset, half_width: float, frames: Frames | None) -> Mask:
     """Return the mask of pixels whose raw error is off by more than a window, or unknown.
 
     Mixed pixels at edges, reflections and misplaced masks are off by decimetres; the errors to be
@@ -335,11 +318,7 @@ class MaskOptions(Options):
 
 
 def usable_pixels(
-    dataset: Dataset,
-    options: MaskOptions,
-    *,
-    robust: bool,
-    frames: Sequence[int] | np.ndarray | None = None,
+    dataset: Dataset, options: MaskOptions, *, robust: bool, frames: Frames | None = None
 ) -> Dataset:
     """Return the data set without the pixels that the options leave out.
 

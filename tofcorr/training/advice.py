@@ -26,12 +26,7 @@ from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import (
-    SPEED_OF_LIGHT,
-    plane_in_frame,
-    ray_directions,
-    ray_plane_distance,
-)
+from tofcorr.geometry.rays import SPEED_OF_LIGHT, plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.support import (
     ENOUGH_REFLECTIVITY,
@@ -312,7 +307,7 @@ def advise(
     # Poses carry no information about condition terms.
     beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
     if beyond:
-        moments = moments.with_conditions(torch.zeros(moments.num_images, len(beyond)), beyond)
+        moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
     added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
     order, covariances = choose_views(fit.observability.precision, added, number)
     spreads = covariances.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()

@@ -100,7 +100,7 @@ def judge(
     if beyond := beyond_noise(errors["after"]["test"]["rms"], 1e3 * inspection.look.noise_rms):
         said.append(("usable", beyond))
     # From n images a standard error is known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
-    if (images := fit.moments.num_images) < 10:
+    if (images := len(fit.moments.gram)) < 10:
         said.append(("good", f"Only {images} images were fitted: standard errors are rough."))
     if fit.residual:
         said.append(("good", fit.residual))

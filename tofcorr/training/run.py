@@ -33,10 +33,7 @@ from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import stages
 from tofcorr.training.calibration import Calibration, TrainingOptions
-from tofcorr.training.figures import (
-    profile_figure,
-    residual_figure,
-)
+from tofcorr.training.figures import profile_figure, residual_figure
 from tofcorr.training.judgement import DO_NOT_USE, against_garbage, frames_left_out, report_text
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report

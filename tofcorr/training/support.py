@@ -1,7 +1,7 @@
 """What the poses and the target cover, in numbers, and what a calibration would need besides."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, Frames
 
 # Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a
 # function of distance and place. Set by hand.
@@ -36,9 +36,7 @@ class Support:
             wall at the same distance, incidence and place; None without amplitudes.
     """
 
-    def __init__(
-        self, dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
-    ) -> None:
+    def __init__(self, dataset: Dataset, frames: Frames, tool_from_camera: Tensor) -> None:
         from scipy.stats import circstd  # Slow to import.
 
         names = "world_from_tool", "normal_world", "offset"
@@ -128,9 +126,7 @@ def _tilt(normals: Tensor) -> tuple[float, float]:
     return math.degrees(strong), math.degrees(weak)
 
 
-def _reflectivity_ratio(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
-) -> float | None:
+def _reflectivity_ratio(dataset: Dataset, frames: Frames, tool_from_camera: Tensor) -> float | None:
     """Return the ratio of the target's brightest to its darkest reflectivity.
 
     It is measured on about 200 000 pixels, at least 100 a frame; None with fewer than 100 in all.

@@ -20,12 +20,7 @@ import torch
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
-from tofcorr.correction.corrector import (
-    DepthCorrector,
-    RuntimeErrorModel,
-    polynomials,
-    separated,
-)
+from tofcorr.correction.corrector import DepthCorrector, RuntimeErrorModel, polynomials, separated
 from tofcorr.correction.export.parity import Correct, probe_frames, require_parity
 from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState
