@@ -107,5 +107,5 @@ def test_a_recording_of_one_target_is_not_compared_by_target(tmp_path: Path) -> 
 
 
 def test_two_models_of_one_name_are_refused() -> None:
-    with pytest.raises(ConfigError, match="'E0' stands twice"):
+    with pytest.raises(ConfigError, match="two columns would be called 'E0'"):
         SelectionOptions.from_mapping({"models": [MODELS[0], MODELS[0]]}, "test")

@@ -58,7 +58,7 @@ def test_ctrl_c_ends_early_and_resuming_ends_where_an_uninterrupted_run_does(
 def in_standard_errors(trained: Trained, other: TrainingResult) -> float:
     """Return the largest difference of any parameter from those of the uninterrupted run."""
     one, two = trained.result.fit.solution.parameters, other.fit.solution.parameters
-    errors = trained.result.fit.covariance.standard_errors
+    errors = trained.result.fit.covariance.matrix.diagonal().sqrt()
     moved = (one.tool_from_camera - two.tool_from_camera)[:3, 3].norm() / errors[:3].min()
     changed = ((one.coefficients - two.coefficients).abs() / errors[6:]).max()
     return float(max(moved, changed))

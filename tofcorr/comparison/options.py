@@ -107,6 +107,18 @@ class ComparisonOptions(MaskOptions):
     planes: PlaneChoice = "auto"
     device: str = "cpu"
 
+    @model_validator(mode="after")
+    def _names_differ(self) -> Self:
+        for name in self.columns:
+            if self.columns.count(name) > 1:
+                raise ValueError(f"two columns would be called '{name}'; give each its own name")
+        return self
+
+    @property
+    def columns(self) -> list[str]:
+        """The headings of the models in tables."""
+        return [*self.baselines, *(model.name for model in self.models)]
+
     def splits(self, dataset: Dataset) -> tuple[Splits, dict[str, str]]:
         """Return what is held out, and why something that was asked for cannot be.
 
@@ -184,17 +196,10 @@ class EvaluationOptions(ComparisonOptions):
     repeats: RepeatOptions = RepeatOptions()
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
-        if twice := _repeated(self.columns):
-            raise ValueError(f"two columns would be called '{min(twice)}'; give each its own name")
+    def _folds_can_be_fitted(self) -> Self:
         if self.folds == 1:
             raise ValueError("one fold leaves nothing to train on; expected 0 or at least 2 folds")
         return self
-
-    @property
-    def columns(self) -> list[str]:
-        """The headings of the tables' columns."""
-        return [*self.baselines, *(model.name for model in self.models)]
 
     def splits(self, dataset: Dataset) -> tuple[Splits, dict[str, str]]:
         """Return the splits of each protocol that was asked for; the half split always.
@@ -241,14 +246,6 @@ class SelectionOptions(ComparisonOptions):
     folds: int = Field(default=6, ge=2)
     distance_bands: int = Field(default=3, ge=2)
     metric: Literal["mean_abs", "rms"] = "mean_abs"
-
-    @model_validator(mode="after")
-    def _each_once(self) -> Self:
-        names = [model.name for model in self.models]
-        for what, values in (("model's name", names), ("grouping", [*self.by])):
-            if twice := _repeated(values):
-                raise ValueError(f"every {what} may stand once, '{twice[0]}' stands twice")
-        return self
 
     def splits(self, dataset: Dataset) -> tuple[Splits, dict[str, str]]:
         """Return the groups of frames to hold out in turn: images, bands of distance, or targets.
@@ -309,10 +306,6 @@ def _by_distance(dataset: Dataset, bands: int) -> dict[str, np.ndarray]:
         )
         for band in np.array_split(order, min(bands, len(order)))
     }
-
-
-def _repeated(names: list[Any]) -> list[str]:
-    return [name for name in names if names.count(name) > 1]
 
 
 def masks_of(options: MaskOptions) -> MaskOptions:

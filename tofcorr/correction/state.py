@@ -107,19 +107,32 @@ class CalibrationExtras(Options):
         return CalibrationExtras(**own)
 
 
-class CalibrationState(CalibrationExtras):
+class Setting(Options):
+    """The camera that a correction is for, and what it is valid for.
+
+    Attributes:
+        camera: The lateral parameters.
+        depth_kind: What the camera's depth means: along the ray, or along the optical axis.
+        domain: Image size and the calibrated ranges, which also scale the variables.
+        saturation_amplitude: Pixels at or above it are not valid; None if unknown.
+        hand_eye_estimated: Whether the hand-eye transform was estimated, or known beforehand.
+    """
+
+    camera: Camera
+    depth_kind: DepthKind
+    domain: Domain
+    saturation_amplitude: PositiveNumber | None = None
+    hand_eye_estimated: bool
+
+
+class CalibrationState(CalibrationExtras, Setting):
     """Everything that a calibration found, and the ranges and camera it is valid for.
 
     Attributes:
         name: The model's name, for example EA.
         error_model: Its terms.
-        domain: Image size and the calibrated ranges, which also scale the variables.
         coefficients: `ErrorModel.coefficient_vector`, shape (K,), float64.
         tool_from_camera: The hand-eye transform, shape (4, 4), float64, metres.
-        hand_eye_estimated: Whether it was estimated, or known beforehand.
-        camera: The lateral parameters.
-        depth_kind: What the camera's depth means: along the ray, or along the optical axis.
-        saturation_amplitude: Pixels at or above it are not valid; None if unknown.
         fixed_pattern: One offset a pixel, shape (H, W), float64, metres; None without that term.
         residual: The residual network; None if there is none.
     """
@@ -128,13 +141,8 @@ class CalibrationState(CalibrationExtras):
 
     name: str
     error_model: ErrorModelOptions
-    domain: Domain
     coefficients: Float64
     tool_from_camera: Float64
-    hand_eye_estimated: bool
-    camera: Camera
-    depth_kind: DepthKind
-    saturation_amplitude: PositiveNumber | None = None
     fixed_pattern: Float64 | None = None
     residual: ResidualState | None = None
 

@@ -85,11 +85,6 @@ class Design:
         some = torch.linspace(0, self.pixel_functions[0].numel() - 1, _PROBES).long()
         self.pixel_pairs = distinct_products(self.pixel_functions.flatten(1)[:, some])
 
-    @property
-    def num_columns(self) -> int:
-        """Columns without the ray: the distance and the coefficients."""
-        return len(self.signal)
-
     def signal_functions(
         self, radial_distance: Float[Tensor, "*pixels"], amplitude: Float[Tensor, "*pixels"]
     ) -> Float[Tensor, "F *pixels"]:
@@ -288,10 +283,11 @@ def _gather_index(design: Design, product_of: Int[Tensor, "F F"]) -> Int[Tensor,
 
     Each product of signal functions is summed over every static image, one product after the other.
     """
-    columns = torch.arange(design.num_columns).repeat_interleave(3)
+    number = len(design.signal)
+    columns = torch.arange(number).repeat_interleave(3)
     zero = torch.zeros(1, dtype=torch.long)
     signal, pixel = (torch.cat([part[columns], zero]) for part in (design.signal, design.pixel))
-    axis = torch.cat([torch.arange(3).repeat(design.num_columns), zero + 3])
+    axis = torch.cat([torch.arange(3).repeat(number), zero + 3])
     left, right = torch.triu_indices(4, 4)
     ray_product = torch.zeros(4, 4, dtype=torch.long)
     ray_product[left, right] = ray_product[right, left] = torch.arange(10)
@@ -338,7 +334,7 @@ def moments_of_few(
     Returns:
         Shape (S, S) with S = 3C + 1.
     """
-    size = 3 * design.num_columns + 1
+    size = 3 * len(design.signal) + 1
     gram = torch.zeros(size, size, dtype=torch.float64)
     images = batch.radial_distance, batch.amplitude, weights
     measured, amplitude, weight = (one if one is None else one[frame].cpu() for one in images)

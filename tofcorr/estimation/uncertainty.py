@@ -54,11 +54,6 @@ class Covariance:
         """Degrees of freedom of Student's t for estimate / standard error: poses less one."""
         return len(self.jackknife) - 1
 
-    @property
-    def standard_errors(self) -> Float[Tensor, "P"]:
-        """Square roots of the diagonal, shape (P,)."""
-        return self.matrix.diagonal().clamp(min=0).sqrt()
-
 
 def jackknife_covariance(
     moments: ImageMoments,

@@ -18,6 +18,7 @@ from tofcorr.correction.state import (
     STATE_FILE,
     CalibrationExtras,
     CalibrationState,
+    Setting,
     load_calibration,
     read_values,
     save_values,
@@ -30,9 +31,9 @@ from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.errors import CalibrationDataError, ConfigError, ExportError, StateError
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.files import refuse_damaged
-from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
+from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.module.fitting import FitReport, fit_to
-from tofcorr.options import Options, PositiveNumber, load_options, one_line, resolve_options
+from tofcorr.options import load_options, one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Frames, Recordings, covered_domain, opened
 from tofcorr.training.calibration import TrainingOptions
 
@@ -67,26 +68,16 @@ _USUAL = Domain(
 )
 
 
-class Labels(Options):
+class Labels(Setting):
     """What a module says of itself besides the numbers that its output depends on.
 
     Attributes:
         options: How it is fitted.
         terms: Its terms, with what a fit found in the data.
-        camera: The lateral parameters.
-        depth_kind: What depth means.
-        domain: The calibrated ranges.
-        saturation_amplitude: None if unknown.
-        hand_eye_estimated: Whether the hand-eye transform was estimated, or known beforehand.
     """
 
     options: TrainingOptions
     terms: ErrorModelOptions
-    camera: Camera
-    depth_kind: DepthKind
-    domain: Domain
-    saturation_amplitude: PositiveNumber | None = None
-    hand_eye_estimated: bool = True
 
 
 def _numbers(values: Tensor) -> Tensor:
@@ -303,12 +294,8 @@ class DepthCorrection(FrameCorrection):
             self.error_model,
             name=self.options.name,
             error_model=self.terms,
-            domain=self.domain,
             tool_from_camera=self.hand_eye().double(),
-            hand_eye_estimated=self.hand_eye_estimated,
-            camera=self.camera,
-            depth_kind=self.depth_kind,
-            saturation_amplitude=self.saturation_amplitude,
+            **dict(Setting.model_validate(self, from_attributes=True)),
             **dict(self.extras),
         )
 

@@ -444,12 +444,9 @@ def in_threads(
         threads: How many; None: as many as the caller uses.
     """
     threads = threads_at_once() if threads is None else threads
-    return map(work, items) if threads < 2 else _in_several_threads(work, items, threads)
-
-
-def _in_several_threads(
-    work: Callable[[Item], Result], items: Iterable[Item], threads: int
-) -> Iterator[Result]:
+    if threads < 2:
+        yield from map(work, items)
+        return
     gradients = torch.is_grad_enabled()
 
     def alone(item: Item) -> Result:

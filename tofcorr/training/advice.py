@@ -310,7 +310,6 @@ def advise(
         moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
     added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
     order, covariances = choose_views(fit.observability.precision, added, number)
-    spreads = covariances.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
     worst = [1e3 * worst_sigma(covariance) for covariance in covariances]
     names = "distance_m", "tilt_deg", "roll_by_deg"
     poses = [
@@ -322,11 +321,7 @@ def advise(
         }
         for k, sigma in zip(order, worst[1:], strict=True)
     ]
-    advice: dict[str, Any] = {"worst_sigma_mm_or_mrad": worst[0], "poses": poses}
-    if best.hand_eye_is_free:
-        before, after = 1e3 * spreads[0, :6], 1e3 * spreads[-1, :6]
-        advice["hand_eye_sigma_mm_or_mrad"] = {"before": before.tolist(), "after": after.tolist()}
-    return order, advice
+    return order, {"worst_sigma_mm_or_mrad": worst[0], "poses": poses}
 
 
 def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[list[int], Tensor]:
