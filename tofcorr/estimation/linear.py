@@ -338,14 +338,14 @@ class Classes(NamedTuple):
         of_unknown: Class of each unknown, shape (P,); -1: its prior is not estimated.
         believed_random: Variance of each class before any data, which counts as one more effect.
         believed_unknown: The same for the classes of the unknowns.
-        largest_random: Largest variance of each class of effects.
+        largest_random: Largest variance of each effect, shape (R,), or of all.
     """
 
     of_random: Tensor
     of_unknown: Tensor
     believed_random: Tensor
     believed_unknown: Tensor
-    largest_random: Tensor
+    largest_random: Tensor = torch.tensor(torch.inf)
 
 
 def reduced(sums: GroupSums, noise: Tensor, random_precision: Tensor) -> tuple[Tensor, Tensor]:
@@ -366,8 +366,8 @@ def reduced(sums: GroupSums, noise: Tensor, random_precision: Tensor) -> tuple[T
     return left[:, :-1, :-1], left[:, :-1, -1]
 
 
-def estimate(sums: GroupSums, prior_precision: Tensor, start: Variances, of: Classes) -> Estimate:
-    """Estimate the unknowns and the variances together.
+def estimate(sums: GroupSums, prior_precision: Tensor, of: Classes) -> Estimate:
+    """Estimate the unknowns and the variances together, starting from what was believed of these.
 
     The variances are found by expectation maximisation of the marginal likelihood (Laird and Ware
     1982), in the form of MacKay (1992), which has the same fixed point and does not stall at
@@ -376,10 +376,13 @@ def estimate(sums: GroupSums, prior_precision: Tensor, start: Variances, of: Cla
     Args:
         sums: Of each group.
         prior_precision: A fixed prior of mean zero on the unknowns, shape (P, P).
-        start: Where the variances start.
-        of: Which of them are one.
+        of: Which variances are one.
     """
-    variances = start
+    variances = Variances(
+        noise=1.0,
+        random=of.believed_random[of.of_random],
+        unknowns=torch.where(of.of_unknown < 0, torch.inf, of.believed_unknown[of.of_unknown]),
+    )
     # Splits of a Kinect v2's recording settled in 10 to 40 steps: a standard deviation is then
     # known far better than the data determine it.
     for _ in range(60):
@@ -429,7 +432,7 @@ def _updated(sums: GroupSums, found: Estimate, of: Classes) -> Variances:
     effects, uncertainty = random_effects(sums, found)
     known = 1 - uncertainty / before.random
     random = _by_class(effects.square().sum(0), known.sum(0), of.of_random, of.believed_random)
-    random = torch.minimum(random, of.largest_random[of.of_random])
+    random = torch.minimum(random, of.largest_random)
     known = 1 - found.covariance.diagonal() / before.unknowns
     unknowns = _by_class(found.mean.square(), known, of.of_unknown, of.believed_unknown)
     ones = torch.ones(len(effects), 1).to(effects)

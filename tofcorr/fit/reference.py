@@ -27,7 +27,6 @@ from tofcorr.estimation.linear import (
     Curvature,
     Estimate,
     GroupSums,
-    Variances,
     estimate,
     random_effects,
     reduced,
@@ -334,24 +333,15 @@ def _solved(
     of_unknown = torch.full((sums.unknowns,), -1)
     of_unknown[kept - len(classes) : kept] = classes
     of_unknown[kept : kept + BOWS] = CLASSES
-    kinds = int(_RANDOM.max()) + 1
-    believed = torch.tensor([_FORM**2] * CLASSES + [_BOW**2]).double()
     of = Classes(
         of_random=_RANDOM,
         of_unknown=of_unknown,
-        believed_random=torch.full((kinds,), _POSE**2).double(),
-        believed_unknown=believed,
-        largest_random=torch.full((kinds,), torch.inf).double(),
+        believed_random=torch.full_like(_RANDOM.unique().double(), _POSE**2),
+        believed_unknown=torch.tensor([_FORM**2] * CLASSES + [_BOW**2]).double(),
     )
     # On the twist and the coefficients: wider than the error of any camera that was calibrated.
     wide = torch.where(of_unknown < 0, PRIOR_SIGMA**-2, 0.0).double().diag()
-    start = Variances(
-        noise=1.0,
-        random=torch.full((sums.random,), _POSE**2).double(),
-        unknowns=torch.where(of_unknown < 0, torch.inf, believed[of_unknown]),
-    )
-    of = of._replace(largest_random=_without_unknowns(sums, start, of))
-    found = estimate(sums, wide, start, of)
+    found = estimate(sums, wide, of._replace(largest_random=_without_unknowns(sums, of)))
     persistence = _persistence(random_effects(sums, found)[0][:, 2])
     departs, variances = scatter(with_offset, found), found.variances
     # Of poses that are alike fewer count, as if each were as much worse.
@@ -386,8 +376,8 @@ def _persistence(shift: Tensor) -> float:
     return found if found > by_chance else 0.0
 
 
-def _without_unknowns(sums: GroupSums, start: Variances, of: Classes) -> Tensor:
-    """Return the variances of the effects, by class, if the fitted model were exact.
+def _without_unknowns(sums: GroupSums, of: Classes) -> Tensor:
+    """Return the variances of the effects if the fitted model were exact.
 
     They bound those beside unknowns: a model that is changed to fit the insides of images must not
     make up for it by poses that are wrong.
@@ -395,9 +385,7 @@ def _without_unknowns(sums: GroupSums, start: Variances, of: Classes) -> Tensor:
     first = sums.unknowns
     own = GroupSums(sums.products[:, first:, first:], sums.size, sums.random)
     none = of._replace(of_unknown=of.of_unknown[:0])
-    bare = start._replace(unknowns=start.unknowns[:0])
-    found = estimate(own, torch.zeros(0, 0).to(sums.products), bare, none).variances.random
-    return torch.stack([found[of.of_random == k].max() for k in range(len(of.believed_random))])
+    return estimate(own, torch.zeros(0, 0).to(sums.products), none).variances.random
 
 
 REFERENCE_FILE = "reference.json"
