@@ -9,7 +9,6 @@ from tofcorr.comparison.evaluate import (
     EvaluationResult,
     main_pairs,
     pairs,
-    set_names,
 )
 from tofcorr.comparison.experiment import Experiment
 from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
@@ -35,11 +34,6 @@ from tofcorr.errors import ConfigError
 def test_options_that_make_no_sense_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         options(**changes)
-
-
-def test_sets_are_called_after_their_folders_and_numbered_where_alike() -> None:
-    assert set_names(["/a/set1", "/b/set2"]) == ["set1", "set2"]
-    assert set_names(["/a/wall", "/b/set", "/c/wall"]) == ["wall (1)", "set", "wall (3)"]
 
 
 def test_pairs_leave_before_out_and_the_main_ones_are_a_chain_and_a_star() -> None:

@@ -11,7 +11,7 @@ from synthetic_scene import E0, EA
 from tofcorr.comparison.options import SelectionOptions
 from tofcorr.comparison.select import select
 from tofcorr.comparison.statistics import Ranking
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 
 MODELS = [{"name": "E0", "model": E0}, {"name": "EA", "model": EA}]
@@ -104,8 +104,3 @@ def test_a_recording_of_one_target_is_not_compared_by_target(tmp_path: Path) -> 
     assert skipped["target"] == "the recording has one target only."
     with pytest.raises(CalibrationDataError, match="the recording has one target only"):
         options(by=["target"]).splits(dataset)
-
-
-def test_two_models_of_one_name_are_refused() -> None:
-    with pytest.raises(ConfigError, match="two columns would be called 'E0'"):
-        SelectionOptions.from_mapping({"models": [MODELS[0], MODELS[0]]}, "test")

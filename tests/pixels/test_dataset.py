@@ -26,7 +26,7 @@ from tofcorr.pixels.passes import image_moments
         ({"depth_kind": "z"}, "its depth_kind is z, that of .*one is radial"),
         (
             {"frame_names": FrameNames(eye_to_hand=True)},
-            "the camera stands still in one of this and .*one, and the robot carries it",
+            "eye_to_hand is True, that of .*one",
         ),
     ],
 )

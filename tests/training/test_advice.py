@@ -13,7 +13,6 @@ from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.advice import PosePool, advise, choose_views, draw_pool
-from tofcorr.training.support import worst_sigma
 
 
 @pytest.fixture(scope="module")
@@ -124,15 +123,3 @@ def test_five_advised_poses_shrink_the_worst_sigma_more_than_five_random_ones(
 def test_following_the_advice_shrinks_the_worst_sigma(tmp_path: Path) -> None:
     worst = followed(tmp_path, 0, {"tilt_deg": 15.0})
     assert worst["advised"] < worst["before"]
-
-
-def test_worst_sigma_is_the_largest_over_all_unit_directions() -> None:
-    generator = torch.Generator().manual_seed(0)
-    root = torch.randn(5, 5, generator=generator, dtype=torch.float64)
-    covariance = root @ root.T
-    directions = torch.nn.functional.normalize(
-        torch.randn(2000, 5, generator=generator, dtype=torch.float64), dim=-1
-    )
-    sigmas = torch.einsum("np,pq,nq->n", directions, covariance, directions).sqrt()
-    assert float(sigmas.max()) <= worst_sigma(covariance)
-    assert float(sigmas.max()) > 0.9 * worst_sigma(covariance)

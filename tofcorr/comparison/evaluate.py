@@ -272,7 +272,7 @@ def evaluate(
         data = [Dataset((recording,)) for recording in sets]
         inspections = [vet(one, resolved_planes(options.planes, sets), force=force) for one in data]
         headlines = tuple(one.headline for one in inspections if one.headline)
-        names = set_names([recording.path for recording in sets])
+        names = _numbered_where_alike([recording.path.resolve().name for recording in sets])
         evaluations = tuple(
             Experiment(name, one, options, inspection)
             for name, one, inspection in zip(names, data, inspections, strict=True)
@@ -283,9 +283,7 @@ def evaluate(
     return result
 
 
-def set_names(paths: Sequence[Path | str]) -> list[str]:
-    """Return the recordings' names: those of their folders, numbered where two are alike."""
-    names = [Path(path).resolve().name for path in paths]
+def _numbered_where_alike(names: Sequence[str]) -> list[str]:
     return [
         name if names.count(name) == 1 else f"{name} ({k})" for k, name in enumerate(names, start=1)
     ]

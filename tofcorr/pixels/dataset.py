@@ -6,6 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from os import PathLike
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -61,16 +62,12 @@ class Dataset:
             raise CalibrationDataError("There is no recording to calibrate.")
         first, *others = self.recordings
         for other in others:
-            for name in ("camera", "depth_kind", "modulation_frequency"):
-                one, its = getattr(first, name), getattr(other, name)
+            for name in ("camera", "depth_kind", "modulation_frequency", "frame_names.eye_to_hand"):
+                one, its = map(attrgetter(name), (first, other))
                 if its != one:
                     differ = f"its {name} is {its}, that of {first.path} is {one}"
                     need = "recordings that are calibrated together come from one camera"
                     raise CalibrationDataError(f"{other.path}: {differ}; {need} in one setting.")
-            if other.frame_names.eye_to_hand != first.frame_names.eye_to_hand:
-                differ = f"the camera stands still in one of this and {first.path}"
-                other_one = "the robot carries it in the other; their hand-eye transforms differ"
-                raise CalibrationDataError(f"{other.path}: {differ}, and {other_one}.")
 
     @property
     def first(self) -> Recording:

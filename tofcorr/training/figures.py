@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tofcorr.estimation.robust import without_strays
-from tofcorr.pixels.passes import frame_errors
 from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
 from tofcorr.training.calibration import Calibration
 
@@ -93,12 +92,8 @@ def error_picture(calibration: Calibration) -> tuple[np.ndarray, str]:
 
 def frames_to_show(calibration: Calibration) -> np.ndarray:
     """Return global numbers of five frames from the best corrected to the worst, by their ranks."""
-    data = calibration.data
-    # Three million pixels are measured to choose them, about.
-    most = max(3_000_000 // (data.first.camera.height * data.first.camera.width), 5)
-    ranked = thinned(calibration.frames, most)
-    errors = frame_errors(data, {"after": calibration.stages["after"]}, ranked)["after"]
-    used = errors.count > 0
+    errors = calibration.errors["after"]
+    used = (errors.count > 0) & np.isin(errors.frames, calibration.frames)
     order = np.argsort(errors.squared[used] / errors.count[used])
     return thinned(errors.frames[used][order], 5)
 
