@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from synthetic_scene import EA, Scene, make_scene
+from synthetic_scene import EA, make_scene
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.solvers import minimise
-from tofcorr.estimation.uncertainty import Covariance, jackknife_covariance
+from tofcorr.estimation.uncertainty import jackknife_covariance
 from tofcorr.geometry import se3
 
 
@@ -16,23 +16,18 @@ def step_between(origin: Parameters, end: Parameters) -> torch.Tensor:
     return torch.cat([se3.log(between), end.coefficients - origin.coefficients])
 
 
-def jackknife_and_refits(scene: Scene) -> tuple[Covariance, torch.Tensor]:
-    moments = scene.moments()
-    optimum = minimise(MomentObjective(moments), scene.truth).parameters
-    shifts = []
-    for left_out in range(len(moments.gram)):
-        rest = moments.images([k for k in range(len(moments.gram)) if k != left_out])
-        refitted = minimise(MomentObjective(rest), optimum).parameters
-        shifts.append(step_between(optimum, refitted))
-    return jackknife_covariance(moments, optimum), torch.stack(shifts)
-
-
 def relative_gap(noise: float) -> float:
     """Return how far the jackknife is from refitting, relative to the shifts, in their metric."""
     scene = make_scene(torch.Generator().manual_seed(0), EA, noise=noise)
-    covariance, refits = jackknife_and_refits(scene)
+    moments = scene.moments()
+    optimum = minimise(MomentObjective(moments), scene.truth).parameters
+    refits = []
+    for left_out in range(len(moments.gram)):
+        rest = moments.images([k for k in range(len(moments.gram)) if k != left_out])
+        refits.append(step_between(optimum, minimise(MomentObjective(rest), optimum).parameters))
+    shifts, covariance = torch.stack(refits), jackknife_covariance(moments, optimum)
     scale = covariance.matrix.diagonal().sqrt()
-    return float(((covariance.jackknife - refits) / scale).norm() / (refits / scale).norm())
+    return float(((covariance.jackknife - shifts) / scale).norm() / (shifts / scale).norm())
 
 
 def test_the_jackknife_is_leaving_out_each_image_in_turn() -> None:
@@ -41,14 +36,6 @@ def test_the_jackknife_is_leaving_out_each_image_in_turn() -> None:
     gap, gap_at_a_tenth = relative_gap(0.003), relative_gap(0.0003)
     assert gap < 0.02
     assert gap_at_a_tenth < 0.2 * gap
-
-
-def test_the_standard_errors_are_those_of_the_refits() -> None:
-    scene = make_scene(torch.Generator().manual_seed(1), EA)
-    covariance, refits = jackknife_and_refits(scene)
-    num = len(refits)
-    expected = ((num - 1) / num * (refits - refits.mean(dim=0)).square().sum(dim=0)).sqrt()
-    torch.testing.assert_close(covariance.matrix.diagonal().sqrt(), expected, rtol=0.03, atol=0.0)
 
 
 def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(

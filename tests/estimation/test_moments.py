@@ -136,18 +136,6 @@ def test_without_amplitudes_a_model_that_needs_none_is_unaffected(
     assert torch.equal(blind.moments().gram, scene.moments().gram)
 
 
-def test_an_image_of_few_pixels_has_the_moments_that_all_its_pixels_would_give(
-    scene: Scene, weights: Tensor, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    valid = scene.batch.valid
-    few = replace(scene.batch, valid=valid & (torch.rand(valid.shape, generator=generator) < 0.05))
-    found = MomentAccumulator(scene.design())(few, weights)
-    monkeypatch.setattr(MomentAccumulator, "few_pixels", -1.0)
-    expected = MomentAccumulator(scene.design())(few, weights)
-    torch.testing.assert_close(found.gram, expected.gram, rtol=1e-12, atol=1e-12)
-    assert torch.equal(found.count, expected.count)
-
-
 def test_images_of_several_blocks_have_the_same_moments(
     monkeypatch: pytest.MonkeyPatch, generator: torch.Generator
 ) -> None:

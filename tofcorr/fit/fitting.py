@@ -284,9 +284,8 @@ def refuse_diverged(parameters: Parameters) -> None:
 def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
     """Join an error model, given the coefficients, and the hand-eye transform of parameters."""
     error.set_coefficient_vector(parameters.coefficients)
-    hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
-    hand_eye.rebase(parameters.tool_from_camera)
-    return CalibrationModel(error, hand_eye)
+    fixed = not parameters.hand_eye_is_free
+    return CalibrationModel(error, HandEye(parameters.tool_from_camera, fixed=fixed))
 
 
 def _noise(problem: Problem, weights: PixelWeights | None) -> DistanceNoise | None:

@@ -36,17 +36,11 @@ from tofcorr.module.fitting import FitReport, fit_to
 from tofcorr.options import load_options, one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Frames, Recordings, covered_domain, opened
 from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.run import Config
 
 FORMAT = "tofcorr-module"
 
-Terms = (
-    str
-    | Path
-    | Mapping[str, Any]
-    | TrainingOptions
-    | ErrorModelOptions
-    | Sequence[TermOptions | Mapping[str, Any]]
-)
+Terms = Config | ErrorModelOptions | Sequence[TermOptions | Mapping[str, Any]]
 """A shipped configuration's name or file, whole options, or the list of terms."""
 
 # Ranges that scale the variables of a module until a fit or the user gives others. Metres and
