@@ -5,7 +5,7 @@ one: each the one that most shrinks the variances that remain.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -41,6 +41,48 @@ _DARK = 1 / 8
 # Largest angle between a corner's ray and the wall's normal, degrees. Set by hand: the amplitude
 # falls to a third there.
 _STEEPEST_INCIDENCE_DEG = 70.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workspace:
+    """Where the camera may go before the wall.
+
+    Attributes:
+        nearest: Shortest distance to the wall along the optical axis, metres.
+        farthest: Longest such distance, metres.
+        tilt_deg: Largest angle between the optical axis and the wall's normal.
+        roll_deg: Largest turn about the optical axis, either way.
+        wall_size: Width and height of the free wall around the point that the start pose looks
+            at, metres; None: it is larger than every view.
+        checkerboard: Whether the wall carries a pattern of dark and bright; else it is white.
+        longest_ray: Longest distance from the camera to what a corner of the image shows, metres.
+    """
+
+    nearest: float
+    farthest: float
+    tilt_deg: float = 35.0
+    roll_deg: float = 90.0
+    wall_size: tuple[float, float] | None = None
+    checkerboard: bool = False
+    longest_ray: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Refuse a workspace that no camera can be in.
+
+        Raises:
+            ConfigError: A number is out of range.
+        """
+        if not 0 < self.nearest <= self.farthest:
+            ends = f"{self.nearest:g} to {self.farthest:g} m"
+            raise ConfigError(f"The distances {ends} are no interval in front of the camera.")
+        if not 0 < self.tilt_deg < _STEEPEST_INCIDENCE_DEG:
+            most = f"between 0 and {_STEEPEST_INCIDENCE_DEG:g}"
+            raise ConfigError(f"The tilt of {self.tilt_deg:g} degrees is not {most}.")
+
+    @property
+    def log_dark(self) -> float:
+        """Log reflectivity of the wall's dark parts relative to its bright ones."""
+        return math.log(_DARK) if self.checkerboard else 0.0
 
 
 @dataclass(frozen=True)
@@ -101,9 +143,9 @@ def draw_views(
     cameras: Tensor,
     plane: tuple[Tensor, Tensor],
     tool_from_camera: Tensor,
-    limits: tuple[float, float, float, float],
+    space: Workspace,
     brightness: Mapping[str, Tensor],
-    usable: Callable[[Tensor, int], bool],
+    rays: Tensor,
     generator: np.random.Generator,
     size: int = 300,
 ) -> PosePool | None:
@@ -117,27 +159,26 @@ def draw_views(
         plane: Of the wall that each looks at: normals towards the camera, shape (N, 3), and
             offsets, shape (N,).
         tool_from_camera: The hand-eye transform, shape (4, 4).
-        limits: Largest tilt and roll, degrees; smallest and largest distance.
+        space: Where the cameras may be.
         brightness: Of the targets, which are taken in turn.
-        usable: Whether a camera may be used, from its pose and the number of its source.
+        rays: Unit rays, shape (H, W, 3).
         generator: Source of randomness.
         size: How many are wanted; twenty times as many are drawn at most.
 
     Returns:
         The poses; None if none can be used.
     """
-    steepest, roll_deg, nearest, farthest = limits
     normal, offset = plane
     distance = along_axis(cameras, plane)
     found = []
     for _ in range(20 * size):
         k = int(generator.integers(len(distance)))
-        tilt = steepest * generator.uniform()
-        roll = roll_deg * generator.uniform(-1, 1)
-        away = generator.uniform(nearest, farthest)
+        tilt = space.tilt_deg * generator.uniform()
+        roll = space.roll_deg * generator.uniform(-1, 1)
+        away = generator.uniform(space.nearest, space.farthest)
         azimuth = generator.uniform(0, 2 * math.pi)
         pose = _moved_camera(cameras[k], normal[k], distance[k], (tilt, azimuth, roll, away))
-        if usable(pose, k):
+        if _sees_wall(pose, normal[k], offset[k], rays, space):
             found.append((pose, k, (away, tilt, roll)))
         if len(found) == size:
             break
@@ -189,22 +230,17 @@ def _moved_camera(
 
 
 def _sees_wall(
-    camera: Tensor,
-    normal: Tensor,
-    offset: Tensor,
-    rays: Tensor,
-    farthest: float = math.inf,
-    size: tuple[float, float] | None = None,
+    camera: Tensor, normal: Tensor, offset: Tensor, rays: Tensor, space: Workspace
 ) -> bool:
     """Whether all corners of the image look at the wall, not too grazing, too far or beside it."""
     normal_camera, offset_camera = plane_in_frame(normal, offset, camera)
     corners = rays[[0, 0, -1, -1], [0, -1, 0, -1]]
     distance = ray_plane_distance(corners[None], normal_camera, offset_camera)[0]
     steepest = math.cos(math.radians(_STEEPEST_INCIDENCE_DEG))
-    seen = (distance <= farthest) & (-(corners @ normal_camera) >= steepest)
-    if size is not None:
+    seen = (distance <= space.longest_ray) & (-(corners @ normal_camera) >= steepest)
+    if space.wall_size is not None:
         points = (corners * distance[:, None]) @ camera[:3, :3].T + camera[:3, 3]
-        seen &= (points[:, :2].abs() <= torch.tensor(size).double() / 2).all(dim=1)
+        seen &= (points[:, :2].abs() <= torch.tensor(space.wall_size).double() / 2).all(dim=1)
     return bool(seen.all())
 
 
@@ -241,15 +277,19 @@ def draw_pool(
     facing = -(normal * camera[:, :3, 2]).sum(-1)
     recorded = float(torch.rad2deg(torch.arccos(facing.clamp(-1, 1))).max())
     # Up to the largest tilt recorded, within what a robot arm reaches in front of a wall.
-    steepest, rays = min(max(recorded, 30), 40), dataset.ray_directions()
-    farthest = ranges.high * (1 + 1 / 20)
+    space = Workspace(
+        nearest=float(distance.min()),
+        farthest=float(distance.max()),
+        tilt_deg=min(max(recorded, 30), 40),
+        longest_ray=ranges.high * (1 + 1 / 20),
+    )
     return draw_views(
         camera,
         (normal, offset),
         hand_eye,
-        (steepest, 90, float(distance.min()), float(distance.max())),
+        space,
         target_brightness(dataset, frames, hand_eye),
-        lambda pose, k: _sees_wall(pose, normal[k], offset[k], rays, farthest),
+        dataset.ray_directions(),
         generator,
         size,
     )
@@ -353,46 +393,6 @@ def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[li
     return order, torch.stack(covariances)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Workspace:
-    """Where the camera may go before the wall.
-
-    Attributes:
-        nearest: Shortest distance to the wall along the optical axis, metres.
-        farthest: Longest such distance, metres.
-        tilt_deg: Largest angle between the optical axis and the wall's normal.
-        roll_deg: Largest turn about the optical axis, either way.
-        wall_size: Width and height of the free wall around the point that the start pose looks
-            at, metres; None: it is larger than every view.
-        checkerboard: Whether the wall carries a pattern of dark and bright; else it is white.
-    """
-
-    nearest: float
-    farthest: float
-    tilt_deg: float = 35.0
-    roll_deg: float = 90.0
-    wall_size: tuple[float, float] | None = None
-    checkerboard: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse a workspace that no camera can be in.
-
-        Raises:
-            ConfigError: A number is out of range.
-        """
-        if not 0 < self.nearest < self.farthest:
-            ends = f"{self.nearest:g} to {self.farthest:g} m"
-            raise ConfigError(f"The distances {ends} are no interval in front of the camera.")
-        if not 0 < self.tilt_deg < _STEEPEST_INCIDENCE_DEG:
-            most = f"between 0 and {_STEEPEST_INCIDENCE_DEG:g}"
-            raise ConfigError(f"The tilt of {self.tilt_deg:g} degrees is not {most}.")
-
-    @property
-    def log_dark(self) -> float:
-        """Log reflectivity of the wall's dark parts relative to its bright ones."""
-        return math.log(_DARK) if self.checkerboard else 0.0
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PosePlan:
     """Poses to record, the most informative first.
@@ -462,9 +462,9 @@ def plan_poses(
         torch.eye(4, dtype=torch.float64)[None],
         (normal, offset),
         hand_eye,
-        (workspace.tilt_deg, workspace.roll_deg, workspace.nearest, workspace.farthest),
+        workspace,
         {"wall": torch.tensor([workspace.log_dark, 0.0]).double()},
-        lambda pose, _: _sees_wall(pose, normal[0], offset[0], rays, size=workspace.wall_size),
+        rays,
         np.random.default_rng(seed),
     )
     if pool is None:
