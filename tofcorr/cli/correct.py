@@ -130,7 +130,7 @@ def _refuse_useless(run: Path) -> None:
     from tofcorr.training.judgement import DO_NOT_USE
 
     file = run / "report.json"
-    if (run / "corrector.ts").exists() or not file.exists():
+    if (run / "corrector.ts").exists() or not file.is_file():
         return
     report = json.loads(file.read_text(encoding="utf-8"))
     if report["verdict"] == DO_NOT_USE:
