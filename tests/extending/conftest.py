@@ -60,7 +60,6 @@ class StripesEffect(LinearDelay):
 
     name = "stripes"
     summary = "stripes over the image"
-    source = "invented for a test"
     remedy = "a white wall"
 
     @classmethod

@@ -11,7 +11,6 @@ from hypothesis import example, given
 
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import (
-    distance_along_rays,
     lens_misses,
     phase_from_radial_distance,
     plane_in_frame,
@@ -106,12 +105,6 @@ def test_logarithm_undoes_the_exponential_below_half_a_turn(values: list[float])
     torch.testing.assert_close(se3.log(se3.exp(twist)), twist, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("scale", [0.0, 1e-7, 1.0])
-def test_derivative_of_the_exponential_is_exact(scale: float) -> None:
-    twist = scale * torch.tensor([0.3, -0.1, 0.2, 0.5, -0.4, 0.9], dtype=torch.float64)
-    assert torch.autograd.gradcheck(se3.exp, twist.requires_grad_())
-
-
 @given(values=twists)
 def test_signed_distance_does_not_depend_on_the_frame(values: list[float]) -> None:
     world_from_frame = se3.exp(torch.tensor(values, dtype=torch.float64))
@@ -145,21 +138,6 @@ def test_a_normal_and_its_tangents_are_orthonormal(components: list[float]) -> N
     torch.testing.assert_close(frame @ frame.T, identity, rtol=0, atol=1e-12)
     # A stack of normals gives the same as one by one.
     assert torch.equal(tangents(torch.stack([normal, -normal]))[0], tangents(normal))
-
-
-def test_rays_of_many_frames_meet_the_plane_of_their_own_frame(generator: torch.Generator) -> None:
-    world_from_camera = se3.exp(torch.randn(3, 6, generator=generator, dtype=torch.float64))
-    normal = torch.nn.functional.normalize(
-        torch.randn(3, 3, generator=generator, dtype=torch.float64), dim=1
-    )
-    offset = torch.tensor([0.3, -0.5, 1.0], dtype=torch.float64)
-    frame = torch.tensor([0, 0, 1, 2, 2, 2])
-    rays = torch.randn(6, 3, generator=generator, dtype=torch.float64)
-    distance = distance_along_rays(rays, frame, world_from_camera, normal, offset)
-    points = (world_from_camera[frame, :3, :3] @ (rays * distance[:, None])[..., None])[..., 0]
-    points = points + world_from_camera[frame, :3, 3]
-    height = (points * normal[frame]).sum(-1) + offset[frame]
-    torch.testing.assert_close(height, torch.zeros_like(height), rtol=0, atol=1e-10)
 
 
 def test_transforms_are_apart_by_their_distance_and_the_angle_between_them() -> None:

@@ -57,18 +57,6 @@ def test_a_sine_and_even_harmonics_return_the_true_distance(even: tuple[Harmonic
     assert _distance_error(distance, even).abs().max() < 1e-9
 
 
-def test_circular_error_repeats_every_quarter_of_the_unambiguous_range() -> None:
-    harmonics = (Harmonic(order=3, share=0.03), Harmonic(order=5, share=0.012))
-    quarter = unambiguous_range(FREQUENCY) / 4
-    distance = torch.linspace(0.3, 0.3 + quarter, 200, dtype=torch.float64)[None]
-    first = _distance_error(distance, harmonics)
-    later = _distance_error(distance + 2 * quarter, harmonics)
-    torch.testing.assert_close(later, first, rtol=0, atol=1e-12)
-    assert first.abs().max() > 0.02
-    half = _distance_error(distance + quarter / 2, harmonics)
-    assert (half - first).abs().max() > 0.02
-
-
 def test_circular_error_of_a_third_harmonic_is_the_derived_one() -> None:
     # A0 - A2 = 2 (cos p + s cos 3p) and A3 - A1 = 2 (sin p - s sin 3p), so the phase read is that
     # of exp(jp) (1 + s exp(-4jp)).

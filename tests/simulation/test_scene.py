@@ -39,16 +39,6 @@ def test_footprint_cut_by_an_edge_has_the_shares_of_both_squares() -> None:
     assert seen[11:].eq(1.0).all()
 
 
-def test_finer_sampling_approaches_the_exact_mean() -> None:
-    board = CheckerboardTarget(square_mm=50.0, reflectivity_dark=0.0, reflectivity_bright=1.0)
-    pixels = _grid(40, 40, 0.009, turn=0.37)
-    exact = seen_reflectivity(board, pixels, subsamples=64)
-    coarse = (seen_reflectivity(board, pixels, subsamples=2) - exact).abs().mean()
-    fine = (seen_reflectivity(board, pixels, subsamples=6) - exact).abs().mean()
-    assert fine < coarse / 2
-    assert fine < 0.02
-
-
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0.6, -0.48, 0.64)])
 def test_plane_frame_lies_in_the_plane(normal: tuple[float, float, float]) -> None:
     n = torch.tensor(normal, dtype=torch.float64)

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
@@ -47,9 +47,8 @@ def ray_directions(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {
 
 def _pixels(camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
     """Return the coordinates of all pixels, row by row: to the right, then down."""
-    rows = torch.arange(camera.height, dtype=torch.float64)
-    columns = torch.arange(camera.width, dtype=torch.float64)
-    return torch.stack(torch.meshgrid(rows, columns, indexing="ij")[::-1], dim=-1).reshape(-1, 2)
+    rows, columns = torch.arange(camera.height), torch.arange(camera.width)
+    return torch.cartesian_prod(rows, columns).flip(1).double()
 
 
 def lens_misses(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {camera.width}"]:
@@ -128,11 +127,9 @@ def _improved(
                 torch.autograd.grad(image[:, axis].sum(), point, retain_graph=True)[0]
                 for axis in (0, 1)
             ]
-        (xx, xy), (yx, yy) = (slope.unbind(dim=1) for slope in slopes)
-        off_x, off_y = (image.detach() - goal).unbind(dim=1)
-        area = xx * yy - xy * yx
-        step = torch.stack([yy * off_x - xy * off_y, xx * off_y - yx * off_x], dim=1)
-        here = here - step / area[:, None]
+        jacobian = torch.stack(slopes, dim=1)
+        area = torch.linalg.det(jacobian)
+        here = here - torch.linalg.solve_ex(jacobian, image.detach() - goal).result
     same_side = ((here - centre) * (goal - centre)).sum(dim=1) > 0
     better = (area > 0) & same_side & (_misses(here, goal, camera) < before[missed])
     return found.index_copy(0, missed[better], here[better])
@@ -204,30 +201,6 @@ def ray_plane_distance(
     distance = -offset[..., None, None] / cosine
     meets = (cosine.abs() > _GRAZING_COSINE) & (distance > 0)
     return torch.where(meets, distance, torch.nan)
-
-
-def distance_along_rays(
-    rays: Float[Tensor, "M 3"],
-    frame: Int[Tensor, "M"],
-    world_from_camera: Float[Tensor, "F 4 4"],
-    normal_world: Float[Tensor, "F 3"],
-    offset: Float[Tensor, "F"],
-) -> Float[Tensor, "M"]:
-    """Return how far along each ray the plane of its frame lies, for rays of many frames.
-
-    Args:
-        rays: Viewing rays in the camera frame, shape (M, 3). They need not have unit length; the
-            result is in multiples of their lengths.
-        frame: Index of the frame of each ray, shape (M,).
-        world_from_camera: Shape (F, 4, 4).
-        normal_world: Unit normals, shape (F, 3).
-        offset: d of n . x + d = 0, shape (F,), metres.
-
-    Returns:
-        Shape (M,). Nothing is masked: a ray that points away from the plane gives a negative value.
-    """
-    normal, height = plane_in_frame(normal_world, offset, world_from_camera)
-    return -height[frame] / (rays * normal[frame]).sum(-1)
 
 
 def tangents(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
@@ -304,21 +277,16 @@ def wrapped(errors: np.ndarray, modulation_frequency: float | None) -> np.ndarra
     return (whole != 0) & (np.abs(errors - whole * full) < _WRAPPED_WITHIN)
 
 
-def range_of_wrapped(errors: np.ndarray, modulation_frequency: float | None) -> float | None:
-    """Return the unambiguous range if most of some large errors are whole multiples of it.
+def mostly_wrapped(errors: np.ndarray, modulation_frequency: float | None) -> bool:
+    """Return whether most of some large errors are whole unambiguous ranges.
+
+    Not all: edges are some of them. Without errors, or without a frequency, they are not.
 
     Args:
         errors: Of pixels that are far off, any shape, metres.
         modulation_frequency: In Hz; None: unknown.
-
-    Returns:
-        The range, metres; None if they have something else in common, or there are none.
     """
-    if modulation_frequency is None or not errors.size:
-        return None
-    # Not all: edges are some of them.
-    mostly = wrapped(errors, modulation_frequency).mean() > 0.5
-    return unambiguous_range(modulation_frequency) if mostly else None
+    return 2 * int(wrapped(errors, modulation_frequency).sum()) > errors.size
 
 
 def phase_from_radial_distance(radial_distance: Tensor, modulation_frequency: float) -> Tensor:

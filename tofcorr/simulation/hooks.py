@@ -11,7 +11,7 @@ effect has written.
     on_delay     delay: extra optical distance in metres.
     on_signal    signal: the phasor of every harmonic in every pixel; tap_delay.
     on_taps      taps: expected electrons of A0..A3, before noise and quantisation.
-    on_readout   measured_distance, measured_amplitude, measured_offset: what the camera reports.
+    on_readout   measured_distance, measured_amplitude: what the camera reports.
 
 Everything is float64 (`signal` is complex128). Without noise the measured distance is
 differentiable in every field, if effects assign new tensors and never write into existing ones.
@@ -117,7 +117,6 @@ class FrameState:
     Stage readout:
         measured_distance: Radial distance as reported, shape (H, W), metres.
         measured_amplitude: Counts, shape (H, W).
-        measured_offset: Mean of the four samples, counts, shape (H, W).
         raw: The four samples as read out, counts, shape (4, H, W).
     """
 
@@ -157,7 +156,6 @@ class FrameState:
 
     measured_distance: Tensor = _NOT_YET
     measured_amplitude: Tensor = _NOT_YET
-    measured_offset: Tensor = _NOT_YET
     raw: Tensor = _NOT_YET
 
     def recorded(self, name: str) -> float | None:

@@ -298,12 +298,10 @@ class Harmonic(Options):
 
 def harmonic_tensors(harmonics: Sequence[Harmonic]) -> tuple[Tensor, Tensor]:
     """Return orders (M,) float64 and relative phasors (M,) complex128, the fundamental first."""
-    orders = [1.0, *(float(harmonic.order) for harmonic in harmonics)]
-    shares = [1.0, *(harmonic.share for harmonic in harmonics)]
-    phases = [0.0, *(math.radians(harmonic.phase_deg) for harmonic in harmonics)]
-    angle = torch.tensor(phases, dtype=torch.float64)
-    phasors = torch.tensor(shares, dtype=torch.float64) * torch.exp(1j * angle)
-    return torch.tensor(orders, dtype=torch.float64), phasors
+    overtones = [(each.order, each.share, math.radians(each.phase_deg)) for each in harmonics]
+    rows = torch.tensor([(1.0, 1.0, 0.0), *overtones], dtype=torch.float64)
+    order, share, phase = rows.unbind(1)
+    return order, share * torch.exp(1j * phase)
 
 
 def correlation_samples(
@@ -322,11 +320,8 @@ def correlation_samples(
     """
     quarters = torch.arange(4, dtype=torch.float64)[:, None] * (math.pi / 2)
     shift = torch.exp(1j * quarters * orders)
-    if tap_phasor is None:
-        swing = torch.einsum("km,mhw->khw", shift, signal)
-    else:
-        swing = torch.einsum("km,kmhw,mhw->khw", shift, tap_phasor, signal)
-    return background + swing.real
+    turned = signal if tap_phasor is None else tap_phasor * signal
+    return background + (shift[..., None, None] * turned).sum(1).real
 
 
 # From four samples to phase, amplitude, offset and distance: equations 1 to 3 of Abdo and Borgeat

@@ -145,7 +145,7 @@ class SensorPipeline:
     def _readout(self, state: FrameState) -> None:
         readout = self._sensor.readout
         state.raw = read_out(state.taps, readout, state.generator)
-        phase, state.measured_amplitude, state.measured_offset = demodulate(state.raw)
+        phase, state.measured_amplitude, _ = demodulate(state.raw)
         distance = distance_from_phase(phase, state.modulation_frequency)
         # Light, an amplitude that is large enough, and no sample saturated.
         lit = torch.isfinite(state.radial_distance) & (state.amplitude > 0)

@@ -9,9 +9,8 @@ import torch
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from tofcorr.geometry.rays import distance_along_rays
 from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
-from tofcorr.simulation.effects.base import CatalogueEffect, EffectInputs
+from tofcorr.simulation.effects.base import CatalogueEffect, EffectInputs, distance_to
 from tofcorr.simulation.effects.lens import true_rays
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
 from tofcorr.simulation.effects.motion import MotionEffect, radial_speed
@@ -163,12 +162,11 @@ def test_a_robot_that_is_too_short_scales_distances_beside_a_plane_and_a_camera_
     error = effect.shift(inputs, _coefficients(effect, length=longer - 1))
     true = facts.world_from_tool.clone()
     true[:, :3, 3] *= longer
-    plane = facts.normal_world, facts.offset
-    moved = distance_along_rays(inputs.rays, inputs.frame, true @ mounted, *plane)
+    moved = distance_to(inputs, replace(facts, world_from_tool=true))
     torch.testing.assert_close(inputs.radial_distance + error, moved)
     mounted[:3, 3] *= longer
-    plane = facts.normal_world, longer * facts.offset
-    scaled = distance_along_rays(inputs.rays, inputs.frame, true @ mounted, *plane)
+    longer_facts = replace(facts, world_from_tool=true, offset=longer * facts.offset)
+    scaled = distance_to(replace(inputs, tool_from_camera=mounted), longer_facts)
     torch.testing.assert_close(scaled, longer * inputs.radial_distance)
 
 
@@ -180,8 +178,8 @@ def test_a_bracket_bends_about_the_torque_of_its_weight(inputs: EffectInputs) ->
     down = facts.world_from_tool[:, :3, :3].mT @ torch.tensor([0.0, 0.0, -1.0]).double()
     torque = np.cross([0.0, 0.0, 0.002], down.numpy())
     turned[:, :3, :3] = torch.from_numpy(Rotation.from_rotvec(torque).as_matrix())
-    true = facts.world_from_tool @ turned @ inputs.tool_from_camera
-    moved = distance_along_rays(inputs.rays, inputs.frame, true, facts.normal_world, facts.offset)
+    bent = replace(inputs, tool_from_camera=turned @ inputs.tool_from_camera)
+    moved = distance_to(bent, facts)
     assert (moved - inputs.radial_distance).abs().max() > 1e-4
     # Turns are exact to the second order: 2 mrad cubed, over a few metres.
     torch.testing.assert_close(inputs.radial_distance + shift, moved, atol=1e-8, rtol=0)

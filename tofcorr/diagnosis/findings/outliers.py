@@ -23,7 +23,7 @@ from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.robust import sigma_from_mad
-from tofcorr.geometry.rays import multiples_in_words, range_of_wrapped
+from tofcorr.geometry.rays import mostly_wrapped, multiples_in_words, unambiguous_range
 from tofcorr.plausibility.finding import LARGEST_GAP, Inspection, in_words
 
 
@@ -94,6 +94,7 @@ def outliers_of(study: Study) -> Outliers:
     tile = _tiles(study.observations, rows, columns)
     held, all_held = (torch.bincount(tile, x, rows * columns) for x in (odd.double(), None))
     frequency = study.observations.recording.modulation_frequency
+    whole = unambiguous_range(frequency) if frequency else None
     return Outliers(
         deleted=float(deleted.double().mean()),
         reduced=float((odd & ~deleted).double().mean()),
@@ -101,7 +102,7 @@ def outliers_of(study: Study) -> Outliers:
         noise=study.fit.floor,
         tiles=(held / all_held).reshape(TILES).numpy(),
         place=place_of(study, odd),
-        wrapped_by=range_of_wrapped(errors.numpy(), frequency) if len(errors) else None,
+        wrapped_by=whole if mostly_wrapped(errors.numpy(), frequency) else None,
     )
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tofcorr.geometry.rays import (
+    mostly_wrapped,
     multiples_in_words,
-    range_of_wrapped,
     unambiguous_range,
     wrapped,
 )
@@ -74,7 +74,7 @@ def garbage(look: Look) -> Iterator[Finding]:
         return
     what = "edges, reflections or other surfaces"
     frequency, far = look.recording.modulation_frequency, _far_off(look)
-    if frequency is not None and range_of_wrapped(far[far > 0], frequency) is not None:
+    if frequency is not None and mostly_wrapped(far[far > 0], frequency):
         what = f"most by {_range_in_words(frequency)}, so they show a target beyond it"
     advice = "mask them (mask.npy, or `mask: ransac` in the configuration)"
     if bent or dominated:  # See `training.left_out`.
@@ -133,7 +133,7 @@ def _wrapping(look: Look) -> Iterator[Finding]:
     errors = scene.distance - (1 + given.slope) * true - given.constant
     errors = errors[np.isfinite(errors)]
     share = float(wrapped(errors, frequency).mean()) if len(errors) else 0.0
-    if 10 * share < 1 or range_of_wrapped(errors[np.abs(errors) > FAR_OFF], frequency) is None:
+    if 10 * share < 1 or not mostly_wrapped(errors[np.abs(errors) > FAR_OFF], frequency):
         return
     severity = "impossible" if look.fits else "doubtful"
     by = f"{100 * share:.0f} % of the pixels are off the recorded planes by "

@@ -1,7 +1,5 @@
 """Shift caused by background light."""
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
@@ -22,7 +20,7 @@ class AmbientLightShape(Options):
     reference_counts: float = 100.0
 
 
-class AmbientLightEffect(LinearDelay):
+class AmbientLightEffect(LinearDelay, shape=AmbientLightShape):
     r"""Background light that the suppression does not remove completely.
 
     .. math:: \Delta d = k_1 \frac{B}{A + B} + k_2 \frac{B}{B_0} + k_3 \ln \frac{A + B}{A}
@@ -34,11 +32,12 @@ class AmbientLightEffect(LinearDelay):
     sensitivity measure a share of it as a signal of fixed phase. If the background is the same for
     all pixels, this error grows with B / A. If the target reflects the background, reflectivity
     cancels in the ratio, and the error grows with d^2 / cos(theta).
+
+    Source: Kahlmann et al. 2006 (background illumination).
     """
 
     name = "ambient_light"
     summary = "shift by background light"
-    source = "Kahlmann et al. 2006 (background illumination)"
     remedy = "the same poses with a lamp on and off, the background recorded"
     needs = (AMBIENT, AMPLITUDE)
     fixed_terms = tuple(
@@ -48,7 +47,6 @@ class AmbientLightEffect(LinearDelay):
             *("returned_cosine", "returned_sine"),
         )
     )
-    shape_type: ClassVar[type[Options]] = AmbientLightShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "AmbientLightEffect":

@@ -1,7 +1,6 @@
 """Error that depends on the amplitude, of higher order than the base model's quadratic."""
 
 import math
-from typing import ClassVar
 
 from torch import Tensor
 
@@ -26,22 +25,22 @@ class AmplitudeShape(Options):
     degree: int = 5
 
 
-class AmplitudeEffect(LinearDelay):
+class AmplitudeEffect(LinearDelay, shape=AmplitudeShape):
     r"""Any smooth error that depends on the amplitude only.
 
     .. math:: \Delta d = \sum_{k=1}^{K} l_k P_k(u) + i_1 w + i_2 w^2
 
     with u the logarithm of the amplitude scaled to [-1, 1] and w the amplitude itself over its
     maximum: I1 of Abdo and Borgeat (2010), and the error of dark surfaces (Lindner and Kolb 2007).
+
+    Source: Lindner and Kolb 2007.
     """
 
     name = "amplitude"
     refines = ("intensity", "distance_amplitude")
     summary = "error of weak or strong signals, of higher order than the base model"
-    source = "Lindner and Kolb 2007"
     remedy = "a grey ladder of five reflectivities at one distance, with three integration times"
     needs = (AMPLITUDE,)
-    shape_type: ClassVar[type[Options]] = AmplitudeShape
     prior_linear = 0.03
 
     @classmethod

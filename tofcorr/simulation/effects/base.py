@@ -22,7 +22,6 @@ from tofcorr.conditions import condition
 from tofcorr.data.recording import CHUNK_PIXELS, OUTSIDE
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import (
-    distance_along_rays,
     phase_from_radial_distance,
     plane_in_frame,
     unambiguous_range,
@@ -306,7 +305,7 @@ class Coefficient(NamedTuple):
         name: Key in a simulator's YAML.
         unit: For people.
         prior_sd: Standard deviation of its prior around zero, in `unit`. Unless a comment says
-            otherwise it was set by hand, from the sizes that the effect's `source` reports.
+            otherwise it was set by hand, from the sizes that the effect's source reports.
     """
 
     name: str
@@ -317,13 +316,15 @@ class Coefficient(NamedTuple):
 class CatalogueEffect(Effect, ABC):
     """An effect with named coefficients, for simulation and for fitting.
 
+    Its docstring says where the equation is from. A class is declared with `shape`, the type of its
+    options: the constants that are not linear, such as time constants, widths, levels.
+
     Class attributes:
         name: Its name in `diagnosis.json` and in a simulator's YAML.
         summary: What it is, in one line.
-        source: Where the equation is from.
         remedy: What to record to tell it from other effects, in one line.
         needs: What must be known to test it.
-        shape_type: Options of the constants that are not linear: time constants, widths, levels.
+        shape_type: The type of its options.
         linear: Whether the columns hold at any strength. If not, a fit computes them again at the
             fitted coefficients.
         contains: Names of the effects whose every shift this effect can describe as well.
@@ -338,7 +339,6 @@ class CatalogueEffect(Effect, ABC):
     """
 
     summary: ClassVar[str] = ""
-    source: ClassVar[str] = ""
     remedy: ClassVar[str] = ""
     needs: ClassVar[tuple[Need, ...]] = ()
     shape_type: ClassVar[type[Options]] = Options
@@ -350,6 +350,11 @@ class CatalogueEffect(Effect, ABC):
     prior: ClassVar[float] = 0.02
     form_error: ClassVar[float] = 0.8
     reads_light: ClassVar[bool] = False
+
+    def __init_subclass__(cls, shape: type[Options] | None = None) -> None:
+        """Keep the type of the options; without one it is that of the base class."""
+        super().__init_subclass__()
+        cls.shape_type = shape or cls.shape_type
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
         self.shape: Any = shape
@@ -539,8 +544,8 @@ def plane_in_camera(inputs: EffectInputs, facts: FrameFacts) -> tuple[Tensor, Te
 
 def distance_to(inputs: EffectInputs, facts: FrameFacts) -> Tensor:
     """Return how far along each ray the plane of its frame is, shape (M,), metres."""
-    pose = facts.world_from_tool @ inputs.tool_from_camera
-    return distance_along_rays(inputs.rays, inputs.frame, pose, facts.normal_world, facts.offset)
+    normal, height = plane_in_camera(inputs, facts)
+    return -inputs.of_frame(height[:, 0]) / (inputs.rays * inputs.of_frame(normal)).sum(-1)
 
 
 class SignalEffect(CatalogueEffect):

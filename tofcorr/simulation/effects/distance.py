@@ -1,7 +1,5 @@
 """Error that depends on the distance, of higher order than a cubic."""
 
-from typing import ClassVar
-
 from torch import Tensor
 
 from tofcorr.options import Options
@@ -22,21 +20,21 @@ class DistanceShape(Options):
     degree: int = 9
 
 
-class DistanceEffect(LinearDelay):
+class DistanceEffect(LinearDelay, shape=DistanceShape):
     r"""Any smooth error that depends on the distance only.
 
     .. math:: \Delta d = \sum_{k=1}^{K} c_k P_k(u), \quad u = 2 (d - d_0) / (d_1 - d_0) - 1
 
     with Legendre polynomials P_k: the cubic of Abdo and Borgeat (2010), and the finer structure
     that a B-spline (Lindner and Kolb 2006) or a table (Kahlmann et al. 2006) describes.
+
+    Source: Lindner and Kolb 2006; Kahlmann et al. 2006.
     """
 
     name = "distance"
     refines = ("distance", "distance_amplitude")
     summary = "error of the distance alone, of higher order than the base model"
-    source = "Lindner and Kolb 2006; Kahlmann et al. 2006"
     remedy = "more distances over the whole range, at one tilt and one reflectivity"
-    shape_type: ClassVar[type[Options]] = DistanceShape
     prior, decay = 0.06, 1.3
 
     @classmethod

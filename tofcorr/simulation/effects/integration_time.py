@@ -1,7 +1,5 @@
 """Shift that depends on the integration time."""
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
@@ -24,22 +22,22 @@ class IntegrationTimeShape(Options):
     degree: int = 3
 
 
-class IntegrationTimeEffect(FrameEffect):
+class IntegrationTimeEffect(FrameEffect, shape=IntegrationTimeShape):
     r"""A shift with the logarithm of the integration time.
 
     .. math:: \Delta d = \sum_{k=1}^{K} a_k \ln^k (\tau / \tau_0)
 
     Longer exposure reads nearer by centimetres (Kahlmann et al. 2006; Lindner and Kolb 2007).
     K is at most the number of settings minus one: that is enough to fit every setting exactly.
+
+    Source: Kahlmann et al. 2006; Lindner and Kolb 2007.
     """
 
     name = "integration_time"
     summary = "shift that depends on the integration time"
-    source = "Kahlmann et al. 2006; Lindner and Kolb 2007"
     remedy = "three or more integration times at the same poses, in random order"
     needs = (INTEGRATION_TIME,)
     linear = True
-    shape_type: ClassVar[type[Options]] = IntegrationTimeShape
     prior = 0.03
 
     @classmethod

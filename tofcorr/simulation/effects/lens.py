@@ -22,11 +22,12 @@ class LensEffect(CatalogueEffect):
     and similarly y' (without skew s), for the ray (x, y, 1) of the intrinsics and the true ray
     (x', y', 1). This is Brown's model (1971) with a thin prism, applied to rays instead of pixels.
     The true ray meets the target at another point, so the measured distance differs.
+
+    Source: Brown 1971, close-range camera calibration.
     """
 
     name = "lens"
     summary = "focal length, principal point, skew or distortion other than recorded"
-    source = "Brown 1971, close-range camera calibration"
     remedy = "strong tilts in four directions at several distances; calibrate the lens again"
     fixed_terms = (
         *(Coefficient(f"focal_{axis}", "1", 0.02) for axis in "xy"),

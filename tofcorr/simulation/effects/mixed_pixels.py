@@ -1,7 +1,5 @@
 """Pixels whose footprint spans an edge."""
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
@@ -37,7 +35,7 @@ class MixedPixelsShape(Options):
     sigma_px: tuple[float, ...] = (0.6, 1.2)
 
 
-class MixedPixelsEffect(CatalogueEffect):
+class MixedPixelsEffect(CatalogueEffect, shape=MixedPixelsShape):
     r"""Signals of neighbouring pixels mixed into one, and further errors at edges.
 
     .. math:: z' = z + \sum_s w_s (G_s * z - z), \quad
@@ -49,14 +47,14 @@ class MixedPixelsEffect(CatalogueEffect):
     the errors at the edges of squares that Abdo and Borgeat (2010) report. They grow with the
     contrast of the edge, or are the same at every edge (a step or a slit in the surface). A slit of
     fixed width in metres fills a share of the pixel that falls with the distance d in metres.
+
+    Source: Abdo and Borgeat 2010 (square edges); Lindner et al. 2010.
     """
 
     name = "mixed_pixels"
     summary = "errors where bright and dark meet within one pixel"
-    source = "Abdo and Borgeat 2010 (square edges); Lindner et al. 2010"
     remedy = "a checkerboard in focus and out of focus, shifted by parts of a pixel"
     needs = (AMPLITUDE, FREQUENCY)
-    shape_type: ClassVar[type[Options]] = MixedPixelsShape
 
     @classmethod
     def terms(cls, shape: MixedPixelsShape) -> tuple[Coefficient, ...]:

@@ -16,6 +16,8 @@ from tofcorr.simulation.effects.base import (
 )
 from tofcorr.simulation.hooks import FrameState
 
+_NUMBER = torch.arange(4, dtype=torch.float64)[:, None]
+
 
 class MotionEffect(CatalogueEffect):
     r"""Each sample sees the target at another distance.
@@ -28,11 +30,12 @@ class MotionEffect(CatalogueEffect):
     of the first one after the pose. Where rows or columns are read one after the other, epsilon
     grows over the image (r and c from -1 to 1). 44 mm RMS at 2 m/s and 125 ms (Drayton et al.
     2013).
+
+    Source: Drayton et al. 2013; Lindner and Kolb 2009.
     """
 
     name = "motion"
     summary = "camera or target moving while the four samples are taken"
-    source = "Drayton et al. 2013; Lindner and Kolb 2009"
     remedy = "the same poses at rest and in motion, in both directions"
     needs = (VELOCITY, FREQUENCY)
     fixed_terms = tuple(  # Time between samples, of the first, and half of a read-out.
@@ -42,10 +45,9 @@ class MotionEffect(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four samples as distance, shape (M,), metres."""
-        number = torch.arange(4, dtype=torch.float64)[:, None]
-        moved = radial_speed(inputs) * (number * coefficients[0] + _first(inputs, coefficients))
+        moved = radial_speed(inputs) * _late(inputs, coefficients)
         phase = inputs.phase + phase_from_radial_distance(moved, inputs.known_frequency)
-        taps = torch.cos(phase + number * torch.pi / 2)
+        taps = torch.cos(phase + _NUMBER * torch.pi / 2)
         seen = torch.complex(taps[0] - taps[2], taps[3] - taps[1])
         return inputs.metres_per_radian * phase_difference(seen, inputs.turn)
 
@@ -54,16 +56,16 @@ class MotionEffect(CatalogueEffect):
         twist = state.facts.tool_twist
         if twist is None or bool(twist[-1].isnan().any()):
             return
-        inputs, number = inputs_from_state(state), torch.arange(4, dtype=torch.float64)[:, None]
-        late = number * self.coefficients[0] + _first(inputs, self.coefficients)
-        delays = (radial_speed(inputs) * late).reshape(4, *state.radial_distance.shape)
+        inputs = inputs_from_state(state)
+        delays = radial_speed(inputs) * _late(inputs, self.coefficients)
+        delays = delays.reshape(4, *state.radial_distance.shape)
         state.tap_delay = delays if state.tap_delay is None else state.tap_delay + delays
 
 
-def _first(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-    """Return the time of the first sample after the pose, shape (M,), s."""
-    _, first, rows, columns = coefficients.unbind(0)
-    return first + rows * inputs.rows + columns * inputs.columns
+def _late(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+    """Return the times of the four samples after the pose, shape (4, M), s."""
+    interval, first, rows, columns = coefficients.unbind(0)
+    return _NUMBER * interval + first + rows * inputs.rows + columns * inputs.columns
 
 
 def radial_speed(inputs: EffectInputs) -> Tensor:

@@ -99,7 +99,7 @@ class MultipathShape(AreaShape):
     distance_m: float = 1.0
 
 
-class MultipathEffect(SignalEffect):
+class MultipathEffect(SignalEffect, shape=MultipathShape):
     r"""Light by other ways than the direct one, in three forms that add up.
 
     .. math:: z' = z \Bigl(1 + \sum_s \rho_s a_s + j \frac{4 \pi f}{c} R
@@ -123,11 +123,12 @@ class MultipathEffect(SignalEffect):
     with the mean distance D_0 of the recording. *Flange.* What holds the camera sends the light of
     the target back to it. In corners the camera reads centimetres too far (Gudmundsson et al.
     2007).
+
+    Source: Gudmundsson et al. 2007; Corti et al. 2015; Lambert's law.
     """
 
     name = "multipath"
     summary = "light reflected by a wall, a floor or a table beside the target"
-    source = "Gudmundsson et al. 2007; Corti et al. 2015; Lambert's law"
     remedy = "move the target within the room, or cover the floor with something black"
     needs = (FREQUENCY, FIXED_TARGET)
     fixed_terms = (
@@ -139,7 +140,6 @@ class MultipathEffect(SignalEffect):
         ),
         Coefficient("flange", "1", 0.05),
     )
-    shape_type = MultipathShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:

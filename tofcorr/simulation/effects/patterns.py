@@ -125,20 +125,20 @@ class FixedPatternShape(ImageShape):
     block_px: int = 1
 
 
-class FixedPatternEffect(MapEffect):
+class FixedPatternEffect(MapEffect, shape=FixedPatternShape):
     r"""One constant for every pixel, independent of its neighbours: the fixed-pattern matrix.
 
     .. math:: \Delta d = o_{rc}, \quad o_{rc} \sim N(0, s^2)
 
     A simulator's YAML gives either `rms_m` and `seed`, from which the values are drawn, or
     `values_m`, a list of rows.
+
+    Source: Kahlmann et al. 2006 (fixed pattern noise matrix).
     """
 
     name = "fixed_pattern"
     summary = "a constant offset of every pixel"
-    source = "Kahlmann et al. 2006 (fixed pattern noise matrix)"
     remedy = "twenty poses or more with the wall in all pixels"
-    shape_type: ClassVar[type[Options]] = FixedPatternShape
     # A per-pixel offset already contains row and column offsets.
     contains = ("row_column_pattern",)
     tables = {"values_m": ("rms_m", tuple[tuple[float, ...], ...])}  # noqa: RUF012 - typed above
@@ -168,20 +168,20 @@ class FixedPatternEffect(MapEffect):
         return (row // side * across + column // side)[:, None]
 
 
-class RowColumnPatternEffect(MapEffect):
+class RowColumnPatternEffect(MapEffect, shape=ImageShape):
     r"""One constant for every row and one for every column.
 
     .. math:: \Delta d = o_r + o_c
 
     Rows are addressed and columns are converted one by one; each has its own delay. A simulator's
     YAML gives either `row_rms_m`, `column_rms_m` and `seed`, or `rows_m` and `columns_m`.
+
+    Source: row addressing and column converters of area sensors (EMVA 1288).
     """
 
     name = "row_column_pattern"
     summary = "a constant offset of every row and every column"
-    source = "row addressing and column converters of area sensors (EMVA 1288)"
     remedy = "twenty poses or more with the wall in all pixels"
-    shape_type: ClassVar[type[Options]] = ImageShape
     tables = {  # noqa: RUF012 - typed above
         "rows_m": ("row_rms_m", tuple[float, ...]),
         "columns_m": ("column_rms_m", tuple[float, ...]),

@@ -1,7 +1,5 @@
 """Smooth error over the image, of higher order than a quadratic, or growing with the distance."""
 
-from typing import ClassVar
-
 from torch import Tensor
 
 from tofcorr.options import Options
@@ -22,7 +20,7 @@ class PixelShape(Options):
     reference_distance_m: float = 1.5
 
 
-class PixelEffect(LinearDelay):
+class PixelEffect(LinearDelay, shape=PixelShape):
     r"""A smooth surface over the image, plus one that grows with the distance.
 
     .. math:: \Delta d = \sum_{1 \le i+j \le K} p_{ij} P_i(x) P_j(y)
@@ -30,14 +28,14 @@ class PixelEffect(LinearDelay):
 
     with columns x and rows y scaled to [-1, 1]: P1 of Fuchs and May (2007), P2 of Abdo and
     Borgeat (2010), and higher orders.
+
+    Source: Fuchs and May 2007; Abdo and Borgeat 2010.
     """
 
     name = "pixel"
     refines = ("pixel",)
     summary = "smooth error over the image, of higher order than the base model"
-    source = "Fuchs and May 2007; Abdo and Borgeat 2010"
     remedy = "a white wall, frontal, at three or more distances, with the camera rolled"
-    shape_type: ClassVar[type[Options]] = PixelShape
     prior, decay = 0.04, 1.3
 
     @classmethod

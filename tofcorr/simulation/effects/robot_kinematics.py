@@ -1,7 +1,7 @@
 """Errors of the poses that the robot reports: of its geometry, and by the play of its gears."""
 
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ class RobotKinematicsShape(Options):
     centre_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
-class RobotKinematicsEffect(GeometryEffect):
+class RobotKinematicsEffect(GeometryEffect, shape=RobotKinematicsShape):
     r"""A pose error that depends on position and orientation of the tool.
 
     .. math:: p' = (1 + l)\, p + M q + s |q|^2, \quad
@@ -37,11 +37,12 @@ class RobotKinematicsEffect(GeometryEffect):
     (a wrong unit, a wrong arm), and the whole arm also rotates about it: about the vertical axis by
     a_k cos(k alpha) + b_k sin(k alpha), k = 1, 2, 3, for the azimuth alpha (eccentric encoder,
     gear), and downwards by d rho^2 for the reach rho (bending base).
+
+    Source: linearised kinematic error of a serial arm (Mooring, Roth and Driels 1991).
     """
 
     name = "robot_kinematics"
     summary = "scale, sag or joint errors of the robot, or a bracket that bends"
-    source = "linearised kinematic error of a serial arm (Mooring, Roth and Driels 1991)"
     remedy = "the same camera poses by another configuration of the arm, or a tracker"
     needs = (ROBOT,)
     fixed_terms = (
@@ -53,7 +54,6 @@ class RobotKinematicsEffect(GeometryEffect):
         Coefficient("length", "m/m", 0.01),
         *(Coefficient(f"bracket_{i}", "rad", 0.004) for i in _AXES),
     )
-    shape_type: ClassVar[type[Options]] = RobotKinematicsShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
@@ -103,11 +103,12 @@ class BacklashEffect(GeometryEffect):
     u holds the signs of the tool's last motion along the axes of the world (`sides_of_approach`).
     Each joint has a play of its own; over the poses of a recording most of it is a shift along the
     axes.
+
+    Source: ISO 9283, unidirectional against multi-directional pose accuracy.
     """
 
     name = "backlash"
     summary = "play in the gears of the robot"
-    source = "ISO 9283, unidirectional against multi-directional pose accuracy"
     remedy = "the same poses, approached from the other side"
     needs = (ROBOT,)
     fixed_terms = tuple(Coefficient(f"play_{axis}", "m", 0.002) for axis in "xyz")

@@ -1,11 +1,11 @@
 """Taps that no longer grow with the light, and the light that reached them."""
 
-import math
 from collections.abc import Iterator
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import conv1d
 
 from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.options import Options
@@ -80,7 +80,7 @@ class SaturationShape(Options):
     contrast: float = 0.5
 
 
-class SaturationEffect(CatalogueEffect):
+class SaturationEffect(CatalogueEffect, shape=SaturationShape):
     r"""Taps that saturate, softly or at a knee, and spill into the pixels beside.
 
     .. math:: t' = t - \kappa t^3 / t_f^2 - \sum_k h_k\, o_k(t) + \sum_a g_a S_a o(t),
@@ -91,23 +91,22 @@ class SaturationEffect(CatalogueEffect):
     The distance results from four bent taps, t = B + A cos(phi + k pi / 2): the error has four
     periods within the unambiguous range and grows with the amplitude. The recorded amplitude of a
     clipped pixel is too small; `light_of` estimates A.
+
+    Source: four-tap demodulation with a bent characteristic; Lange 2000.
     """
 
     name = "saturation"
     summary = "taps that bend or clip in bright pixels"
-    source = "four-tap demodulation with a bent characteristic; Lange 2000"
     remedy = "a bright target at three integration times, one of them short"
     needs = (AMPLITUDE, FREQUENCY)
-    shape_type: ClassVar[type[Options]] = SaturationShape
     reads_light = True
     prior_soft = 0.3
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the brightest tap of the recording, A + A / contrast, as the full level."""
-        ambient, contrast = inputs.facts.ambient, SaturationShape().contrast
-        full = (1 + 1 / contrast) * inner_range(inputs.known_amplitude)[1]
-        full += 0.0 if ambient is None else float(ambient.nan_to_num(0.0).max())
+        full = (1 + 1 / SaturationShape().contrast) * inner_range(inputs.known_amplitude)[1]
+        full += float(_ambient(inputs).max())
         return cls(SaturationShape(full_counts=full or 1.0))
 
     @classmethod
@@ -156,9 +155,7 @@ class SaturationEffect(CatalogueEffect):
     def _taps(self, inputs: EffectInputs) -> Tensor:
         """Return the four taps as they would be without a bend, shape (4, M), counts."""
         amplitude = light_of(inputs)
-        background = amplitude / self.shape.contrast
-        if inputs.facts.ambient is not None:
-            background = background + inputs.of_frame(inputs.facts.ambient.nan_to_num(0.0))
+        background = amplitude / self.shape.contrast + inputs.of_frame(_ambient(inputs))
         return _four_taps(background, amplitude * inputs.turn)
 
     def _bend(self, taps: Tensor, coefficients: Tensor) -> Tensor:
@@ -177,12 +174,15 @@ class SaturationEffect(CatalogueEffect):
 
     def _spills_of(self, inputs: EffectInputs) -> Tensor:
         """Return the phasors of what runs into the chosen pixels, shape (M, 2), counts."""
-        ambient = inputs.facts.ambient
-        ambient = torch.zeros_like(inputs.facts.offset) if ambient is None else ambient
-        found = inputs.from_images(
-            _spilled, inputs.known_frequency, self.shape, of_frames=ambient.nan_to_num(0.0)
-        )
+        frequency, ambient = inputs.known_frequency, _ambient(inputs)
+        found = inputs.from_images(_spilled, frequency, self.shape, of_frames=ambient)
         return found.to(inputs.turn)
+
+
+def _ambient(inputs: EffectInputs) -> Tensor:
+    """Return the background light of the frames, shape (F,), counts; none where it is unknown."""
+    ambient = inputs.facts.ambient
+    return torch.zeros_like(inputs.facts.offset) if ambient is None else ambient.nan_to_num(0.0)
 
 
 def _spilled(
@@ -224,14 +224,9 @@ def spilled(over: Tensor, axis: int) -> Tensor:
         over: Charge above the full level, of any shape, not negative.
         axis: The axis along which it runs.
     """
-    count = over.shape[axis]
-    weights = [math.exp(-place / _LENGTH_PX) for place in range(1, _REACH_PX + 1)]
-    received = torch.zeros_like(over)
-    for place, weight in enumerate(weights, start=1):
-        if place >= count:
-            break
-        first, last = over.narrow(axis, 0, count - place), over.narrow(axis, place, count - place)
-        share = weight / (2 * sum(weights))
-        received.narrow(axis, place, count - place).add_(first, alpha=share)
-        received.narrow(axis, 0, count - place).add_(last, alpha=share)
-    return received
+    place = torch.arange(-_REACH_PX, _REACH_PX + 1, device=over.device).abs()
+    weights = torch.exp(-place / _LENGTH_PX) * (place > 0)
+    lines = over.movedim(axis, -1)
+    alone = lines.reshape(-1, 1, lines.shape[-1])
+    received = conv1d(alone, (weights / weights.sum()).to(over)[None, None], padding=_REACH_PX)
+    return received.reshape(lines.shape).movedim(-1, axis)

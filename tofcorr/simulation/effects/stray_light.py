@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import ClassVar
 
 import torch
 from kornia.geometry.transform import warp_affine
@@ -33,7 +32,7 @@ class StrayLightShape(Options):
     ghost_sigma_of_width: float = 0.02
 
 
-class StrayLightEffect(SignalEffect):
+class StrayLightEffect(SignalEffect, shape=StrayLightShape):
     r"""Every pixel receives some light of its neighbourhood.
 
     .. math:: z'(u) = z + \sum_s w_s G_s * z + w_\infty \langle z \rangle
@@ -46,14 +45,14 @@ class StrayLightEffect(SignalEffect):
     back, and the lens to it again, is a ghost: the image turned half round about the optical axis
     (u = 0), smaller by m and out of focus (G_g). A bright spot is then seen again on the other
     side.
+
+    Source: Kavli et al. 2008; Mure-Dubois and Huegli 2007.
     """
 
     name = "stray_light"
     summary = "light scattered inside the lens, visible in dark pixels next to bright ones"
-    source = "Kavli et al. 2008; Mure-Dubois and Huegli 2007"
     remedy = "the same pose with and without a bright object near the camera"
     needs = (AMPLITUDE, FREQUENCY)
-    shape_type: ClassVar[type[Options]] = StrayLightShape
 
     @classmethod
     def terms(cls, shape: StrayLightShape) -> tuple[Coefficient, ...]:

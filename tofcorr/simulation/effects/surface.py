@@ -1,7 +1,5 @@
 """How a surface returns light: shifts with the angle at which the ray meets it."""
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
@@ -19,11 +17,12 @@ class IncidenceAngleEffect(LinearDelay):
     .. math:: \Delta d = k_1 (1 / \cos \theta - 1) + k_2 (1 - \cos \theta)^2
 
     Depending on the material, light of a slanted ray travels farther inside it, or less deep.
+
+    Source: Radmer et al. 2008 (incident light).
     """
 
     name = "incidence_angle"
     summary = "shift with the angle at which the ray meets the surface"
-    source = "Radmer et al. 2008 (incident light)"
     remedy = "tilts to both sides at one distance, and a second material"
     fixed_terms = (Coefficient("secant", "m", 0.1), Coefficient("square", "m", 0.1))
 
@@ -39,7 +38,7 @@ class GlossShape(Options):
     width_deg: tuple[float, ...] = (4.0, 8.0, 16.0)
 
 
-class GlossEffect(LinearDelay):
+class GlossEffect(LinearDelay, shape=GlossShape):
     r"""A shift of the pixels that look straight at the target.
 
     .. math:: \Delta d = \sum_w g_w \, e^{-2 (1 - \cos\theta) / w^2}
@@ -49,13 +48,13 @@ class GlossEffect(LinearDelay):
     at a right angle. Light that is mirrored has not walked inside the material, and reads nearer
     than the rest; light that was mirrored to a wall and back reads farther. The lobe of a real
     surface is a sum of narrow and wide ones. The brightness of the highlight is not simulated.
+
+    Source: specular lobe (Torrance and Sparrow 1967) beside subsurface delay.
     """
 
     name = "gloss"
     summary = "highlights of a glossy target, where the camera looks straight at it"
-    source = "specular lobe (Torrance and Sparrow 1967) beside subsurface delay"
     remedy = "the same poses with a matt target, or tilted by more than the highlight's width"
-    shape_type: ClassVar[type[Options]] = GlossShape
 
     @classmethod
     def terms(cls, shape: GlossShape) -> tuple[Coefficient, ...]:

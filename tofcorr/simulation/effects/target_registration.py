@@ -1,7 +1,7 @@
 """A target whose plane differs from the recorded one."""
 
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -45,7 +45,7 @@ class TargetRegistrationShape(Options):
     duration_s: float = 0.0
 
 
-class TargetRegistrationEffect(GeometryEffect):
+class TargetRegistrationEffect(GeometryEffect, shape=TargetRegistrationShape):
     r"""An error of each plane's offset and of the two angles of its normal.
 
     .. math:: n' = \frac{n + a u + b v}{|n + a u + b v|}, \quad d' = d + \delta - (n' - n) \cdot p
@@ -53,14 +53,14 @@ class TargetRegistrationEffect(GeometryEffect):
     for unit vectors u and v in the plane and the pivot p. If the shape lists no planes, all planes
     have the same error. A target may also move during the recording: delta, a and b then drift, and
     change after a third and two thirds of it, for all planes alike.
+
+    Source: geometry of a plane.
     """
 
     name = "target_registration"
     summary = "a plane whose position or tilt differs from the recorded one"
-    source = "geometry of a plane"
     remedy = "tilts to both sides and a laser or tracker reference of the plane"
     needs = (FIXED_TARGET, MEASURED_PLANES)
-    shape_type: ClassVar[type[Options]] = TargetRegistrationShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:

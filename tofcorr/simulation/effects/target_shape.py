@@ -1,6 +1,6 @@
 """A target that is not flat."""
 
-from typing import ClassVar, Self
+from typing import Self
 
 from torch import Tensor
 
@@ -44,7 +44,7 @@ class TargetShapeShape(AreaShape):
     degree: int = 6
 
 
-class TargetShapeEffect(LinearEffect):
+class TargetShapeEffect(LinearEffect, shape=TargetShapeShape):
     r"""A surface with bumps.
 
     .. math:: \Delta d = -h(x, y) / \cos \theta, \quad
@@ -52,14 +52,14 @@ class TargetShapeEffect(LinearEffect):
 
     with the height h above the plane, towards the camera, over the target's own coordinates.
     Height and tilt of the whole plane are `target_registration`.
+
+    Source: geometry of a ray that meets a raised surface.
     """
 
     name = "target_shape"
     summary = "a target that is not flat"
-    source = "geometry of a ray that meets a raised surface"
     remedy = "look at another part of the target, or rotate it in its plane"
     needs = (FIXED_TARGET,)
-    shape_type: ClassVar[type[Options]] = TargetShapeShape
     prior = 0.03
 
     @classmethod

@@ -2,7 +2,7 @@
 
 import math
 from itertools import pairwise
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -35,7 +35,7 @@ class WarmUpShape(Options):
     body_reference_c: float | None = None
 
 
-class WarmUpEffect(FrameEffect):
+class WarmUpEffect(FrameEffect, shape=WarmUpShape):
     r"""Drift with the time since power-on, and with the heat of the time that the camera ran.
 
     .. math:: \Delta d_i = \sum_T k_T (1 - e^{-t_i / T})
@@ -47,17 +47,17 @@ class WarmUpEffect(FrameEffect):
     does not matter how often it was recorded. The last term follows the body temperature if it is
     recorded, relative to the room temperature if that is known too; the effect of the room itself
     is `room_temperature`. About 15 mm within three frames (Abdo and Borgeat 2010).
+
+    Source: Kahlmann et al. 2006; Abdo and Borgeat 2010.
     """
 
     name = "warm_up"
     summary = "drift while the camera warms up and cools down between frames"
-    source = "Kahlmann et al. 2006; Abdo and Borgeat 2010"
     remedy = (
         "poses in random order with revisits, the first minutes included, body temperature logged"
     )
     needs = (TIMESTAMP,)
     linear = True
-    shape_type: ClassVar[type[Options]] = WarmUpShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
@@ -116,7 +116,7 @@ class RoomTemperatureShape(Options):
     starts_s: tuple[float, ...] = (0.0,)
 
 
-class RoomTemperatureEffect(FrameEffect):
+class RoomTemperatureEffect(FrameEffect, shape=RoomTemperatureShape):
     r"""A shift with the room temperature, immediate and lagged.
 
     .. math:: \Delta d = a (\vartheta - \vartheta_0)
@@ -126,14 +126,14 @@ class RoomTemperatureEffect(FrameEffect):
     with first-order lagged temperatures of the time constants T in `lags_s`. The temperature before
     the first frame and during long pauses is not recorded: after each of them, at t_j, the camera's
     temperature deviates by s_j degrees. About 8 mm per degree (Kahlmann et al. 2006).
+
+    Source: Kahlmann et al. 2006.
     """
 
     name = "room_temperature"
     summary = "shift with the temperature of the room"
-    source = "Kahlmann et al. 2006"
     remedy = "the same poses at room temperatures at least 3 degrees apart, logged"
     needs = (ROOM_TEMPERATURE,)
-    shape_type: ClassVar[type[Options]] = RoomTemperatureShape
     prior, prior_start = 0.008, 1.5
 
     @classmethod
@@ -172,13 +172,10 @@ class RoomTemperatureEffect(FrameEffect):
         at_once, lagged, square, off = coefficients.split([1, len(lags), 1, len(starts)])
         excess = room - self.shape.reference_c
         shift = at_once * excess + square * excess**2
+        since = times[:, None] - times.new_tensor(starts)
         for strength, lag in zip(lagged, lags, strict=True):
-            followed = lagged_by(lag, times, excess)
-            for degrees, start in zip(off, starts, strict=True):
-                since = times - start
-                lingering = torch.exp(-since.clamp(min=0.0) / lag) * (since >= 0)
-                followed = followed + degrees * lingering
-            shift = shift + strength * followed
+            lingering = torch.exp(-since.clamp(min=0.0) / lag) * (since >= 0)
+            shift = shift + strength * (lagged_by(lag, times, excess) + lingering @ off)
         return shift
 
 

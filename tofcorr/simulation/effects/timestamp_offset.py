@@ -1,7 +1,7 @@
 """A time difference between images and poses."""
 
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import Self
 
 from torch import Tensor
 
@@ -25,7 +25,7 @@ class TimestampOffsetShape(Options):
     knows_exposure: bool = False
 
 
-class TimestampOffsetEffect(GeometryEffect):
+class TimestampOffsetEffect(GeometryEffect, shape=TimestampOffsetShape):
     r"""The image is taken some time after the recorded pose.
 
     .. math:: T' = T \exp(\hat\xi\, \Delta t), \quad
@@ -35,28 +35,24 @@ class TimestampOffsetEffect(GeometryEffect):
     faster, that difference changes by 2 t_1 over the recording, whose middle is at t-bar and whose
     half length is h. A stamp may tell when a frame was asked for, which takes a times the
     integration time tau: a camera takes 4 to 24 exposures for a frame.
+
+    Source: rigid motion at constant twist.
     """
 
     name = "timestamp_offset"
     summary = "a time difference between images and poses"
-    source = "rigid motion at constant twist"
     remedy = "the same path in both directions, or poses at rest"
     needs = (VELOCITY,)
-    shape_type: ClassVar[type[Options]] = TimestampOffsetShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the time that the recording lasted, and integration times where they differ."""
         times, exposure = inputs.facts.timestamp, inputs.facts.integration_time
         first, last = float(times.min()), float(times.max())
-        return cls(
-            TimestampOffsetShape(
-                middle_s=(first + last) / 2,
-                half_s=(last - first) / 2 or 1.0,
-                # It differs, and is known of every frame.
-                knows_exposure=exposure is not None and bool(exposure.max() > exposure.min()),
-            )
-        )
+        # It differs, and is known of every frame.
+        known = exposure is not None and bool(exposure.max() > exposure.min())
+        middle, half = (first + last) / 2, (last - first) / 2 or 1.0
+        return cls(TimestampOffsetShape(middle_s=middle, half_s=half, knows_exposure=known))
 
     @classmethod
     def terms(cls, shape: TimestampOffsetShape) -> tuple[Coefficient, ...]:

@@ -1,12 +1,11 @@
 """Circular error of a signal that is not a pure sine."""
 
 import math
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import (
     FREQUENCY,
@@ -38,7 +37,7 @@ class WigglingShape(Options):
         return self.high_counts > self.low_counts > 0
 
 
-class WigglingEffect(SignalEffect):
+class WigglingEffect(SignalEffect, shape=WigglingShape):
     r"""Odd harmonics of the light, which four taps cannot separate from the fundamental.
 
     .. math:: \Delta d = \frac{c}{4 \pi f} \arg \Bigl(1 + \sum_{n = 4, 8, 12}
@@ -48,14 +47,14 @@ class WigglingEffect(SignalEffect):
     quarter of the unambiguous range. Coefficients are the amplitudes of sin and cos in
     metres, (c / 4 pi f) rho cos psi and (c / 4 pi f) rho sin psi. Where the amplitude is known, the
     error may change with it: u is its logarithm scaled to [-1, 1] (Lefloch et al. 2013).
+
+    Source: Lindner and Kolb 2006; Drayton et al. 2013; Lefloch et al. 2013.
     """
 
     name = "wiggling"
     summary = "periodic error of the distance, from harmonics of the light"
-    source = "Lindner and Kolb 2006; Drayton et al. 2013; Lefloch et al. 2013"
     remedy = "many distances over one and a half periods of the error (a quarter of c / 2f each)"
     needs = (FREQUENCY,)
-    shape_type: ClassVar[type[Options]] = WigglingShape
     prior = 0.08
 
     @classmethod
@@ -86,15 +85,14 @@ class WigglingEffect(SignalEffect):
 
     def on_signal(self, state: FrameState) -> None:
         """Add the harmonics of order n + 1 to the light."""
-        scale = unambiguous_range(state.modulation_frequency) / (2 * torch.pi)
-        fundamental = state.signal[0]
-        waves = self._waves(fundamental.sgn(), inputs_from_state(state))
+        inputs, fundamental = inputs_from_state(state), state.signal[0]
+        waves = self._waves(fundamental.sgn(), inputs)
         orders = [*(cycles + 1 for cycles in _CYCLES), _CYCLES[0] + 1]
         pairs = self.coefficients.reshape(-1, 2).unbind(0)
         for (sine, cosine), order, own in zip(pairs, orders, waves, strict=False):
             if sine == 0 and cosine == 0:
                 continue
-            phasor = torch.complex(sine, cosine) / scale * fundamental * own
+            phasor = torch.complex(sine, cosine) / inputs.metres_per_radian * fundamental * own
             state.orders = torch.cat([state.orders, state.orders.new_tensor([order])])
             state.signal = torch.cat([state.signal, phasor[None]])
 
