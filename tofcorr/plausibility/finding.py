@@ -1,7 +1,7 @@
 """What checks found: how bad it is, in a sentence each, and for the commands that ask for it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -70,12 +70,9 @@ class Finding:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "check": self.check,
-            "severity": self.severity,
-            "sentence": self.sentence,
-            "frames": list(self.frames),
-        }
+        values = asdict(self)
+        del values["spoils"]  # For those who fit.
+        return values
 
 
 impossible, doubtful, note = (

@@ -49,16 +49,12 @@ def transposed(poses: np.ndarray) -> np.ndarray:
     return changed
 
 
-def scaled(poses: np.ndarray, factor: float) -> np.ndarray:
-    """Return the poses with their translations multiplied."""
-    changed = poses.copy()
-    changed[:, :3, 3] *= factor
-    return changed
-
-
 def of_other_axes(poses: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return the poses in a world, and of a tool, whose axes are the rows of a (4, 4) matrix."""
-    return axes @ poses @ axes.T
+    """Return the poses in a world, and of a tool, whose axes are the rows of a (4, 4) matrix.
+
+    Axes that are longer or shorter, all alike, change the unit of the translations.
+    """
+    return axes @ poses @ np.linalg.inv(axes)
 
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
@@ -98,7 +94,7 @@ IN_POSES: dict[str, Mistake] = {
         f"in {unit}": Mistake(
             f"the translations are in {unit}",
             f"{'divide' if factor < 1 else 'multiply'} tx, ty, tz",
-            partial(scaled, factor=factor),
+            partial(of_other_axes, axes=np.diag([factor, factor, factor, 1.0])),
         )
         for unit, factor in (*_UNITS.items(), ("kilometres", 1e3))
     },

@@ -7,10 +7,10 @@ from tofcorr.options import Options
 from tofcorr.simulation.effects.base import (
     AMBIENT,
     AMPLITUDE,
-    Coefficient,
     EffectInputs,
     LinearDelay,
     known,
+    terms_in,
 )
 
 
@@ -18,6 +18,9 @@ class AmbientLightShape(Options):
     """The background light that serves as unit."""
 
     reference_counts: float = 100.0
+
+
+_WAVES = [f"{kind}_{wave}" for kind in ("false", "returned") for wave in ("cosine", "sine")]
 
 
 class AmbientLightEffect(LinearDelay, shape=AmbientLightShape):
@@ -40,13 +43,7 @@ class AmbientLightEffect(LinearDelay, shape=AmbientLightShape):
     summary = "shift by background light"
     remedy = "the same poses with a lamp on and off, the background recorded"
     needs = (AMBIENT, AMPLITUDE)
-    fixed_terms = tuple(
-        Coefficient(name, "m", 0.03)
-        for name in (
-            *("share", "linear", "logarithm", "false_cosine", "false_sine"),
-            *("returned_cosine", "returned_sine"),
-        )
-    )
+    fixed_terms = terms_in("m", dict.fromkeys(("share", "linear", "logarithm", *_WAVES), 0.03))
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "AmbientLightEffect":

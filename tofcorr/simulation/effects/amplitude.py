@@ -14,6 +14,7 @@ from tofcorr.simulation.effects.base import (
     inner_range,
     legendre,
     side_by_side,
+    terms_in,
 )
 
 
@@ -60,14 +61,8 @@ class AmplitudeEffect(LinearDelay, shape=AmplitudeShape):
     @classmethod
     def terms(cls, shape: AmplitudeShape) -> tuple[Coefficient, ...]:
         """Return the coefficients of the logarithm, then of the amplitude itself."""
-        logarithm = [
-            Coefficient(f"log_{k}", "m", 2 * cls.prior / (1 + 0.5 * k))
-            for k in range(1, shape.degree + 1)
-        ]
-        return (
-            *logarithm,
-            *(Coefficient(name, "m", cls.prior_linear) for name in ("linear", "square")),
-        )
+        sizes = {f"log_{k}": 2 * cls.prior / (1 + k / 2) for k in range(1, shape.degree + 1)}
+        return terms_in("m", sizes | dict.fromkeys(("linear", "square"), cls.prior_linear))
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the functions of the amplitude, shape (M, K)."""

@@ -313,6 +313,11 @@ class Coefficient(NamedTuple):
     prior_sd: float
 
 
+def terms_in(unit: str, prior_sds: Mapping[str, float]) -> tuple[Coefficient, ...]:
+    """Return coefficients of one unit by their names and the deviations of their priors."""
+    return tuple(Coefficient(name, unit, prior_sd) for name, prior_sd in prior_sds.items())
+
+
 class CatalogueEffect(Effect, ABC):
     """An effect with named coefficients, for simulation and for fitting.
 

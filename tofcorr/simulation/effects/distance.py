@@ -9,6 +9,7 @@ from tofcorr.simulation.effects.base import (
     LinearDelay,
     legendre,
     side_by_side,
+    terms_in,
 )
 
 
@@ -46,10 +47,8 @@ class DistanceEffect(LinearDelay, shape=DistanceShape):
     @classmethod
     def terms(cls, shape: DistanceShape) -> tuple[Coefficient, ...]:
         """Return c1, c2, ...; the prior is smaller for higher degrees."""
-        return tuple(
-            Coefficient(f"legendre_{k}", "m", cls.prior / k**cls.decay)
-            for k in range(1, shape.degree + 1)
-        )
+        sizes = {f"legendre_{k}": cls.prior / k**cls.decay for k in range(1, shape.degree + 1)}
+        return terms_in("m", sizes)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the Legendre polynomials, shape (M, K)."""

@@ -11,6 +11,7 @@ from tofcorr.simulation.effects.base import (
     EffectInputs,
     FrameEffect,
     known,
+    terms_in,
 )
 from tofcorr.simulation.hooks import FrameFacts
 
@@ -50,9 +51,7 @@ class IntegrationTimeEffect(FrameEffect, shape=IntegrationTimeShape):
     @classmethod
     def terms(cls, shape: IntegrationTimeShape) -> tuple[Coefficient, ...]:
         """Return the coefficients of the powers of the logarithm."""
-        return tuple(
-            Coefficient(f"log_{k}", "m", cls.prior / k) for k in range(1, shape.degree + 1)
-        )
+        return terms_in("m", {f"log_{k}": cls.prior / k for k in range(1, shape.degree + 1)})
 
     def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:
         """Return the polynomial of the logarithm, shape (F,), metres."""

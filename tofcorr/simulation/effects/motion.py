@@ -8,15 +8,17 @@ from tofcorr.simulation.effects.base import (
     FREQUENCY,
     VELOCITY,
     CatalogueEffect,
-    Coefficient,
     EffectInputs,
     inputs_from_state,
     known,
     phase_difference,
+    terms_in,
 )
 from tofcorr.simulation.hooks import FrameState
 
 _NUMBER = torch.arange(4, dtype=torch.float64)[:, None]
+# Time between samples, of the first, and half of a read-out.
+_TIMES = ("sample_interval_s", "first_sample_s", "half_of_rows_s", "half_of_columns_s")
 
 
 class MotionEffect(CatalogueEffect):
@@ -38,10 +40,7 @@ class MotionEffect(CatalogueEffect):
     summary = "camera or target moving while the four samples are taken"
     remedy = "the same poses at rest and in motion, in both directions"
     needs = (VELOCITY, FREQUENCY)
-    fixed_terms = tuple(  # Time between samples, of the first, and half of a read-out.
-        Coefficient(name, "s", 0.1)
-        for name in ("sample_interval_s", "first_sample_s", "half_of_rows_s", "half_of_columns_s")
-    )
+    fixed_terms = terms_in("s", dict.fromkeys(_TIMES, 0.1))
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four samples as distance, shape (M,), metres."""

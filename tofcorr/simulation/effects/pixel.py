@@ -10,6 +10,7 @@ from tofcorr.simulation.effects.base import (
     exponents,
     products,
     side_by_side,
+    terms_in,
 )
 
 
@@ -46,12 +47,10 @@ class PixelEffect(LinearDelay, shape=PixelShape):
     @classmethod
     def terms(cls, shape: PixelShape) -> tuple[Coefficient, ...]:
         """Return the surface's coefficients, then those that grow with the distance."""
-        surface = [
-            Coefficient(f"x{i}_y{j}", "m", cls.prior / (i + j) ** cls.decay)
-            for i, j in exponents(1, shape.degree)
-        ]
-        growth = [Coefficient(f"growth_{part}", "m", cls.prior / 2) for part in ("x", "y", "r2")]
-        return (*surface, *growth)
+        surface, prior = exponents(1, shape.degree), cls.prior
+        sizes = {f"x{i}_y{j}": prior / (i + j) ** cls.decay for i, j in surface}
+        growth = {f"growth_{part}": prior / 2 for part in ("x", "y", "r2")}
+        return terms_in("m", sizes | growth)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the functions of image position and distance, shape (M, K)."""

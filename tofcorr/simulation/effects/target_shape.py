@@ -14,6 +14,7 @@ from tofcorr.simulation.effects.base import (
     inputs_from_state,
     products,
     side_by_side,
+    terms_in,
 )
 from tofcorr.simulation.hooks import FrameState
 
@@ -70,10 +71,8 @@ class TargetShapeEffect(LinearEffect, shape=TargetShapeShape):
     @classmethod
     def terms(cls, shape: TargetShapeShape) -> tuple[Coefficient, ...]:
         """Return the heights; the prior is smaller for shorter waves."""
-        return tuple(
-            Coefficient(f"x{i}_y{j}", "m", cls.prior / (i + j))
-            for i, j in exponents(2, shape.degree)
-        )
+        heights = exponents(2, shape.degree)
+        return terms_in("m", {f"x{i}_y{j}": cls.prior / (i + j) for i, j in heights})
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return how much earlier the ray meets the surface per unit of each height, (M, K)."""

@@ -1,6 +1,7 @@
 """Circular error of a signal that is not a pure sine."""
 
 import math
+from itertools import product
 from typing import Self
 
 import torch
@@ -15,6 +16,7 @@ from tofcorr.simulation.effects.base import (
     inner_range,
     inputs_from_state,
     side_by_side,
+    terms_in,
 )
 from tofcorr.simulation.hooks import FrameState
 
@@ -69,14 +71,11 @@ class WigglingEffect(SignalEffect, shape=WigglingShape):
     @classmethod
     def terms(cls, shape: WigglingShape) -> tuple[Coefficient, ...]:
         """Return sine and cosine of each number of periods, then their change with amplitude."""
-        names = [(f"_{cycles}", cycles) for cycles in _CYCLES]
+        ranks = {f"_{cycles}": cycles for cycles in _CYCLES}
         if shape.knows_amplitude:
-            names.append((f"_{_CYCLES[0]}_amplitude", 2 * _CYCLES[0]))
-        return tuple(
-            Coefficient(f"{wave}{name}", "m", cls.prior / rank)
-            for name, rank in names
-            for wave in ("sin", "cos")
-        )
+            ranks[f"_{_CYCLES[0]}_amplitude"] = 2 * _CYCLES[0]
+        both = product(ranks.items(), ("sin", "cos"))
+        return terms_in("m", {f"{wave}{name}": cls.prior / rank for (name, rank), wave in both})
 
     def shares(self, inputs: EffectInputs) -> Tensor:
         """Return sine and cosine of each number of periods: its wave, and that a quarter on."""
