@@ -92,24 +92,19 @@ Camera = Annotated[CameraIntrinsics, AfterValidator(_bounded)]
 """A camera in a file: of bounded size."""
 
 
-class ImageSize(Options):
-    """Width and height of an image, pixels."""
-
-    width: Size
-    height: Size
-
-    @model_validator(mode="after")
-    def _of_bounded_size(self) -> Self:
-        return _bounded(self)
-
-
-class CameraSection(ImageSize):
+class CameraSection(Options):
     """The section `camera` of `recording.yaml`."""
 
     model_config = ConfigDict(extra="ignore")
 
+    width: Size
+    height: Size
     K: PinholeMatrix
     distortion: Distortion
+
+    @model_validator(mode="after")
+    def _of_bounded_size(self) -> Self:
+        return _bounded(self)
 
     def intrinsics(self) -> CameraIntrinsics:
         """Return the camera for the functions of `tofcorr.geometry`."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from tofcorr.conditions import condition
 from tofcorr.correction.model import refuse_other_than_tensor
@@ -193,15 +194,12 @@ def surfaces(distance: Tensor, seen: Tensor, rays: Tensor) -> tuple[Tensor, Tens
     inverse = 1 / (distance * slant)
     x, y = ((rays[..., axis] / slant).expand_as(inverse) for axis in (0, 1))
     steps, known = [], True
-    for axis in (1, 2):
+    for axis, sides in ((1, (0, 0, 1, 1)), (2, (1, 1, 0, 0))):
         count = inverse.shape[axis]
         change = torch.stack([inverse, x, y]).diff(dim=axis + 1)
-        nothing = torch.zeros_like(seen.narrow(axis, 0, 1))
-        both = seen.narrow(axis, 0, count - 1) & seen.narrow(axis, 1, count - 1)
-        both = torch.cat([nothing, both, nothing], axis)
+        both = pad(seen.narrow(axis, 0, count - 1) & seen.narrow(axis, 1, count - 1), sides)
         # The change to each pixel from the one before, and from it to the one after.
-        ends = change.narrow(axis + 1, 0, 1), change, change.narrow(axis + 1, count - 2, 1)
-        change = torch.cat(ends, axis + 1)
+        change = pad(change, sides, mode="replicate")
         size = torch.where(both, change[0].detach().abs(), torch.inf)
         backward = size.narrow(axis, 0, count) <= size.narrow(axis, 1, count)
         before, after = (change.narrow(axis + 1, start, count) for start in (0, 1))
@@ -272,7 +270,7 @@ def _group_of(effect: CatalogueEffect) -> Group:
     """Return the last group of stages at which an effect acts; that of whole frames by itself."""
     stages = [(group, f"on_{stage}") for group in Group for stage in group.value]
     acts = [group for group, hook in stages if hasattr(effect, hook)]
-    return Group.FRAME if effect.of_frame else [Group.DELAY, *acts][-1]
+    return Group.FRAME if isinstance(effect, FrameEffect) else [Group.DELAY, *acts][-1]
 
 
 class ImageEffects(nn.Module):

@@ -188,48 +188,43 @@ def shape(look: Look) -> Iterator[Finding]:
     yield from _curved(look, look.shape["curvature"]) if wrong is None else [wrong]
 
 
-_CAMERA: dict[str, tuple[str, float, str]] = {
-    "focal": ("focal length", 0.03, "the focal length were {size:.0f} % {longer}"),
-    "aspect": (
-        "focal length",
-        0.03,
-        "the horizontal focal length were {size:.0f} % {longer}, the vertical one as it is",
-    ),
+# From which size on an error counts, in focal lengths. Chosen: 3 % of the focal length bend a wall
+# tilted by 30 degrees by a centimetre at the border; 2 degrees of the principal point; 0.5 % at the
+# corner bends it by 3 mm per metre.
+_LEAST = {"focal length": 0.03, "principal point": 0.04, "distortion": 0.005}
+_CAMERA = {
+    "focal": ("focal length", "the focal length were {size:.0f} % {longer}"),
+    "aspect": ("focal length", "the horizontal focal length alone were {size:.0f} % {longer}"),
     "centre": (
         "principal point",
-        0.04,
         "the principal point lay {first:+z.0f} % of the focal length to the right and "
         "{second:+z.0f} % further down",
     ),
     "corner": (
         "distortion",
-        0.005,
         "the distortion moved the corners of the image {size:.1f} % of the focal length further "
         "{out}",
     ),
     "bend": (
         "distortion",
-        0.005,
         "the image's axes were bent, its corners {first:+.1f} % of the focal length to the right "
         "and {second:+.1f} % further down, as by a wedge of glass or a tilted lens",
     ),
 }
-"""By estimate: the finding, from which size on it counts, in focal lengths, and what would fit
-better. Chosen: 3 % of the focal length bend a wall tilted by 30 degrees by a centimetre at the
-border; 2 degrees of the principal point; 0.5 % at the corner bends it by 3 mm per metre."""
+"""By estimate: the finding, and what would fit better."""
 
 
 def _wrong_camera(found: dict[str, Estimate]) -> Finding | None:
     """Judge K and distortion by estimates of their errors, and say what is most surely wrong."""
     surely = {
         name: one.size / one.size_error
-        for name, (_, least, _) in _CAMERA.items()
-        if (one := found[name]).size > max(least, SIGMAS * one.size_error)
+        for name, (check, _) in _CAMERA.items()
+        if (one := found[name]).size > max(_LEAST[check], SIGMAS * one.size_error)
     }
     if not surely:
         return None
     name = max(surely, key=surely.__getitem__)
-    one, (check, _, words) = found[name], _CAMERA[name]
+    one, (check, words) = found[name], _CAMERA[name]
     first, second = 100 * one.value[0], 100 * one.value[-1]
     longer, out = ("longer", "out") if first > 0 else ("shorter", "in")
     better = words.format(size=abs(first), first=first, second=second, longer=longer, out=out)

@@ -334,7 +334,6 @@ class CatalogueEffect(Effect, ABC):
             fitted coefficients.
         contains: Names of the effects whose every shift this effect can describe as well.
         refines: Groups of error terms (`Term.group`) of which this effect is a finer form.
-        of_frame: Whether the shift is the same in all pixels of a frame.
         fixed_terms: The coefficients, where they do not depend on the shape.
         prior: Standard deviation of the priors of its main coefficients, where `terms` names them.
         form_error: What a real effect of this kind may leave of itself, as a share of what these
@@ -351,7 +350,6 @@ class CatalogueEffect(Effect, ABC):
     linear: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
     refines: ClassVar[tuple[str, ...]] = ()
-    of_frame: ClassVar[bool] = False
     prior: ClassVar[float] = 0.02
     form_error: ClassVar[float] = 0.8
     reads_light: ClassVar[bool] = False
@@ -477,8 +475,6 @@ def add_delay(state: FrameState, shift: Tensor) -> None:
 
 class FrameEffect(CatalogueEffect):
     """A delay that is the same in all pixels of a frame; it may depend on the frames before."""
-
-    of_frame = True
 
     @abstractmethod
     def shifts(self, facts: FrameFacts, coefficients: Tensor) -> Tensor:

@@ -1,7 +1,5 @@
 """Shifts with the temperature of camera and room, which follow what was before."""
 
-import math
-from itertools import pairwise
 from typing import Self
 
 import torch
@@ -89,15 +87,16 @@ class WarmUpEffect(FrameEffect, shape=WarmUpShape):
 
 def heats(times: Tensor, shape: WarmUpShape) -> list[Tensor]:
     """Return the heat at the times (F,) of frames for each time constant, 0 cold to 1 warm."""
-    age = times[:, None] - times[None, :]
-    past = age >= 0
     ordered, order = times.sort(stable=True)
     since = ordered.diff(prepend=ordered[:1]).clamp(max=_ON_INTERVALS * shape.frame_interval_s)
     ran = torch.empty_like(times).index_copy(0, order, since)
-    return [
-        (torch.exp(-age.clamp(min=0) / constant) * past) @ -torch.expm1(-ran / constant)
-        for constant in shape.heat_s
-    ]
+    return [lingering(times, times, t) @ -torch.expm1(-ran / t) for t in shape.heat_s]
+
+
+def lingering(times: Tensor, moments: Tensor, constant_s: float) -> Tensor:
+    """Return what is left at times (F,) of ones at moments (M,), shape (F, M); 0 before them."""
+    since = times[:, None] - moments
+    return torch.exp(-since.clamp(min=0.0) / constant_s) * (since >= 0)
 
 
 def _excess(facts: FrameFacts) -> Tensor | None:
@@ -172,10 +171,9 @@ class RoomTemperatureEffect(FrameEffect, shape=RoomTemperatureShape):
         at_once, lagged, square, off = coefficients.split([1, len(lags), 1, len(starts)])
         excess = room - self.shape.reference_c
         shift = at_once * excess + square * excess**2
-        since = times[:, None] - times.new_tensor(starts)
         for strength, lag in zip(lagged, lags, strict=True):
-            lingering = torch.exp(-since.clamp(min=0.0) / lag) * (since >= 0)
-            shift = shift + strength * (lagged_by(lag, times, excess) + lingering @ off)
+            unknown = lingering(times, times.new_tensor(starts), lag) @ off
+            shift = shift + strength * (lagged_by(lag, times, excess) + unknown)
         return shift
 
 
@@ -183,15 +181,11 @@ def lagged_by(lag_s: float, times: Tensor, values: Tensor) -> Tensor:
     """Return the first-order lag of values (F,); before the earliest time they are constant.
 
     Between frames the values change linearly from v_0 to v. The solution of y' = (v(t) - y) / T is
-    y = v + (y_0 - v_0) e - (v - v_0) (1 - e) T / t with e = exp(-t / T).
+    y = v + (y_0 - v_0) e - (v - v_0) (1 - e) T / t with e = exp(-t / T): y is behind v by what is
+    left of all changes before.
     """
-    order = torch.argsort(times, stable=True)
-    at, given = times[order].tolist(), values[order].tolist()
-    followed = given[:1]
-    for (start, end), (first, last) in zip(pairwise(at), pairwise(given), strict=True):
-        passed = (end - start) / lag_s
-        behind = -math.expm1(-passed) / passed if passed > 0 else 1.0
-        followed.append(last + (followed[-1] - first) * math.exp(-passed) - (last - first) * behind)
-    lagged = torch.empty_like(values)
-    lagged[order] = values.new_tensor(followed)
-    return lagged
+    ordered, order = times.sort(stable=True)
+    given, passed = values[order], ordered.diff() / lag_s
+    behind = given.diff() * torch.where(passed > 0, -torch.expm1(-passed) / passed, 1.0)
+    left = torch.exp(-(ordered[:, None] - ordered[1:]) / lag_s).tril(-1)
+    return torch.empty_like(values).index_copy(0, order, given - left @ behind)
