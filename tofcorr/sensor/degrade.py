@@ -27,7 +27,7 @@ AmplitudeMeaning = Literal["amplitude", "reflectivity"]
 _MOST_REFLECTED = 10.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Degraded:
     """What was written.
 
@@ -126,12 +126,8 @@ def degrade(
         said = f"{100 * covered_share:.0f} % of its pixels are at distances that the sensor was"
         beyond = "beyond, the error at the range's edge was used. Is the depth in metres?"
         _warn(f"{recording.path}: {said} measured at, {near:.2g} to {far:.2g} m; {beyond}")
-    return Degraded(
-        recording=Recording.open(out, check_contents=False),
-        valid_share=valid_share,
-        covered_share=covered_share,
-        left_out=model.left_out,
-    )
+    written = Recording.open(out, check_contents=False)
+    return Degraded(written, valid_share, covered_share, model.left_out)
 
 
 def conditions_of_frames(

@@ -33,7 +33,7 @@ from tofcorr.simulation.hooks import FrameFacts
 _BEYOND = 0.125
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class SceneFrames:
     """B frames of any scene; every tensor is of one dtype.
 
@@ -153,14 +153,7 @@ class Eye(nn.Module):
         amplitude = torch.zeros_like(depth)
         if lit is not None:
             amplitude = torch.where(seen & torch.isfinite(lit), lit, 0.0)
-        return SceneFrames(
-            rays=self.rays,
-            distance=distance,
-            amplitude=amplitude,
-            seen=seen,
-            conditions=conditions,
-            surface=surface,
-        )
+        return SceneFrames(self.rays, distance, amplitude, seen, conditions, surface)
 
     def _check(self, name: str, image: Tensor | None, depth: Tensor) -> None:
         if image is None:

@@ -77,10 +77,9 @@ class CameraMountOptions(Options):
 
     def tool_from_camera(self) -> Tensor:
         """Return the true transform, shape (4, 4)."""
-        rotation = torch.deg2rad(torch.tensor(self.rotation_deg, dtype=torch.float64))
-        turned = se3.exp(torch.cat([torch.zeros(3, dtype=torch.float64), rotation]))
+        twist = torch.tensor((0.0, 0.0, 0.0, *self.rotation_deg), dtype=torch.float64)
         translation = torch.tensor(self.translation_mm, dtype=torch.float64) / 1000
-        return se3.assemble(turned[:3, :3], translation)
+        return se3.assemble(se3.exp(torch.deg2rad(twist))[:3, :3], translation)
 
 
 def _recordable(name: str) -> str:

@@ -63,11 +63,9 @@ def image_from_lattice(values: tuple[tuple[float, ...], ...], height: int, width
 
     image = np.array(values)
     for axis, count in enumerate((height, width)):
-        at, knots = np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, image.shape[axis])
-        if len(knots) == 1:
-            image = np.repeat(image, count, axis)
-        else:
-            image = CubicSpline(knots, image, axis)(at)
+        image = np.repeat(image, 2, axis) if image.shape[axis] == 1 else image
+        knots = np.linspace(0.0, 1.0, image.shape[axis])
+        image = CubicSpline(knots, image, axis)(np.linspace(0.0, 1.0, count))
     return torch.from_numpy(image)
 
 
@@ -243,25 +241,21 @@ def delays(
     by_pixel = by_pixel + options.constant_mm / 1000 + measured.constant_m
     if measured.pixel is not None:
         by_pixel = by_pixel + image_from_lattice(measured.pixel.values_m, *by_pixel.shape)
-    by_distance, by_amplitude = (
-        None if table is None else Curve(table.knots, table.values_m)
-        for table in (measured.distance, measured.amplitude)
-    )
+    by_distance, by_amplitude = map(_curve_of, (measured.distance, measured.amplitude))
+    squared = measured.amplitude is not None and measured.amplitude.variable != "amplitude"
 
     def of(radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         delay = by_pixel + options.clock_deviation * radial_distance
         if options.amplitude.scale_mm:
             delay = delay + options.amplitude.delay(amplitude)
-        if by_distance is not None:
-            delay = delay + by_distance(radial_distance)
-        if by_amplitude is not None and measured.amplitude is not None:
-            counts = amplitude / electrons_per_count
-            if measured.amplitude.variable == "normalised_amplitude":
-                counts = counts * radial_distance**2
-            delay = delay + by_amplitude(counts)
-        return delay
+        counts = amplitude / electrons_per_count * (radial_distance**2 if squared else 1.0)
+        return delay + by_distance(radial_distance) + by_amplitude(counts)
 
     return of
+
+
+def _curve_of(table: CurveTable | None) -> Callable[[Tensor], Tensor]:
+    return torch.zeros_like if table is None else Curve(table.knots, table.values_m)
 
 
 def pixel_delay(options: PixelDelayOptions, ray_directions: Tensor) -> Tensor:
