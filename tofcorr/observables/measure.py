@@ -398,10 +398,8 @@ def _likeliest(observed: Observed, amplitude: np.ndarray, saturation: float | No
     missing, frames, at = table.missing[use], table.frames[use], np.log(amplitude[use])
     if not missing.sum():
         return plain
-    levels = np.linspace(0.0, 1.0, _BINS + 1)
-    if len(at) > _BINS:
-        levels = np.union1d(levels, np.geomspace(1.0 / len(at), 1.0 / _BINS, _DARK_BINS))
-    edges = np.unique(np.quantile(at, levels))
+    darkest = np.geomspace(1.0 / len(at), 1.0 / _BINS, _DARK_BINS)
+    edges = np.unique(np.quantile(at, [*np.linspace(0.0, 1.0, _BINS + 1), *darkest]))
     place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, max(len(edges) - 2, 0))
     count, lost, sums = (np.bincount(place, each) for each in (frames, missing, frames * at))
     centre = sums / np.maximum(count, 1)

@@ -7,7 +7,7 @@ effect has written.
     on_pose      true poses of camera and target: world_from_tool, tool_from_camera,
                  normal_world, offset, ray_directions. Distances are not computed yet.
     on_geometry  radial_distance, incidence_cosine, points_world, target_xy.
-    on_light     reflectivity, amplitude, background: electrons of modulated and of constant light.
+    on_light     amplitude, background: electrons of modulated and of constant light.
     on_delay     delay: extra optical distance in metres.
     on_signal    signal: the phasor of every harmonic in every pixel; tap_delay.
     on_taps      taps: expected electrons of A0..A3, before noise and quantisation.
@@ -96,7 +96,6 @@ class FrameState:
         target_xy: The same points in the coordinates of the target, shape (H, W, 2), metres.
 
     Stage light:
-        reflectivity: Mean over the pixel's footprint, shape (H, W), in [0, 1].
         amplitude: Modulated light in electrons per tap, shape (H, W): taps swing by +- amplitude.
         background: Mean of the taps in electrons, shape (H, W): constant part of the camera's light
             plus ambient light.
@@ -142,7 +141,6 @@ class FrameState:
     points_world: Tensor = _NOT_YET
     target_xy: Tensor = _NOT_YET
 
-    reflectivity: Tensor = _NOT_YET
     amplitude: Tensor = _NOT_YET
     background: Tensor = _NOT_YET
 

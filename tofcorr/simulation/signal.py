@@ -44,13 +44,9 @@ class Curve:
     def __call__(self, position: Tensor) -> Tensor:
         """Return the curve at `position`, any shape."""
         inside = position.clamp(self._breaks[0], self._breaks[-1])
-        piece = torch.searchsorted(self._breaks, inside.detach().contiguous(), right=True) - 1
-        piece = piece.clamp(0, len(self._breaks) - 2)
-        step = inside - self._breaks[piece]
-        value = torch.zeros_like(step)
-        for coefficient in self._coefficients:
-            value = value * step + coefficient[piece]
-        return value
+        piece = torch.searchsorted(self._breaks[1:-1], inside.detach().contiguous(), right=True)
+        powers = (inside - self._breaks[piece])[..., None] ** torch.arange(3, -1, -1)
+        return (self._coefficients.T[piece] * powers).sum(-1)
 
 
 def image_from_lattice(values: tuple[tuple[float, ...], ...], height: int, width: int) -> Tensor:

@@ -115,13 +115,12 @@ class SensorPipeline:
         full = amplitude_per_reflectivity(light, state)
         if state.amplitude_recorded is None:
             target = target_named(self._scene.targets, state.target)
-            state.reflectivity = seen_reflectivity(target, state.target_xy, self._scene.subsamples)
-            state.amplitude = full * state.reflectivity
+            seen = seen_reflectivity(target, state.target_xy, self._scene.subsamples)
+            state.amplitude = full * seen
         else:
             seen = torch.isfinite(state.radial_distance)
             electrons = state.amplitude_recorded * electrons_per_count
             state.amplitude = torch.where(seen, electrons, torch.nan)
-            state.reflectivity = state.amplitude / full
         # If background light is unknown, zero is assumed.
         ambient = (state.recorded("ambient") or 0.0) * electrons_per_count
         state.background = state.amplitude / light.demodulation_contrast + ambient
