@@ -30,8 +30,6 @@ Row3 = tuple[Number, Number, Number]
 def _pinhole_matrix(rows: Matrix3) -> Matrix3:
     if rows[1][0] != 0 or rows[2][0] != 0 or rows[2][1] != 0 or rows[2][2] != 1:
         raise ValueError("K must be upper triangular with a last row of 0 0 1")
-    if rows[0][0] <= 0 or rows[1][1] <= 0:
-        raise ValueError("the focal lengths of K must be positive")
     shortest, longest = _FOCAL_LENGTHS
     if not all(shortest <= rows[i][i] <= longest for i in (0, 1)):
         raise ValueError(f"the focal lengths of K must be {shortest:g} to {longest:g} pixels")

@@ -65,9 +65,8 @@ class NoiseMeasurement:
         self.source: Source = source or noise_source(observed)
         table = observed.table
         found, error = frame_correlation(np.concatenate(observed.between_frames, axis=1))
-        self.frame_correlation = (
-            min(found, _MOST_CORRELATED) if found > _LEAST_ERRORS * error else 0.0
-        )
+        significant = found > _LEAST_ERRORS * error
+        self.frame_correlation = min(found, _MOST_CORRELATED) if significant else 0.0
         by_pose = [frame_correlation(pose)[0] for pose in observed.between_frames]
         self.pose_frame_correlation = np.array(by_pose)
         counts = observed.repeats.tolist()

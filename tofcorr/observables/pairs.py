@@ -214,11 +214,13 @@ class Matched:
         groups: Group of each pixel of both; -1: not compared.
         size: Number of groups.
         poses: Simulated poses by the real ones that they equal; None: other poses.
+        paired: Whether both show the same poses.
     """
 
     def __init__(self, real: Observed, sim: Observed, amplitudes: Pair | None) -> None:
         tables = (real.table, sim.table)
         self.poses = _shared_poses(real, sim)
+        self.paired = self.poses is not None
         if self.poses is not None:
             self.rows, self.columns = _shared_pixels(*tables, self.poses)
             alike = np.zeros(len(self.rows), dtype=np.int64)
@@ -230,11 +232,6 @@ class Matched:
             self.groups, self.size = _strata(tables, names, brightness)
         self.real = tables[0][self.rows].view(np.recarray)
         self.sim = tables[1][self.columns].view(np.recarray)
-
-    @property
-    def paired(self) -> bool:
-        """Whether both show the same poses."""
-        return self.poses is not None
 
     def sums(
         self,

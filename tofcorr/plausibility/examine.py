@@ -89,10 +89,8 @@ def vet(
     found = examine(data, planes, fits=fits)
     if found.impossible and not force:
         sentences = " ".join(one.sentence for one in found.impossible)
-        raise CalibrationDataError(
-            f"{data.first.path}: {sentences} (`tofcorr inspect` shows more; --force, in Python "
-            "force=True, goes on all the same.)"
-        )
+        more = "`tofcorr inspect` shows more; --force, in Python force=True, goes on all the same."
+        raise CalibrationDataError(f"{data.first.path}: {sentences} ({more})")
     return found
 
 

@@ -67,6 +67,7 @@ class LinearResiduals:
     Attributes:
         residual: Distance of each point to its plane, shape (F, P), metres.
         columns: Its derivatives by the unknowns, shape (F, P, K).
+        rigid: The first of them, by turns and shifts of the hand-eye transform, shape (F, P, 6).
         weight: Of each pixel, shape (F, P), 1 / m^2; zero: not used.
         used: Which pixels are used, shape (F, P), bool.
         cosine: Change of the residual with the distance along the ray, shape (F, P).
@@ -106,12 +107,8 @@ class LinearResiduals:
         shifted = np.broadcast_to(normal_tool[:, None], points.shape)
         errors = [*_hats(d, used), x, y, x * x, y * y, x * y, *_brightness(amplitude)]
         along = cosine[..., None] * np.stack(errors, axis=-1)
-        self.columns = np.concatenate([turned, shifted, along], axis=-1)
-
-    @property
-    def rigid(self) -> np.ndarray:
-        """The columns of the hand-eye transform: turns and shifts, shape (F, P, 6)."""
-        return self.columns[..., :6]
+        self.rigid = np.concatenate([turned, shifted], axis=-1)
+        self.columns = np.concatenate([self.rigid, along], axis=-1)
 
     def frames_for(self, further: int = 0, times: int = 1) -> int:
         """Return how many frames determine the unknowns and further ones, so many times over.

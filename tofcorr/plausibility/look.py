@@ -11,7 +11,6 @@ from typing import Literal
 import numpy as np
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.recording import Recording
 from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import (
@@ -101,7 +100,10 @@ class Look:
         fits: Whether the command fits a model; `check` does not.
 
     Attributes:
+        recording: The first recording, which stands for the camera.
+        rays: Unit rays of all pixels of the image, shape (H W, 3).
         sampled: Global numbers of the F frames looked at.
+        poses: world_from_tool of these frames, shape (F, 4, 4), metres.
         pixel: Flat index of P pixels in the image of each, on the target by its mask, shape (F, P).
         stored: Depth as stored, shape (F, P), float64, metres; NaN: not usable, or no pixel.
         amplitude: Shape (F, P); None if not recorded.
@@ -114,19 +116,24 @@ class Look:
         usable: Which frames have a usable pixel, shape (F,), bool.
         frames: Global numbers of these.
         scene: Their poses and planes as recorded, and their points as measured.
+        flatness: Median distance of a frame's points to their own plane, metres; 0 for single rays.
     """
 
     def __init__(self, data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> None:
         self.data, self.planes, self.fits = data, planes, fits
-        total = data.num_frames
+        self.recording, total = data.first, data.num_frames
+        self.rays = data.ray_directions().numpy().reshape(-1, 3)
         # Twenty minutes of poses, judged in about a second.
         self.sampled = np.unique(np.linspace(0, total - 1, min(total, 600)).astype(int))
+        self.poses = self.column("world_from_tool")
         # A plane is then known to a tenth of the noise of one pixel, and 60 frames are read and
         # judged in well below 0.3 s.
         self._read(int(np.clip(12_000 // len(self.sampled), 24, 200)))
         whole = Scene(self, self.stored, self.pixel)
         self.usable = np.asarray(whole.on_plane.any(1))
         self.frames, self.scene = self.sampled[self.usable], whole.some(self.usable)
+        flatness = self.scene.flatness[self.scene.known]
+        self.flatness = float(np.median(flatness)) if len(flatness) else 0.0
 
     def _read(self, number: int) -> None:
         """Read so many pixels of each frame."""
@@ -160,16 +167,6 @@ class Look:
         self.off_pixel = _padded(off_pixel, 0).astype(int)
         self.noise, self.noise_rms = _noise_of(np.concatenate(second))
 
-    @property
-    def recording(self) -> Recording:
-        """The first recording, which stands for the camera."""
-        return self.data.first
-
-    @cached_property
-    def rays(self) -> np.ndarray:
-        """Unit rays of all pixels of the image, shape (H W, 3)."""
-        return self.data.ray_directions().numpy().reshape(-1, 3)
-
     def column(self, name: str) -> np.ndarray:
         """Return a column that every recording has, for the frames looked at, shape (F, ...)."""
         return self.data.column(name).numpy()[self.sampled]
@@ -178,20 +175,9 @@ class Look:
         """Return a condition of the frames looked at, shape (F,); NaN: unknown."""
         return self.data.conditions(self.sampled)[:, CONDITIONS.index(name)].numpy()
 
-    @property
-    def poses(self) -> np.ndarray:
-        """world_from_tool of the frames looked at, shape (F, 4, 4), metres."""
-        return self.column("world_from_tool")
-
     def with_images(self, stored: np.ndarray, pixel: np.ndarray) -> Scene:
         """Return the scene if these depths (F, P) had been measured, at these pixels."""
         return Scene(self, stored, pixel).some(self.usable)
-
-    @property
-    def flatness(self) -> float:
-        """Median distance of a frame's points to their own plane, metres; 0 for single rays."""
-        known = self.scene.flatness[self.scene.known]
-        return float(np.median(known)) if len(known) else 0.0
 
     @cached_property
     def as_given(self) -> Alignment | None:

@@ -178,12 +178,9 @@ def _of_planes(look: Look) -> Iterator[tuple[str, str, Scene | Alignment | None]
     free = align_with_free_walls(scene)
     yield WRONG_PLANES, "measure them again, or train with `planes: unknown`", free
     if not scene.moves:
-        yield (
-            "the planes are not in the camera's frame, which a recording without robot poses asks "
-            "for",
-            "write the planes in camera coordinates, or the robot's poses",
-            look.aligned(scene.changed(moves=True)),
-        )
+        cause = "the planes are not in the camera's frame, which a recording without robot asks for"
+        advice = "write the planes in camera coordinates, or the robot's poses"
+        yield cause, advice, look.aligned(scene.changed(moves=True))
 
 
 def _of_images(look: Look) -> Iterator[tuple[str, str, Scene]]:
@@ -206,8 +203,6 @@ def _of_images(look: Look) -> Iterator[tuple[str, str, Scene]]:
             yield cause, advice, look.with_images(depth, look.pixel)
     off = look.off_mask
     if off is not None and (np.isfinite(off).sum(axis=1) >= 12).mean() > 0.5:
-        yield (
-            "the mask is inverted: it is 0 on the target",
-            "write 1 where a pixel looks at the target",
-            look.with_images(off, look.off_pixel),
-        )
+        inverted = "the mask is inverted: it is 0 on the target"
+        advice = "write 1 where a pixel looks at the target"
+        yield inverted, advice, look.with_images(off, look.off_pixel)

@@ -99,6 +99,9 @@ class Mounting:
         )
         kept = _agreeing(columns, residual)
         self.frame, self.step, self._residual = chosen[kept], step[kept], residual[kept]
+        # The smaller part must have a sixth of the frames, and six: six unknowns, three from each.
+        # Smaller parts are single wrong poses.
+        self._fewest = max(6, len(self.frame) // 6)
         self._basis = np.linalg.qr(_stacked(columns[kept]))[0]
         self._left = self._beside(_stacked(self._residual))[:, 0]
 
@@ -141,14 +144,6 @@ class Mounting:
                 sure = share > least[1] and size > WORTH_A_WORD
                 parts = (self.frame[chosen], size, share) if sure else None
         return parts
-
-    @property
-    def _fewest(self) -> int:
-        """How many of the frames the smaller part must have: six, and a sixth of them.
-
-        Six unknowns, three from a frame; smaller parts are single wrong poses.
-        """
-        return max(6, len(self.frame) // 6)
 
     def moment(self) -> Parts | None:
         """Return the parts before and after one of some moments; None: the camera did not move."""

@@ -37,9 +37,8 @@ def write_page(found: Inspection, path: Path) -> None:
     """Write the page, whole or not at all.
 
     Raises:
-        CalibrationDataError: `path` does not end in .html, exists, or cannot be written.
+        CalibrationDataError: It cannot be written.
     """
-    refuse_page(path)
     drawn = all_figures(found)
     text = page_text("tofcorr.plausibility", "inspection.html.j2", drawn, {}, inspection=found)
     with staged_file(path, CalibrationDataError) as part:

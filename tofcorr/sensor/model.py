@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -15,8 +16,9 @@ from tofcorr.error_terms.condition_terms import Condition, with_means
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.noise import NoiseModel
+from tofcorr.files import staged_file
 from tofcorr.sensor.scene import Eye, Group, ImageEffects, SceneFrames, conditions_of
-from tofcorr.sensor.sensor_file import ErrorSection, SensorFile, read_sensor, write_sensor
+from tofcorr.sensor.sensor_file import ErrorSection, SensorFile, read_sensor, sensor_text
 
 # How often the measured distance is put into its own error. Each time the deviation is multiplied
 # by the slope of the error, 0.05 at most: after 3 times 6e-6 of the error is left. Derived.
@@ -37,6 +39,7 @@ class BaseError(nn.Module):
 
     Attributes:
         model: The terms; their coefficients are the parameters.
+        needs_amplitude: Whether a term reads the amplitude.
     """
 
     mean_conditions: Tensor
@@ -45,17 +48,13 @@ class BaseError(nn.Module):
         super().__init__()
         self.reads_measured = section.reads == "measured_distance"
         self.model = error_model_of(section, domain)
+        self.needs_amplitude = self.model.needs_amplitude()
         self.domain = domain
         self.limits = self.model.limits(domain)
         if not self.reads_measured:
             self.limits = replace(self.limits, radial_distance=self._true_range(domain))
         means = torch.tensor(domain.mean_conditions(), dtype=torch.float64)
         self.register_buffer("mean_conditions", means)
-
-    @property
-    def needs_amplitude(self) -> bool:
-        """Whether a term reads the amplitude."""
-        return self.model.needs_amplitude()
 
     @torch.no_grad()
     def _true_range(self, domain: Domain) -> Interval:
@@ -128,6 +127,7 @@ class SensorNoise(nn.Module):
 
     Attributes:
         deviations: f, s and r, shape (3,), metres; any sign.
+        needs_amplitude: Whether the noise depends on the amplitude.
     """
 
     fixed: Tensor
@@ -135,7 +135,7 @@ class SensorNoise(nn.Module):
 
     def __init__(self, section: NoiseModel, size: tuple[int, int]) -> None:
         super().__init__()
-        self.section = section
+        self.section, self.needs_amplitude = section, section.needs_amplitude
         self.deviations = nn.Parameter(torch.tensor(section.deviations, dtype=torch.float64))
         width = section.correlation_px
         # A Gaussian filter that keeps the variance of white noise; 0.006 % of it lies beyond 4.
@@ -145,11 +145,6 @@ class SensorNoise(nn.Module):
         self.register_buffer("kernel", weights / weights.norm())
         camera = torch.Generator().manual_seed(section.fixed_seed)
         self.register_buffer("fixed", self._drawn(torch.zeros(size, dtype=torch.float64), camera))
-
-    @property
-    def needs_amplitude(self) -> bool:
-        """Whether the noise depends on the amplitude."""
-        return self.section.needs_amplitude
 
     def sigma(self, distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the standard deviation along the ray, as `NoiseModel.sigma` does."""
@@ -250,7 +245,8 @@ class SensorModel(DescribedModule):
         self._ranges = self.base.domain.conditions
         self._said: set[str] = set()
         self.to(dtype)
-        self._say(self.effects.left_out)
+        self.left_out = tuple(self.effects.left_out)
+        self._say(self.left_out)
 
     @classmethod
     def load(cls, sensor: str | Path, dtype: torch.dtype = torch.float32) -> Self:
@@ -269,7 +265,8 @@ class SensorModel(DescribedModule):
         Raises:
             ExportError: The file cannot be written.
         """
-        write_sensor(self.to_sensor_file(), file)
+        with staged_file(file) as part:
+            part.write_text(sensor_text(self.to_sensor_file()), encoding="utf-8")
 
     def to_sensor_file(self) -> SensorFile:
         """Return the content of `sensor.yaml` with the parameters of now."""
@@ -290,11 +287,6 @@ class SensorModel(DescribedModule):
             for name in ("floor_m", "shot_m", "read_m"):
                 del values["noise"][name]
         return {"dtype": str(self.eye.rays.dtype), **values}
-
-    @property
-    def left_out(self) -> tuple[str, ...]:
-        """Effects that no depth image can show, and why, a sentence each."""
-        return tuple(self.effects.left_out)
 
     def forward(
         self,
@@ -394,7 +386,7 @@ class SensorModel(DescribedModule):
         at = replace(at, distance=at.distance + error) if one_by_one else frames
         return frames.distance + lens + error + self.effects.shift(Group.SIGNAL, at)
 
-    def _say(self, sentences: list[str]) -> None:
+    def _say(self, sentences: Sequence[str]) -> None:
         """Warn of effects that are left out, once of each."""
         new = [sentence for sentence in sentences if sentence not in self._said]
         self._said.update(new)

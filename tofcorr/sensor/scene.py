@@ -279,6 +279,8 @@ class ImageEffects(nn.Module):
 
     Attributes:
         left_out: Effects that no depth image can show, and why, a sentence each.
+        needs_amplitude: Whether an effect reads the amplitude.
+        reads_light: Whether an effect reads the light of clipped pixels.
 
     Raises:
         ConfigError: An effect is unknown, or a parameter is wrong.
@@ -306,16 +308,8 @@ class ImageEffects(nn.Module):
             else:
                 self._effects.append(effect)
                 self.coefficients.append(nn.Parameter(effect.coefficients.clone()))
-
-    @property
-    def needs_amplitude(self) -> bool:
-        """Whether an effect reads the amplitude."""
-        return any(AMPLITUDE in effect.needs for effect in self._effects)
-
-    @property
-    def reads_light(self) -> bool:
-        """Whether an effect reads the light of clipped pixels."""
-        return any(effect.reads_light for effect in self._effects)
+        self.needs_amplitude = any(AMPLITUDE in effect.needs for effect in self._effects)
+        self.reads_light = any(effect.reads_light for effect in self._effects)
 
     def usable(
         self, known: Mapping[str, Tensor]

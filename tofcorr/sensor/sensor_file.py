@@ -12,7 +12,6 @@ from tofcorr.error_terms.condition_terms import NAME_OF
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation.noise import NoiseModel
 from tofcorr.estimation.robust import LEVEL
-from tofcorr.files import staged_file
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.geometry.se3 import RigidTransform
 from tofcorr.observables.measure import DropoutModel
@@ -202,16 +201,6 @@ def sensor_text(sensor: SensorFile) -> str:
     """Return the text of the file, with a heading for people."""
     title = " ".join(sensor.title.split())
     return _HEADING.format(title=title) + dump_yaml(sensor.to_mapping(), last="depth_kind")
-
-
-def write_sensor(sensor: SensorFile, file: Path | str) -> None:
-    """Write the file, whole or not at all; an older one in its place is replaced.
-
-    Raises:
-        ExportError: It cannot be written.
-    """
-    with staged_file(file) as part:
-        part.write_text(sensor_text(sensor), encoding="utf-8")
 
 
 def dropout_section(model: DropoutModel, observed: Observed) -> DropoutModel:

@@ -65,9 +65,7 @@ class SensorPipeline:
         effects: Sequence[Effect] = (),
     ) -> None:
         self._camera, self._rays = camera, ray_directions(camera)
-        self._sensor = sensor
-        self._scene = scene
-        self._effects = tuple(effects)
+        self._sensor, self._scene, self._effects = sensor, scene, tuple(effects)
         self._harmonics = harmonic_tensors(sensor.harmonics)
         self._delay_of = delays(sensor.delays, self._rays, sensor.readout.electrons_per_count)
 

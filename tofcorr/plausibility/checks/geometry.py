@@ -255,11 +255,10 @@ def drift(look: Look) -> Iterator[Finding]:
     if found is not None:
         # Frames miss their planes by a quarter of it in the middle of each half.
         size = f"{1e3 * found.size:.0f} mm (standard error {1e3 * found.size_error:.0f} mm)"
-        yield Finding(
-            "impossible" if found.size > 4 * CAMERA else "doubtful",
-            f"From first to last frame the points move {size} off the recorded planes: the poses "
-            "drift, or robot, target or camera was moved; record again, or in parts.",
-        )
+        severity = "impossible" if found.size > 4 * CAMERA else "doubtful"
+        said = f"From first to last frame the points move {size} off the recorded planes"
+        cause = "the poses drift, or robot, target or camera was moved; record again, or in parts"
+        yield Finding(severity, f"{said}: {cause}.")
 
 
 def agreement(look: Look) -> Iterator[Finding]:
@@ -336,12 +335,10 @@ def _unexplained(look: Look, excess: float) -> Finding:
         hints += "; state `modulation_frequency_hz` if you know it"
     far = int((look.rms > HOPELESS).sum())
     others = f", {far} of {len(look.rms)} frames more than {_mm(HOPELESS)}" if far else ""
-    return Finding(
-        "impossible" if excess > HOPELESS else "doubtful",
-        f"{_misfit(look)}{others}, and no usual mistake explains it: poses, planes or depth are of "
-        f"something else, or the poses scatter{hints}.",
-        spoils=excess > SPOILS,
-    )
+    severity = "impossible" if excess > HOPELESS else "doubtful"
+    said = f"{_misfit(look)}{others}, and no usual mistake explains it"
+    cause = f"poses, planes or depth are of something else, or the poses scatter{hints}"
+    return Finding(severity, f"{said}: {cause}.", spoils=excess > SPOILS)
 
 
 def _misfit(look: Look) -> str:
@@ -349,10 +346,9 @@ def _misfit(look: Look) -> str:
     turned = f" and {angle:.0f} degrees" if angle >= 2 else ""
     far = abs(given.constant) > LARGE_CONSTANT
     constant = f", with all distances {1e3 * given.constant:+.0f} mm off" if far else ""
-    return (
-        f"After the best alignment of the camera the points lie {_mm(given.misfit)}{turned} off "
-        f"the {'walls' if look.planes == 'unknown' else 'recorded planes'}{constant}"
-    )
+    lie = f"the points lie {_mm(given.misfit)}{turned} off"
+    planes = "walls" if look.planes == "unknown" else "recorded planes"
+    return f"After the best alignment of the camera {lie} the {planes}{constant}"
 
 
 def _mm(metres: float) -> str:

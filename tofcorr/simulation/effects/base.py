@@ -200,9 +200,7 @@ def inputs_from_state(state: FrameState) -> EffectInputs:
     Amplitudes are known from stage light on.
     """
     count = state.radial_distance.numel()
-    counts = None
-    if state.amplitude.numel() == count:
-        counts = state.amplitude / state.electrons_per_count
+    counts = state.amplitude / state.electrons_per_count if state.amplitude.numel() else None
     return EffectInputs(
         camera=state.camera,
         modulation_frequency=state.modulation_frequency,

@@ -13,7 +13,13 @@ from torch import Tensor
 
 from tofcorr.errors import ConfigError
 from tofcorr.options import FiniteNumber, Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, EffectInputs, add_delay
+from tofcorr.simulation.effects.base import (
+    CatalogueEffect,
+    Coefficient,
+    EffectInputs,
+    add_delay,
+    inputs_from_state,
+)
 from tofcorr.simulation.hooks import FrameState
 
 # Smallest mean number of measurements per block. Set by hand: averages noise to a third.
@@ -96,8 +102,7 @@ class MapEffect(CatalogueEffect):
 
     def on_delay(self, state: FrameState) -> None:
         """Delay every pixel by its values."""
-        pixel = torch.arange(state.radial_distance.numel())
-        add_delay(state, self.coefficients[self.cells_of(pixel)].sum(-1))
+        add_delay(state, self.shift(inputs_from_state(state), self.coefficients))
 
 
 def drawn_values(count: int, rms: float, seed: int) -> Tensor:
