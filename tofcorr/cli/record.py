@@ -77,7 +77,7 @@ def _transform(values: tuple[float, ...] | None, key: str) -> "np.ndarray | None
         return None
     import numpy as np
 
-    from tofcorr.importing.pose_files import rigid_transforms
+    from tofcorr.data.table import rigid_transforms
 
     row = np.array([values])
     return rigid_transforms(row[:, :3], row[:, 3:], lambda _: f"--{key.replace('_', '-')}")[0]

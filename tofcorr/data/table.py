@@ -3,7 +3,7 @@
 import csv
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
@@ -112,13 +112,13 @@ def read_table(path: Path) -> FrameTable:
         np.stack([number[name] for name in names], axis=1)
         for names in (TRANSLATION, QUATERNION, NORMAL)
     )
-    _check_unit_length(quaternion, "quaternion qx,qy,qz,qw", path)
-    length = _check_unit_length(normal, "normal nx,ny,nz", path)
-    # kornia normalises them, and has the scalar first.
-    rotation = quaternion_to_rotation_matrix(torch.from_numpy(quaternion[:, [3, 0, 1, 2]]))
+    length = np.linalg.norm(normal, axis=1)
+    for frame in np.flatnonzero(np.abs(length - 1) > UNIT_LENGTH_TOLERANCE)[:1]:
+        said = f"the normal nx,ny,nz has length {length[frame]:.6g}, not 1 to 0.001"
+        raise CalibrationDataError(f"{path}: frame {frame}: {said}.")
     return FrameTable(
         timestamp=number[TIMESTAMP],
-        world_from_tool=se3.assemble(rotation, torch.from_numpy(translation)).numpy(),
+        world_from_tool=rigid_transforms(translation, quaternion, lambda k: f"{path}: frame {k}"),
         normal_world=normal / length[:, None],
         offset=number["d"] / length,
         target=np.array(cells["target"]),
@@ -129,6 +129,38 @@ def read_table(path: Path) -> FrameTable:
             if each.column in cells
         },
     )
+
+
+def rigid_transforms(
+    translation: np.ndarray, rotation: np.ndarray, where: Callable[[int], str]
+) -> np.ndarray:
+    """Return rigid transforms, shape (P, 4, 4).
+
+    Args:
+        translation: Shape (P, 3), metres.
+        rotation: Quaternions, scalar last, shape (P, 4); or axes times angles, radians, (P, 3).
+        where: What to call a pose in a message, by its number.
+
+    Raises:
+        CalibrationDataError: A quaternion is not of unit length to 0.001, which is what three
+            decimals do to it, or an angle is larger than a whole turn.
+    """
+    length, of_quaternions = np.linalg.norm(rotation, axis=1), rotation.shape[1] == 4
+    # Robots report half a turn at most, some up to a whole one.
+    off = np.abs(length - 1) if of_quaternions else length - 2 * np.pi
+    for place in np.flatnonzero(~(off <= UNIT_LENGTH_TOLERANCE)).tolist():
+        said = (
+            "the quaternion x y z w has length {:.4g}; expected 1."
+            if of_quaternions
+            else "rx, ry, rz are read as an axis times radians, here {:.4g}; are they Euler angles?"
+        )
+        raise CalibrationDataError(f"{where(place)}: {said.format(length[place])}")
+    given, place = torch.from_numpy(rotation), torch.from_numpy(translation)
+    if not of_quaternions:
+        turns = se3.exp(torch.cat([torch.zeros_like(place), given], dim=1))
+        return se3.assemble(turns[:, :3, :3], place).numpy()
+    # kornia normalises them, and has the scalar first.
+    return se3.assemble(quaternion_to_rotation_matrix(given[:, [3, 0, 1, 2]]), place).numpy()
 
 
 def table_text(rows: Iterable[FrameRow]) -> str:
@@ -212,16 +244,6 @@ def _number(cell: str) -> float:
         return float(cell.replace("_", "?") or "nan")
     except ValueError:
         return np.inf
-
-
-def _check_unit_length(vectors: np.ndarray, name: str, path: Path) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        length = np.sqrt((vectors**2).sum(axis=1))
-    for frame in np.flatnonzero(~(np.abs(length - 1) <= UNIT_LENGTH_TOLERANCE))[:1]:
-        raise CalibrationDataError(
-            f"{path}: frame {frame}: the {name} has length {length[frame]:.6g}, not 1 to 0.001."
-        )
-    return length
 
 
 def _wrong(path: Path, frame: int, column: str, expected: str, got: str) -> CalibrationDataError:

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from tofcorr.data.table import rigid_transforms
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.numbers import (
     any_numbers,
@@ -74,37 +74,6 @@ def _guessed_format(path: Path) -> str:
         said = f"line {number} has {len(fields)} numbers"
         raise CalibrationDataError(f"{path}: {said}; expected 8 (TUM), 12, 16 or a header.")
     return "tum" if len(fields) == 8 else "matrices"
-
-
-def rigid_transforms(
-    translation: np.ndarray, rotation: np.ndarray, where: Callable[[int], str]
-) -> np.ndarray:
-    """Return rigid transforms, shape (P, 4, 4).
-
-    Args:
-        translation: Shape (P, 3), metres.
-        rotation: Quaternions, scalar last, shape (P, 4); or axes times angles, radians, (P, 3).
-        where: What to call a pose in a message, by its number.
-
-    Raises:
-        CalibrationDataError: A quaternion is not of unit length to 0.001, which is what three
-            decimals do to it, or an angle is larger than a whole turn.
-    """
-    length, of_quaternions = np.linalg.norm(rotation, axis=1), rotation.shape[1] == 4
-    # Robots report half a turn at most, some up to a whole one.
-    off = np.abs(length - 1) if of_quaternions else length - 2 * np.pi
-    for place in np.flatnonzero(~(off <= 1 / 1000)).tolist():
-        said = (
-            "the quaternion x y z w has length {:.4g}; expected 1."
-            if of_quaternions
-            else "rx, ry, rz are read as an axis times radians, here {:.4g}; are they Euler angles?"
-        )
-        raise CalibrationDataError(f"{where(place)}: {said.format(length[place])}")
-    transforms = np.tile(np.eye(4), (len(rotation), 1, 1))
-    if len(rotation):
-        turn = Rotation.from_quat if of_quaternions else Rotation.from_rotvec
-        transforms[:, :3, :3], transforms[:, :3, 3] = turn(rotation).as_matrix(), translation
-    return transforms
 
 
 def _read_tum(path: Path) -> PoseTrack:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from tofcorr.data.table import rigid_transforms
 from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
 from tofcorr.files import open_regular
 from tofcorr.geometry import se3
@@ -22,7 +23,6 @@ from tofcorr.importing.intrinsics import (
     intrinsics_from_mapping,
     read_named_intrinsics,
 )
-from tofcorr.importing.pose_files import rigid_transforms
 from tofcorr.importing.pose_track import PoseTrack, nearest
 from tofcorr.importing.robot_images import RobotImages
 from tofcorr.importing.run import Refused, RefusedViewError
