@@ -264,16 +264,12 @@ class PosedImport:
             if np.ptp(undo(chosen.world_from_tool)[:, :3, 3], axis=0).max() >= CAMERA:
                 yield f"{cause}: {advice}.", self._misfit(chosen, undo)
         cause, advice, mirrored = IN_IMAGES["mirrored"]
-        left = self._misfit(chosen, depth=lambda image: mirrored(image.depth))
-        yield f"{cause}: {advice}.", left
-        first = self._images.read(int(chosen.images[0]))
+        yield f"{cause}: {advice}.", self._misfit(chosen, depth=mirrored)
+        first = self._images.read(int(chosen.images[0])).depth
         for factor in (1 / 1000, 1 / 10, 10, 1000):
             said = f"all distances are multiplied by {factor:g}: is --depth-unit-mm right?"
-            if factor * np.ma.median(np.ma.masked_invalid(first.depth)) >= FAR_OFF:
-                yield said, self._misfit(chosen, depth=lambda image, k=factor: k * image.depth)
-        if first.amplitude is not None:
-            said = "depth and amplitude are exchanged: swap --depth and --amplitude."
-            yield said, self._misfit(chosen, depth=_amplitudes)
+            if factor * np.ma.median(np.ma.masked_invalid(first)) >= FAR_OFF:
+                yield said, self._misfit(chosen, depth=lambda metres, k=factor: k * metres)
         for late in far_lags(self._track, *self._changes) if self._changes else ():
             said = f"images are {abs(late):.1f} s {'late' if late > 0 else 'early'}"
             with suppress(CalibrationDataError):
@@ -284,7 +280,7 @@ class PosedImport:
         self,
         used: Chosen,
         poses: Callable[[np.ndarray], np.ndarray] = np.asarray,
-        depth: Callable[[DepthImage], np.ndarray] | None = None,
+        depth: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> float:
         """Return the misfit of 30 images with a mistake undone: enough for every wall of a room."""
         few = np.unique(np.linspace(0, len(used.images) - 1, 30).round().astype(int))
@@ -292,8 +288,8 @@ class PosedImport:
         def planes(k: int) -> list[ImagePlane]:
             if depth is None:
                 return self._images.planes(k)
-            undone = depth(self._images.read(k)).astype(np.float32)
-            return self._images.planes_in(DepthImage(np.ascontiguousarray(undone)))
+            undone = np.ascontiguousarray(depth(self._images.read(k).depth))
+            return self._images.planes_in(DepthImage(undone))
 
         images, undone_poses = used.images[few], poses(used.world_from_tool)[few]
         seen = [planes(k) for k in images.tolist()]
@@ -386,13 +382,6 @@ class PosedImport:
                     pose_id=f"stop {stop}" if stop >= 0 else f"image {number}",
                 )
                 yield row, image.depth, image.amplitude, mask
-
-
-def _amplitudes(image: DepthImage) -> np.ndarray:
-    """Return the amplitudes of an image as if they were its depth, metres; whole numbers are mm."""
-    assert image.amplitude is not None
-    counts = np.where(image.amplitude > 0, image.amplitude, np.nan)
-    return counts / (1000 if (image.amplitude % 1 == 0).all() else 1)
 
 
 def _lag_warnings(lag: Lag) -> list[str]:

@@ -88,11 +88,6 @@ def every_second(recorded: Recorded) -> Recorded:
             lambda images: replace(every_second(images), depth_mm=images.depth_mm[::2] // 10),
             "all distances are multiplied by 10: is --depth-unit-mm right",
         ),
-        pytest.param(
-            lambda images: replace(images, depth_mm=images.amplitude, amplitude=images.depth_mm),
-            "swap --depth and --amplitude",
-            marks=SLOW,
-        ),
     ],
 )
 def test_what_is_wrong_is_refused_with_both_numbers(
