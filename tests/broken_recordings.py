@@ -108,7 +108,7 @@ MISSING: dict[str, Damage] = {
 HEADERS: dict[str, Damage] = {
     r"'saturation_amplitde' is not a known key\. Did you mean 'saturation_am": header(*MISSPELT),
     r"recording\.yaml: 'format': .*got 'rosbag'": header(("format", "rosbag")),
-    r"'format' is missing; is this a recording": header(("format", GONE)),
+    r"'format' is missing\.": header(("format", GONE)),
     r"'version': .*got 2": header(("version", 2)),
     r"'version': .*got True": header(("version", True)),
     r"'camera\.width' is missing": header(("camera.width", GONE)),

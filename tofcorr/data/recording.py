@@ -19,12 +19,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
 from tofcorr.geometry.rays import plane_in_frame, radial_distance_from_z_depth, ray_directions
 from tofcorr.geometry.se3 import RigidTransform
-from tofcorr.options import (
-    Options,
-    PositiveNumber,
-    not_a_truth_value,
-    read_mapping,
-)
+from tofcorr.options import Options, PositiveNumber, not_a_truth_value, read_mapping
 
 HEADER_FILE = "recording.yaml"
 PlaneOrigin = Literal["recorded", "estimated"]
@@ -36,8 +31,8 @@ class Header(Options):
 
     model_config = ConfigDict(extra="ignore")
 
-    format: Literal["tofcorr-recording"] = "tofcorr-recording"
-    version: Annotated[Literal[1], BeforeValidator(not_a_truth_value)] = 1
+    format: Literal["tofcorr-recording"]
+    version: Annotated[Literal[1], BeforeValidator(not_a_truth_value)]
     camera: CameraSection
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None
@@ -55,10 +50,6 @@ def read_header(path: Path) -> Header:
         CalibrationDataError: The file is missing or breaks the format; the message names the key.
     """
     values = read_mapping(path, CalibrationDataError)
-    # Their defaults are for the writer; a file must contain both.
-    for key in ("format", "version"):
-        if key not in values:
-            raise CalibrationDataError(f"{path}: '{key}' is missing; is this a recording?")
     _refuse_misspelt(values, path)
     return Header.from_mapping(values, str(path), CalibrationDataError)
 

@@ -12,19 +12,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.arrays import IMAGE_ARRAYS, ArrayStream, frame_chunks, read_frames
-from tofcorr.data.recording import (
-    HEADER_FILE,
-    DepthKind,
-    Header,
-    PlaneOrigin,
-    Recording,
-)
-from tofcorr.data.table import (
-    TABLE_FILE,
-    FrameRow,
-    FrameTable,
-    table_text,
-)
+from tofcorr.data.recording import HEADER_FILE, DepthKind, Header, PlaneOrigin, Recording
+from tofcorr.data.table import TABLE_FILE, FrameRow, FrameTable, table_text
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import staged_folder, writing_to
 from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
@@ -77,6 +66,8 @@ class RecordingWriter:
     ) -> None:
         mount = np.eye(4) if tool_from_camera is None else np.asarray(tool_from_camera)
         values = {
+            "format": "tofcorr-recording",
+            "version": 1,
             "camera": camera.section(),
             "depth_kind": depth_kind,
             "modulation_frequency_hz": modulation_frequency,
@@ -282,11 +273,7 @@ _AXES = "camera frame, metres: x right, y down, z forward (optical frame of REP 
 
 
 def write_corrected(
-    corrector: Corrector,
-    recording: Recording,
-    path: Path | str,
-    *,
-    chunk_pixels: int = 2_000_000,
+    corrector: Corrector, recording: Recording, path: Path | str, *, chunk_pixels: int = 2_000_000
 ) -> float:
     """Write a copy of `recording` with corrected depth, in memory bounded by `chunk_pixels`.
 
@@ -313,10 +300,7 @@ def write_corrected(
         )
     num_returns = num_valid = 0
     by = f"tofcorr {__version__}"
-    with (
-        RecordingWriter.like(path, recording, corrected_by=by) as writer,
-        torch.inference_mode(),
-    ):
+    with RecordingWriter.like(path, recording, corrected_by=by) as writer, torch.inference_mode():
         for depth, amplitude, on_target, corrected, kept in _frames(
             corrector, recording, chunk_pixels
         ):

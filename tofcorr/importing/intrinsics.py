@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from tofcorr.data.recording import Header
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.camera import CameraIntrinsics, Matrix3
+from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, Matrix3
 from tofcorr.importing.numbers import any_numbers, finite_numbers
 from tofcorr.options import is_shipped_name, one_line, parse_yaml, read_text, shipped_file
 
@@ -57,8 +56,7 @@ class GivenIntrinsics:
         camera = CameraIntrinsics(
             width=width, height=height, matrix=self.matrix, distortion=self.distortion
         )
-        described = {"camera": camera.section(), "depth_kind": "z"}
-        Header.from_mapping(described, self.source, CalibrationDataError)
+        CameraSection.from_mapping(camera.section(), self.source, CalibrationDataError)
         if self.matrix[0][1] != 0:
             raise CalibrationDataError(f"{self.source}: K has a skew of {self.matrix[0][1]:g}.")
         return camera

@@ -12,13 +12,7 @@ import numpy as np
 
 from tofcorr.data.table import rigid_transforms
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.numbers import (
-    any_numbers,
-    finite_numbers,
-    lines_of,
-    load_numbers,
-    read_text,
-)
+from tofcorr.importing.numbers import any_numbers, finite_numbers, lines_of, load_numbers, read_text
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.options import one_line, parse_yaml
 

@@ -23,14 +23,7 @@ from tofcorr.geometry import se3
 from tofcorr.importing.images import DepthImage
 from tofcorr.importing.pose_track import nearest
 from tofcorr.importing.robot_images import ImagesOfPlanes, PosedOptions, RobotImages
-from tofcorr.importing.run import (
-    Frame,
-    PreparedImport,
-    Refused,
-    Sieve,
-    camera_mapping,
-    run_import,
-)
+from tofcorr.importing.run import Frame, PreparedImport, Refused, Sieve, camera_mapping, run_import
 from tofcorr.importing.timing import Lag, estimate_lag, far_lags, find_stops, pair, refine_lag
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
 from tofcorr.importing.walls.hand_eye import distances, exact

@@ -102,10 +102,7 @@ class PreparedImport:
 
 
 def run_import(
-    source: str,
-    options: Options,
-    prepare: Callable[[Sieve], PreparedImport],
-    out: Path,
+    source: str, options: Options, prepare: Callable[[Sieve], PreparedImport], out: Path
 ) -> dict[str, Any]:
     """Turn the images of a source into a recording, and return the content of its `import.json`.
 

@@ -152,10 +152,7 @@ class BoardView(NamedTuple):
 
 
 def import_checkerboard(
-    folder: Path,
-    out: Path,
-    options: CheckerboardOptions,
-    intrinsics: GivenIntrinsics | None,
+    folder: Path, out: Path, options: CheckerboardOptions, intrinsics: GivenIntrinsics | None
 ) -> dict[str, Any]:
     """Turn images of a board into a recording, with `import.json` beside the arrays.
 

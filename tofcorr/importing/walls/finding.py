@@ -9,12 +9,7 @@ import numpy as np
 import torch
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.walls.hand_eye import (
-    TYPICAL,
-    Joint,
-    match,
-    match_single_ray,
-)
+from tofcorr.importing.walls.hand_eye import TYPICAL, Joint, match, match_single_ray
 from tofcorr.importing.walls.image_planes import ImagePlane, SeenPlanes, WallOptions, seen_planes
 
 
