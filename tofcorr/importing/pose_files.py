@@ -154,8 +154,7 @@ def _read_table(path: Path) -> PoseTrack:
     head = _header(text)
     if head is None:
         raise CalibrationDataError(f"{path}: expected a header row and poses, found none.")
-    delimiter, columns, line = head
-    lines = text[text.index(line) + len(line) :].splitlines()
+    delimiter, columns, lines = head
     cut = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
     rows = [row for row in cut if row and not row[0].startswith("#")]
     short = next((k for k, row in enumerate(rows, start=1) if len(row) < len(columns)), None)
@@ -232,25 +231,26 @@ def _plain_name(text: str) -> str:
     return ((letter[1] or "") + letter[2] if letter else name) + ending
 
 
-def _header(text: str) -> tuple[str, list[str], str] | None:
+def _header(text: str) -> tuple[str, list[str], list[str]] | None:
     """Return the header row of a text; None if its first line is a row of numbers.
 
     Comments above it are passed over. A line that begins like a comment, with `#` or `%`, is the
     header if it names coordinates and the line below has as many cells.
 
     Returns:
-        What separates cells, the plain names of the columns, and the row as it stands in the text.
+        What separates cells, the plain names of the columns, and the lines below.
     """
     lines = [line for line in text.splitlines() if line.strip()]
-    for line, below in zip(lines, [*lines[1:], ""], strict=False):
+    for number, line in enumerate(lines, start=1):
+        rows = lines[number:]
         delimiter = max((",", ";", "\t"), key=line.count)
         columns = [_plain_name(cell) for cell in line.split(delimiter)]
         if line.lstrip()[0] not in "#%":
             words = line.replace(delimiter, " ").split()
-            return None if any_numbers(words).size == len(words) else (delimiter, columns, line)
-        same = 1 < len(columns) == below.count(delimiter) + 1
+            return None if any_numbers(words).size == len(words) else (delimiter, columns, rows)
+        same = rows and 1 < len(columns) == rows[0].count(delimiter) + 1
         if same and any(re.fullmatch(r"[tp]?x(_m|_mm)?", name) for name in columns):
-            return delimiter, columns, line
+            return delimiter, columns, rows
     return None
 
 

@@ -145,11 +145,6 @@ class BoardView(NamedTuple):
     kind_moments: np.ndarray
     reported: dict[str, Any]
 
-    @property
-    def name(self) -> str:
-        """What the view is called."""
-        return self.reported["view"]
-
 
 def import_checkerboard(
     folder: Path, out: Path, options: CheckerboardOptions, intrinsics: GivenIntrinsics | None
@@ -201,7 +196,7 @@ class BoardImport:
         views = sieve.apply(self._place, list(self._corners), str, "placing boards")
         ratio = typical_ratio(views)
         refuse = partial(refuse_mixed_up, ratio=ratio)
-        views = sieve.apply(refuse, views, lambda view: view.name, "comparing boards")
+        views = sieve.apply(refuse, views, lambda view: view.reported["view"], "comparing boards")
         warnings += agreement_warnings(views, ratio, options.depth_kind)
         return PreparedImport(
             views=[view.reported for view in views],
@@ -310,7 +305,7 @@ class BoardImport:
                 offset=offset,
                 target=self._board.kind,
             )
-            depth, amplitude = self._read(view.name)
+            depth, amplitude = self._read(view.reported["view"])
             yield row, depth, amplitude, self._area(view.pose)
 
 
