@@ -271,12 +271,10 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
         "corner": [(-x * outward, -y * outward)],
         "bend": [(-square, zero), (zero, -square)],
     }
-    blocks = {
-        name: torch.stack(
-            [moved_rays(rays, normal, distance, move, declared) for move in own], dim=-1
-        ).numpy()
-        for name, own in moves.items()
-    }
+    blocks = {}
+    for name, own in moves.items():
+        moved = [moved_rays(rays, normal, distance, move, declared) for move in own]
+        blocks[name] = torch.stack(moved, dim=-1).numpy()
     found = {name: problem.added(block)[0] for name, block in blocks.items()}
     other = np.log(problem.rays[..., 2]) * (-1 if declared == "radial" else 1)
     kind = (problem.cosine * problem.distance * other)[..., None]

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -94,10 +94,7 @@ def error_model_of(section: ErrorSection, domain: Domain) -> ErrorModel:
         ConfigError: A coefficient is missing.
     """
     model = ErrorModel(ErrorModelOptions(terms=section.terms), domain)
-    groups = {
-        group: {symbol: math.nan if value is None else value for symbol, value in named.items()}
-        for group, named in section.coefficients.items()
-    }
+    groups = _each(section.coefficients, lambda value: math.nan if value is None else value)
     try:
         model.set_paper_coefficients(groups)
     except KeyError as error:
@@ -108,11 +105,13 @@ def error_model_of(section: ErrorSection, domain: Domain) -> ErrorModel:
 
 def section_of(model: ErrorModel, section: ErrorSection) -> ErrorSection:
     """Return a section with the coefficients that a model has now."""
-    groups = {
-        group: {symbol: None if math.isnan(v) else v for symbol, v in named.items()}
-        for group, named in model.paper_coefficients().items()
-    }
+    groups = _each(model.paper_coefficients(), lambda value: None if math.isnan(value) else value)
     return section.model_copy(update={"coefficients": groups})
+
+
+def _each(groups: Mapping[str, Mapping[str, Any]], change: Callable[[Any], Any]) -> dict[str, Any]:
+    """Return coefficients by group and symbol, each of them changed."""
+    return {g: {name: change(v) for name, v in named.items()} for g, named in groups.items()}
 
 
 class SensorNoise(nn.Module):

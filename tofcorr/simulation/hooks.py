@@ -18,7 +18,7 @@ differentiable in every field, if effects assign new tensors and never write int
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
 import torch
@@ -57,8 +57,8 @@ class FrameFacts(Conditions[Tensor]):
 
     def at(self, frames: slice | Sequence[int]) -> Self:
         """Return the facts of some of the frames."""
-        known = {each.name: getattr(self, each.name) for each in fields(self)}
-        chosen: dict[str, Any] = {k: None if v is None else v[frames] for k, v in known.items()}
+        known = vars(self).items()
+        chosen: dict[str, Any] = {k: None if v is None else v[frames] for k, v in known}
         return type(self)(**chosen)
 
 

@@ -218,11 +218,8 @@ def _draw_pose(options: RobotOptions, generator: torch.Generator) -> Tensor:
     tilt_x, tilt_y, roll, aim_x, aim_y = (2 * value - 1 for value in centred)
     low, high = options.distance_m
     tilt = math.radians(options.tilt_deg)
-    turns = (
-        tilt * tilt_x if options.tilt_axes in ("both", "x") else 0.0,
-        tilt * tilt_y if options.tilt_axes in ("both", "y") else 0.0,
-        math.radians(options.roll_deg) * roll,
-    )
+    about_x, about_y = (options.tilt_axes in ("both", axis) for axis in "xy")
+    turns = about_x * tilt * tilt_x, about_y * tilt * tilt_y, math.radians(options.roll_deg) * roll
     # The camera faces the wall: its z is against the wall's normal, its y points down.
     facing = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     rotation = torch.from_numpy((facing * Rotation.from_euler("XYZ", turns)).as_matrix())

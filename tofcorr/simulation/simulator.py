@@ -235,9 +235,8 @@ def append_frame(writer: RecordingWriter, state: FrameState, options: SimulatorO
     recorded, facts, depth = options.conditions.recorded, state.facts, state.measured_distance
     if options.depth_kind == "z":
         depth = z_depth_from_radial_distance(depth, ray_directions(state.camera))
-    known: dict[str, Any] = {
-        name: state.recorded(name) for name in CONDITIONS if name in (*recorded, "timestamp")
-    }
+    names = [name for name in CONDITIONS if name in (*recorded, "timestamp")]
+    known: dict[str, Any] = {name: state.recorded(name) for name in names}
     row = FrameRow(
         **known,
         world_from_tool=facts.world_from_tool[-1].numpy(),

@@ -1,6 +1,7 @@
 """A target whose plane differs from the recorded one."""
 
 from dataclasses import replace
+from itertools import product
 from typing import Self
 
 import torch
@@ -79,12 +80,9 @@ class TargetRegistrationEffect(GeometryEffect, shape=TargetRegistrationShape):
         """Return the errors of offset and two angles for each plane, then how they change."""
         planes = [f"_{number}" for number in range(len(shape.planes))] or [""]
         moves = [f"_{move}" for move in _MOVES] if shape.duration_s > 0 else []
-        return tuple(
-            Coefficient(f"{quantity}{suffix}", unit, sd)
-            for suffixes, sd in ((planes, _PLANE_SD), (moves, _MOVE_SD))
-            for suffix in suffixes
-            for quantity, unit in _OF_PLANE
-        )
+        sizes = dict.fromkeys(planes, _PLANE_SD) | dict.fromkeys(moves, _MOVE_SD)
+        every = product(sizes.items(), _OF_PLANE)
+        return tuple(Coefficient(f"{of}{suffix}", unit, sd) for (suffix, sd), (of, unit) in every)
 
     def in_other_recordings(self) -> Self:
         """Return the effect without the moves of the target, which belong to one recording."""
