@@ -130,9 +130,7 @@ class PoseSums:
         """Return the 95 % interval of the ratio of the means, None where one is not positive."""
         if not min(self.means()) > 0:
             return None
-        ends = self._interval(
-            lambda real, sim: np.log(real / sim) if min(real, sim) > 0 else np.nan
-        )
+        ends = self._interval(lambda a, b: np.log(a / b) if min(a, b) > 0 else np.nan)
         return ends and (float(np.exp(ends[0])), float(np.exp(ends[1])))
 
     def difference_interval(self) -> Interval | None:

@@ -291,9 +291,8 @@ def _frame_differences(residual: np.ndarray) -> np.ndarray:
     if len(residual) < 3:
         return np.zeros((2, 0))
     values, tile = residual[:, known], tiles_of(known)
-    return np.stack(
-        [np.bincount(tile, ((values[lag:] - values[:-lag]) ** 2).mean(0) / 2) for lag in (1, 2)]
-    )
+    squares = [((values[lag:] - values[:-lag]) ** 2).mean(0) / 2 for lag in (1, 2)]
+    return np.stack([np.bincount(tile, each) for each in squares])
 
 
 class _BetweenPoses:
@@ -424,6 +423,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
         raw = known_mean(np.where(on_target, strength, np.nan))
     squares = np.nansum((values - known_mean(values)) ** 2, axis=0)
     distance, cosine = images.distance[at], images.cosine[at]
+    second = [known_mean(images.second[axis] ** 2)[at] for axis in AXES]
     columns = {
         "pose": np.full(len(pixel), pose),
         "pixel": pixel,
@@ -434,9 +434,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
         "amplitude": amplitude,
         "raw_amplitude": raw,
         "of_repeats": quotient(squares, known.sum(0) - 1),
-        "of_neighbours": known_mean(
-            np.stack([known_mean(images.second[k] ** 2)[at] for k in AXES])
-        ),
+        "of_neighbours": known_mean(np.stack(second)),
         "of_nearest": _of_nearest(images.residual, images.amplitude)[at],
         "frames": on_target.sum(0),
         "missing": images.missing[chosen].sum(0),

@@ -388,12 +388,11 @@ def outlying_poses(look: Look) -> Iterator[Finding]:
     """Does the pose or the plane of single frames disagree with all others?"""
     if off := outlying_frames(look):
         amounts = ", ".join(f"{1e3 * value:.0f}" for value in list(off.values())[:5])
-        yield doubtful(
-            f"{in_words(tuple(off)).capitalize()} {'disagrees' if len(off) == 1 else 'disagree'} "
-            f"with all others by {amounts} mm (median {1e3 * float(np.median(look.rms)):.0f} mm): "
-            "wrong poses, planes or images; train, evaluate and select leave them out.",
-            tuple(off),
-        )
+        verb = "disagrees" if len(off) == 1 else "disagree"
+        said = f"{in_words(tuple(off)).capitalize()} {verb} with all others by {amounts} mm"
+        usual = f"median {1e3 * float(np.median(look.rms)):.0f} mm"
+        why = "wrong poses, planes or images; train, evaluate and select leave them out"
+        yield doubtful(f"{said} ({usual}): {why}.", tuple(off))
 
 
 def outlying_frames(look: Look) -> dict[int, float]:

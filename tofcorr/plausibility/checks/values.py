@@ -226,11 +226,10 @@ def lens(look: Look) -> Iterator[Finding]:
     share = float(missed[look.pixel][used].mean()) if used.any() else 0.0
     if share > 0:
         turned = "`distortion` in recording.yaml turns back before it reaches them"
-        yield doubtful(
-            f"About {100 * share:.2g} % of the pixels have no viewing ray: {turned}. Mask them "
-            "(mask.npy), or calibrate the lens with views of a board that reach the corners; the "
-            "order is k1 k2 p1 p2 k3 k4 k5 k6."
-        )
+        said = f"About {100 * share:.2g} % of the pixels have no viewing ray: {turned}"
+        views = "the lens with views of a board that reach the corners; the order is"
+        advice = f"Mask them (mask.npy), or calibrate {views} k1 k2 p1 p2 k3 k4 k5 k6"
+        yield doubtful(f"{said}. {advice}.")
 
 
 def exposure(look: Look) -> Iterator[Finding]:

@@ -259,11 +259,13 @@ def is_clock(times: Tensor) -> bool:
     return bool(times.max() > times.min()) and not torch.equal(times, counts)
 
 
-AMPLITUDE = Need("amplitude.npy", lambda inputs: inputs.amplitude is not None)
-FREQUENCY = Need(
-    "modulation_frequency_hz in recording.yaml",
-    lambda inputs: inputs.modulation_frequency is not None,
-)
+def _given(words: str, name: str) -> Need:
+    """Return the need of an attribute of `EffectInputs`."""
+    return Need(words, lambda inputs: getattr(inputs, name) is not None)
+
+
+AMPLITUDE = _given("amplitude.npy", "amplitude")
+FREQUENCY = _given("modulation_frequency_hz in recording.yaml", "modulation_frequency")
 INTEGRATION_TIME = _condition("integration_time")
 ROOM_TEMPERATURE = _condition("room_temperature")
 AMBIENT = _condition("ambient")
