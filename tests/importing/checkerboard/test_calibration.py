@@ -11,7 +11,7 @@ from importing.checkerboard.rendered_board import (
 )
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.checkerboard.pose import calibrate, calibration_warning
+from tofcorr.importing.checkerboard.boards import calibrate, calibration_warning
 
 SIZE = (CAMERA.width, CAMERA.height)
 

@@ -7,8 +7,7 @@ import pytest
 from importing.checkerboard.rendered_board import BOARD, CAMERA, placement, project
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.checkerboard.boards import Board
-from tofcorr.importing.checkerboard.pose import poses_of
+from tofcorr.importing.checkerboard.boards import Board, poses_of
 
 LARGER = replace(BOARD, square_length=1.01 * BOARD.square_length)
 (FX, _, CX), (_, FY, CY), LAST = CAMERA.matrix

@@ -14,7 +14,7 @@ from importing.checkerboard.rendered_board import (
     varied_placements,
 )
 
-from tofcorr.importing.checkerboard.pose import estimate_pose
+from tofcorr.importing.checkerboard.boards import estimate_pose
 from tofcorr.importing.run import RefusedViewError
 
 

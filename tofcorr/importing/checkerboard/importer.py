@@ -22,9 +22,10 @@ from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.importing.checkerboard.boards import BOARDS, FlatBoard
-from tofcorr.importing.checkerboard.pose import (
+from tofcorr.importing.checkerboard.boards import (
+    BOARDS,
     BoardPose,
+    FlatBoard,
     calibrate,
     calibration_warning,
     estimate_pose,
