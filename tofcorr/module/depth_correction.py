@@ -1,14 +1,15 @@
 """The correction as an `nn.Module`: error terms, residual network and hand-eye as parameters."""
 
 import copy
+import math
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 import torch
-from pydantic import AfterValidator, InstanceOf
+from pydantic import AfterValidator, InstanceOf, TypeAdapter
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
@@ -32,11 +33,12 @@ from tofcorr.errors import CalibrationDataError, ConfigError, ExportError, State
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
-from tofcorr.module.fitting import FitReport, fit_to
 from tofcorr.options import load_options, one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Frames, Recordings, covered_domain, opened
-from tofcorr.training.calibration import TrainingOptions
-from tofcorr.training.run import Config
+from tofcorr.training.calibration import Calibration, TrainingOptions
+from tofcorr.training.judgement import report_text
+from tofcorr.training.report import training_report
+from tofcorr.training.run import Config, calibration_state, inspected
 
 FORMAT = "tofcorr-module"
 
@@ -84,6 +86,80 @@ class _ModuleFile(CalibrationExtras):
     """What a file of `DepthCorrection.save` holds besides format and version."""
 
     state: dict[str, Annotated[InstanceOf[Tensor], AfterValidator(_numbers)]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorMM:
+    """Distances of points to their planes, millimetres; NaN without frames.
+
+    Attributes:
+        mean_abs: Mean absolute distance.
+        rms: Root mean square distance.
+    """
+
+    mean_abs: float
+    rms: float
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class FitReport:
+    """What `DepthCorrection.fit` found; printing it gives the summary.
+
+    Attributes:
+        model: The model's name.
+        before: Error of held-out frames as recorded, with the recorded hand-eye transform.
+        hand_eye_only: The same with the best hand-eye transform and no depth correction.
+        after: The same with hand-eye transform and depth correction.
+        held_out: Whether the errors are of held-out frames; if not, of the frames fitted.
+        tool_from_camera: The hand-eye transform, 4 rows of 4, metres.
+        translation_se_mm: Its standard errors along the tool's axes, millimetres.
+        rotation_se_deg: Its standard errors about the tool's axes, degrees.
+        stopped: Why the solver stopped; only "converged" is convergence.
+        iterations: How many iterations it took.
+        train_frames: Numbers of the frames fitted.
+        test_frames: Numbers of the frames held out.
+        warnings: What to know before the result is trusted, one sentence each.
+        text: All of it as lines, with a verdict.
+    """
+
+    model: str
+    before: ErrorMM
+    hand_eye_only: ErrorMM
+    after: ErrorMM
+    held_out: bool
+    tool_from_camera: tuple[tuple[float, ...], ...]
+    translation_se_mm: tuple[float, ...]
+    rotation_se_deg: tuple[float, ...]
+    stopped: str
+    iterations: int
+    train_frames: tuple[int, ...]
+    test_frames: tuple[int, ...]
+    warnings: tuple[str, ...]
+    text: str
+
+    def __repr__(self) -> str:
+        """Return what `tofcorr train` prints."""
+        return self.text
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> "FitReport":
+        """Return the summary of what a training says of itself, the content of report.json."""
+        half = "test" if told["frames"]["test"] else "train"
+        errors = {
+            stage: {name: math.nan if one is None else one for name, one in halves[half].items()}
+            for stage, halves in told["error_mm"].items()
+        }
+        values = {
+            **told,
+            **told["hand_eye"],
+            **errors,
+            "held_out": half == "test",
+            "train_frames": told["frames"]["train"],
+            "test_frames": told["frames"]["test"],
+            "warnings": [*filter(None, [told["headline"]]), *told["warnings"]],
+            "text": report_text(told),
+        }
+        return TypeAdapter(FitReport).validate_python(values)
 
 
 class DepthCorrection(FrameCorrection):
@@ -205,9 +281,11 @@ class DepthCorrection(FrameCorrection):
         """
         dataset = open_dataset(recordings, self.camera)
         options = resolve_options(TrainingOptions, self.options, changes)
-        state, report = fit_to(dataset, options, watcher, force=force)
-        self._take_over(state)
-        return report
+        data, options, inspection, left_out = inspected(dataset, options, force=force)
+        found = Calibration(data, options, watcher, left_out=left_out)
+        told = training_report(found, options.model_copy(update={"advice": 0}), inspection)
+        self._take_over(calibration_state(found.data, options, found.fit))
+        return FitReport.of(told)
 
     def point_to_plane_loss(self, batch: FrameBatch) -> Tensor:
         """Return the mean squared distance of corrected points to their planes, square metres.
