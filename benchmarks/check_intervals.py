@@ -98,9 +98,9 @@ def one_draw(number: int, seed: int, folder: Path) -> list[Values]:
         sums = OffsetSums(state, moved, wall, own)
         for count, _ in enumerate(sums.read(), 1):
             if count in FRAMES:
-                drift = sums.estimate()
-                ends = drift.value - drift.half_width, drift.value + drift.half_width
-                lines.append(_line(wall, count, DRIFT_MM, drift.value, ends))
+                value, half_width, _ = sums.estimate()
+                ends = value - half_width, value + half_width
+                lines.append(_line(wall, count, DRIFT_MM, value, ends))
     return [{"draw": number, "model": model, **line} for line in lines]
 
 

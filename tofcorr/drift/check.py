@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
-from tofcorr.drift.offset import Offset, OffsetSums, Wall
+from tofcorr.drift.offset import OffsetSums, Wall
 from tofcorr.drift.result import DriftResult, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import solvable
@@ -112,8 +112,8 @@ def check_drift(
     if not list(through(sums.read(), "checking", total=dataset.num_frames)):
         said = f"no image has {FEWEST_PIXELS} usable pixels on a wall within the calibrated ranges"
         raise CalibrationDataError(f"{dataset.first.path}: {said}; record a wall there.")
-    found = sums.estimate()
-    low, high = found.value - found.half_width, found.value + found.half_width
+    offset, half_width, disagreement = sums.estimate()
+    low, high = offset - half_width, offset + half_width
     flatness = math.sqrt(np.mean([one.flatness**2 for one in sums.images]))
     verdict: Verdict = "holds" if max(-low, high) <= threshold else "undecided"
     if max(low, -high, flatness) > threshold:
@@ -121,7 +121,7 @@ def check_drift(
     return DriftResult(
         verdict=verdict,
         wall=wall,
-        offset=found.value,
+        offset=offset,
         interval=(low, high),
         flatness=flatness,
         threshold=threshold,
@@ -129,19 +129,19 @@ def check_drift(
         outside=1 - sums.calibrated / max(sums.on_wall, 1),
         form_is_known=reference is not None,
         unlike=0.0 if known.views is None else share_unlike(sums.sums.views, known.views),
-        headline=_headline(found),
+        headline=_headline(offset, half_width, disagreement),
     )
 
 
-def _headline(found: Offset) -> str | None:
+def _headline(offset: float, half_width: float, disagreement: float | None) -> str | None:
     """Return what to say first of images that are not of one camera and one wall, or not of it."""
-    if found.disagrees:
-        much = f"{found.disagreement:.1f} times as much as those of the calibration"
+    if disagreement is not None:
+        much = f"{disagreement:.1f} times as much as those of the calibration"
         return f"Doubtful frames: they disagree {much}: two cameras, wrong poses, or bent walls?"
     # Warming up makes as much as other errors of a camera.
-    if abs(found.value) <= max(CAMERA, found.half_width):
+    if abs(offset) <= max(CAMERA, half_width):
         return None
-    off = f"{1e3 * abs(found.value):.0f} mm too {'far' if found.value > 0 else 'near'}"
+    off = f"{1e3 * abs(offset):.0f} mm too {'far' if offset > 0 else 'near'}"
     return f"Doubtful frames: they are {off}, and cameras drift by millimetres: another setting?"
 
 

@@ -52,23 +52,6 @@ class ImageDrift(NamedTuple):
     num_pixels: int
 
 
-class Offset(NamedTuple):
-    """The offset along the ray; positive where the camera reads too far.
-
-    Attributes:
-        value: Of all images, metres.
-        half_width: Of its 95 % interval, metres.
-        disagreement: By how much the images depart from each other, as a standard deviation over
-            that of the calibration's images.
-        disagrees: Whether that is too much for images of one camera, one robot and flat walls.
-    """
-
-    value: float
-    half_width: float
-    disagreement: float
-    disagrees: bool
-
-
 class OffsetSums:
     """Sums of products over the pixels of each image, image by image.
 
@@ -135,12 +118,17 @@ class OffsetSums:
                 self.images.append(ImageDrift(frame, flatness, len(used)))
                 yield frame
 
-    def estimate(self) -> Offset:
-        """Return the offset of all images with its standard error.
+    def estimate(self) -> tuple[float, float, float | None]:
+        """Return the offset along the ray; positive where the camera reads too far.
 
         Images may depart from each other more, or less, than those of the calibration did: their
         variances are scaled by the spread seen in both together, or in these alone where the two
         surely differ.
+
+        Returns:
+            The offset of all images and half its 95 % interval, metres; and by how much the images
+            depart from each other, as a standard deviation over that of the calibration's. None:
+            no more than images of one camera, one robot and flat walls may.
         """
         reference, count, sums = self._reference, len(self.sums), self.sums.groups
         # Pixels that are alike count as fewer, which is as if each were as much noisier.
@@ -177,12 +165,8 @@ class OffsetSums:
             (max(variance - with_bow, 0.0), max(reference.independent_poses - 1, 1.0)),
         )
         freedom = variance**2 / sum(part**2 / own for part, own in parts)
-        return Offset(
-            value=value,
-            half_width=student_quantile(1 - LEVEL / 2, freedom) * math.sqrt(variance),
-            disagreement=disagreement,
-            disagrees=disagrees,
-        )
+        half_width = student_quantile(1 - LEVEL / 2, freedom) * math.sqrt(variance)
+        return value, half_width, disagreement if disagrees else None
 
     def _solved(
         self, sums: GroupSums, noise: Tensor, pose_precision: Tensor
