@@ -50,11 +50,6 @@ class HandEye(nn.Module):
         self.register_buffer("start", _rigid(torch.eye(4) if start is None else start))
         self.twist = nn.Parameter(torch.zeros(6, dtype=torch.float64), requires_grad=not fixed)
 
-    @property
-    def fixed(self) -> bool:
-        """Whether the transform is known and not estimated."""
-        return not self.twist.requires_grad
-
     def forward(self) -> Tensor:
         """Return tool_from_camera, shape (4, 4)."""
         return product(self.start, se3.exp(self.twist))

@@ -9,7 +9,6 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import TypeVar
@@ -28,7 +27,6 @@ from tofcorr.pixels.dataset import Dataset, Frames, in_threads, thread_number
 from tofcorr.pixels.sample import pixels_of_image
 
 ValueT = TypeVar("ValueT")
-_alone = ContextVar("alone", default=False)
 
 
 @contextmanager
@@ -60,31 +58,17 @@ def is_first() -> bool:
     return not distributed.is_initialized() or distributed.get_rank() == 0
 
 
-@contextmanager
-def alone() -> Iterator[None]:
-    """Let this process read all frames itself for the length of the block."""
-    reset = _alone.set(True)
-    try:
-        yield
-    finally:
-        _alone.reset(reset)
-
-
-def _sharing() -> bool:
-    return distributed.is_initialized() and not _alone.get()
-
-
 def own_share(frames: Frames) -> np.ndarray:
     """Return the frames that this process reads."""
     frames = np.asarray(frames)
-    if not _sharing():
+    if not distributed.is_initialized():
         return frames
     return frames[distributed.get_rank() :: distributed.get_world_size()]
 
 
 def everyones(value: ValueT) -> list[ValueT]:
     """Return the values that all processes pass, in the order of their ranks."""
-    if not _sharing():
+    if not distributed.is_initialized():
         return [value]
     values: list[ValueT | None] = [None] * distributed.get_world_size()
     distributed.all_gather_object(values, value)

@@ -27,7 +27,7 @@ from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import REFERENCE_FILE, estimate_reference, save_reference
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
-from tofcorr.pixels.passes import alone, is_first, process_group
+from tofcorr.pixels.passes import is_first, process_group
 from tofcorr.pixels.sample import PixelSample, usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
@@ -303,7 +303,7 @@ def train(
                     force=force,
                 )
                 if folder:
-                    with alone(), stage("write"):
+                    with stage("write"):
                         result.write_into(folder)
         # The run is on disk; what only helps to look at it follows.
         if place:
