@@ -191,11 +191,6 @@ class MomentObjective:
     def __init__(self, moments: ImageMoments, prior: "Prior | None" = None) -> None:
         self.moments, self.prior = moments, prior
 
-    @property
-    def num_residuals(self) -> float:
-        """How many residuals the loss sums; at least 1."""
-        return float(self.moments.count.sum().clamp(min=1))
-
     @cached_property
     def _joint(self) -> Float[Tensor, "E E"]:
         """The matrix Q, E = 4 S."""

@@ -46,13 +46,9 @@ class Walls:
     def moved(self, step: Float[Tensor, "{self.size}"]) -> "Walls":
         """Return the walls after a step (3G,): two turns in radians and a shift in metres each."""
         change = step.view(-1, 3)
-        turned = self.normal_world + (change[:, :2, None] * self.tangents()).sum(dim=1)
+        turned = self.normal_world + (change[:, :2, None] * tangents(self.normal_world)).sum(dim=1)
         normal = torch.nn.functional.normalize(turned, dim=1)
         return replace(self, normal_world=normal, offset=self.offset + change[:, 2])
-
-    def tangents(self) -> Float[Tensor, "G 2 3"]:
-        """Return two unit vectors across each normal, shape (G, 2, 3)."""
-        return tangents(self.normal_world)
 
     def seen_by(self, moments: ImageMoments) -> ImageMoments:
         """Return the moments with these walls in place of those recorded."""
@@ -65,9 +61,9 @@ class Walls:
         self, moments: ImageMoments, parameters: Parameters
     ) -> Float[Tensor, "N S {self.size}"]:
         """Return the derivative of each image's residual vector by a step, (N, 3C + 1, 3G)."""
-        tangents, pose = self.tangents()[self.index], self.world_from_tool
-        lever = (tangents * pose[:, None, :3, 3]).sum(dim=-1, keepdim=True)
-        turns = torch.cat([tangents @ pose[:, :3, :3], lever], dim=-1)
+        across, pose = tangents(self.normal_world)[self.index], self.world_from_tool
+        lever = (across * pose[:, None, :3, 3]).sum(dim=-1, keepdim=True)
+        turns = torch.cat([across @ pose[:, :3, :3], lever], dim=-1)
         shift = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]]).to(turns).expand(len(turns), 1, 4)
         own = (torch.cat([turns, shift], dim=1) @ parameters.by_entries()).mT
         everywhere = own.new_zeros(*own.shape[:2], len(self.offset), 3)

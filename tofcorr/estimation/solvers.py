@@ -112,6 +112,7 @@ def minimise(
     if not start.size:  # There is nothing to estimate.
         return Solution(here, (float(equations.loss),), 0.0, "converged")
     found, damping = Solution(here), ROUNDING**0.5
+    count = float(objective.moments.count.sum().clamp(min=1))
     while equations.is_finite:
         loss, hessian = float(equations.loss), equations.hessian
         moves = curved(hessian)
@@ -121,7 +122,7 @@ def minimise(
         # The largest curvature is that of an unknown that moves every residual by about one metre.
         # So large are the sums of squared distances of which the loss is what is left.
         summed = float(hessian.diagonal().max())
-        variance = max(loss, LEAST_RESIDUAL**2 * summed) / objective.num_residuals
+        variance = max(loss, LEAST_RESIDUAL**2 * summed) / count
         decrease = float((along.square() / curvature.values.clamp(min=ROUNDING)).sum())
         found = Solution(here, (*found.history, loss), math.sqrt(decrease / variance))
         if stopped := _stopped(found, options, watcher):

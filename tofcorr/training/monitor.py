@@ -36,7 +36,7 @@ class RunMonitor:
     Example:
         monitor = RunMonitor()
         calibration = Calibration(data, options, watcher=monitor.iteration)
-        monitor.write(run / "tb", calibration, report)
+        monitor.write(run / "tb", calibration, report, figures=True)
     """
 
     def __init__(self) -> None:
@@ -49,12 +49,7 @@ class RunMonitor:
         self._times.append(time.time())
 
     def write(
-        self,
-        folder: Path | str,
-        calibration: Calibration,
-        report: Mapping[str, Any] | None = None,
-        *,
-        figures: bool = True,
+        self, folder: Path, calibration: Calibration, report: Mapping[str, Any], *, figures: bool
     ) -> None:
         """Write TensorBoard's files.
 
@@ -67,10 +62,9 @@ class RunMonitor:
         with event_writer(folder) as writer:
             for values in self._scalars(calibration):
                 writer.add_scalar(*values)
-            if report:
-                # Four spaces keep the lines of a table as they are.
-                lines = [report["message"], *report_text(report).splitlines()]
-                writer.add_text("report", "\n".join(f"    {line}" for line in lines))
+            # Four spaces keep the lines of a table as they are.
+            lines = [report["message"], *report_text(report).splitlines()]
+            writer.add_text("report", "\n".join(f"    {line}" for line in lines))
             if figures:
                 _write_figures(writer, calibration)
 
