@@ -25,8 +25,12 @@ _SCALE = np.array(
 )
 
 
+Ends = tuple[float, float]
+"""Range of a covariate."""
+
+
 def profile(
-    x: np.ndarray, error: np.ndarray, ends: tuple[float, float] | None = None
+    x: np.ndarray, error: np.ndarray, ends: Ends
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return middles of bins of a covariate, and mean and standard deviation of the error in them.
 
@@ -35,10 +39,10 @@ def profile(
     Args:
         x: The covariate, shape (M,).
         error: The error of each pixel, shape (M,); NaN is left out.
-        ends: Range of the covariate; None: see `without_strays`.
+        ends: Range of the covariate.
     """
     bins = 30
-    edges = np.linspace(*(ends or without_strays(x)), bins + 1)
+    edges = np.linspace(*ends, bins + 1)
     number = np.digitize(x, edges) - 1
     inside = (number >= 0) & (number < bins) & np.isfinite(error)
     count, total, square = (
@@ -125,11 +129,11 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
     ends, tested = without_strays(x), np.isin(sample.frame, held_out)
     for stage, error in sample.errors_mm.items():
         label, colour = _STAGES.get(stage, (stage, "k"))
-        draw_profile(panels[0], x, error, colour, label)
+        draw_profile(panels[0], x, error, ends, colour, label)
     halves = (~tested, "tab:blue", "fitted"), (tested, "tab:green", "held out")
     for chosen, colour, label in halves:
         if chosen.any():
-            draw_profile(panels[1], x[chosen], last[chosen], colour, label, ends)
+            draw_profile(panels[1], x[chosen], last[chosen], ends, colour, label)
     titles = "All stages: mean, and one standard deviation", "After correction"
     for axes, title in zip(panels, titles, strict=True):
         axes.axhline(0, color="0.4")
@@ -141,12 +145,7 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
 
 
 def draw_profile(
-    axes: "Axes",
-    x: np.ndarray,
-    error: np.ndarray,
-    colour: str,
-    label: str,
-    ends: tuple[float, float] | None = None,
+    axes: "Axes", x: np.ndarray, error: np.ndarray, ends: Ends, colour: str, label: str
 ) -> None:
     """Draw the mean of an error over a covariate, and a band of one standard deviation.
 
@@ -154,9 +153,9 @@ def draw_profile(
         axes: Where to draw.
         x: The covariate, shape (M,).
         error: The error of each pixel, shape (M,).
+        ends: Range of the covariate.
         colour: Of line and band.
         label: Of the line.
-        ends: Range of the covariate; None: see `without_strays`.
     """
     from tofcorr.plausibility.page import FAINT
 
