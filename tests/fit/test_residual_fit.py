@@ -38,7 +38,7 @@ def fitted(dataset: Dataset, terms: list[dict], **options: object) -> Fit:
 
 
 def held_out(dataset: Dataset, found: Fit) -> float:
-    return frame_errors(dataset, {"model": found.model}, TEST)["model"].rms_mm()
+    return frame_errors(dataset, {"model": found.model})["model"].rms_mm(TEST)
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +72,8 @@ def test_joint_training_lowers_the_loss_of_the_sample_further(wavy: Dataset) -> 
     short = NETWORK | {"keep": "always", "iterations": 20, "folds": 2}
     apart = fitted(wavy, CORE, residual=short | {"joint": False})
     joint = fitted(wavy, CORE, residual=short)
-    errors = frame_errors(wavy, {"apart": apart.model, "joint": joint.model}, TRAIN)
-    assert errors["joint"].rms_mm() < errors["apart"].rms_mm()
+    errors = frame_errors(wavy, {"apart": apart.model, "joint": joint.model})
+    assert errors["joint"].rms_mm(TRAIN) < errors["apart"].rms_mm(TRAIN)
     moved = joint.solution.parameters.coefficients - apart.solution.parameters.coefficients
     assert moved.abs().max() > 0
 

@@ -168,15 +168,11 @@ class FittedModel:
 
 
 def frame_errors(
-    dataset: Dataset,
-    models: Mapping[str, CalibrationModel],
-    frames: Frames | None = None,
-    device: str = "cpu",
+    dataset: Dataset, models: Mapping[str, CalibrationModel], device: str = "cpu"
 ) -> dict[str, FrameErrors]:
-    """Return the distances to the plane that models leave on the same frames; None: on all."""
-    wanted = np.arange(dataset.num_frames) if frames is None else np.asarray(frames)
-    fitted = [FittedModel(model, wanted) for model in models.values()]
-    found = held_out_errors(dataset, fitted, device)
+    """Return the distances to the plane that models leave on all frames."""
+    every = np.arange(dataset.num_frames)
+    found = held_out_errors(dataset, [FittedModel(one, every) for one in models.values()], device)
     return {name: one["to_plane"] for name, one in zip(models, found, strict=True)}
 
 

@@ -91,7 +91,7 @@ class Calibration:
             "hand_eye_only": without_correction(domain, found.hand_eye_only.tool_from_camera),
             "after": found.model,
         }
-        self.errors = frame_errors(data, self.stages, device=options.device)
+        self.errors = frame_errors(data, self.stages, options.device)
         if found.solution.parameters.hand_eye_is_free:
             with thread_number(1):
                 seen = misfit_pixels(data, found, self.frames)
