@@ -173,7 +173,7 @@ def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
     spread = torch.linalg.inv(
         precision + torch.eye(best.size, dtype=torch.float64) / PRIOR_SIGMA**2
     )
-    found = observability(result.moments, best)
+    found = observability(result.moments, best, None, None)
     expected = torch.linalg.eigvalsh(spread).flip(0).sqrt()
     got = torch.tensor([direction.sigma for direction in found.directions], dtype=torch.float64)
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=0)

@@ -174,10 +174,7 @@ class Observability(NamedTuple):
 
 
 def observability(
-    moments: ImageMoments,
-    optimum: Parameters,
-    prior: Prior | None = None,
-    walls: Walls | None = None,
+    moments: ImageMoments, optimum: Parameters, prior: Prior | None, walls: Walls | None
 ) -> Observability:
     """Find undetermined directions, weak ones and strong correlations in the loss's curvature.
 

@@ -252,7 +252,7 @@ def _hold(problem: Problem, core: Core) -> Core:
     moments, best, smooth = core.moments, core.solution.parameters, core.smoothness
     if smooth is not None:
         smooth = smooth.rescaled(effective_variance(moments, best))
-    found = observability(moments, best, prior=smooth, walls=problem.estimated)
+    found = observability(moments, best, smooth, problem.estimated)
     prior = prior_on_undetermined(found, problem.guess(moments))
     core = replace(core, smoothness=smooth, observability=found, prior=prior)
     if prior is None:
