@@ -19,8 +19,8 @@ from tofcorr.sensor.sensor_file import (
     SensorFile,
     dropout_section,
     light_section,
+    sensor_text,
     validity_of,
-    write_sensor,
 )
 from tofcorr.simulation.options import CameraOptions
 from tofcorr.training.run import calibration_state, train
@@ -83,7 +83,7 @@ def main(recording_path: Path, out: Path) -> None:
         light=light_section(observed),
         validity=validity_of(state.domain),
     )
-    write_sensor(sensor, out)
+    out.write_text(sensor_text(sensor), encoding="utf-8")
     print(f"{out} written ({time.process_time() - started:.0f} s of processor time)")
 
 

@@ -48,7 +48,7 @@ class Writes(nn.Module):
         return depth
 
     @torch.jit.export
-    def __getstate__(self) -> tuple[str, bool]:
+    def __getstate__(self) -> tuple[str, bool]:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.path, self.training
 
     @torch.jit.export

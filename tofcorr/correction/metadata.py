@@ -4,7 +4,7 @@ import json
 import warnings
 import zipfile
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import BeforeValidator, ConfigDict
@@ -96,7 +96,7 @@ def load_corrector(path: Path, *, trusted: bool = False) -> tuple[nn.Module, Cor
         names = archive.namelist()
         inside = [archive.read(name) for name in names if name.endswith(EMBEDDED)]
     if inside:
-        corrector: nn.Module = DepthCorrector.from_state(load_calibration(path, inside[0]))
+        corrector: Any = DepthCorrector.from_state(load_calibration(path, inside[0]))
     elif path.with_name(STATE_FILE).exists():
         corrector = DepthCorrector.from_state(load_calibration(path.with_name(STATE_FILE)))
     elif trusted or not any("/code/" in name for name in names):
