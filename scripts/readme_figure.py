@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import click
+import numpy as np
 
 
 @click.command()
@@ -24,8 +25,10 @@ def command(config: Path, recording: Path, out: Path) -> None:
     panels = figure.subplots(1, 3, sharey=True)
     for axes, name in zip(panels, ("distance", "column", "amplitude"), strict=True):
         covariate = sample.covariate_named(name)
+        x = sample.covariates[covariate]
+        ends = float(np.nanmin(x)), float(np.nanmax(x))
         for stage, colour in (("before", "tab:red"), ("after", "tab:blue")):
-            draw_profile(axes, sample.covariates[covariate], sample.errors_mm[stage], colour, stage)
+            draw_profile(axes, x, sample.errors_mm[stage], ends, colour, stage)
         axes.axhline(0, color="0.4", linewidth=0.8)
         axes.set_xlabel(covariate)
         axes.grid(alpha=0.25)
