@@ -328,15 +328,12 @@ def open_regular(path: Path | str, most_bytes: float = MOST_BYTES) -> BinaryIO:
 
     file = open(path, "rb", opener=opened)  # noqa: SIM115 - the caller closes it.
     status = os.fstat(file.fileno())
-    wrong = {
-        "it is no regular file": not stat.S_ISREG(status.st_mode),
-        f"it is larger than {most_bytes / 1e6:.0f} MB": status.st_size > most_bytes,
-    }
-    for reason, holds in wrong.items():
-        if holds:
-            file.close()
-            raise OSError(errno.EINVAL, reason)
-    return file
+    regular = stat.S_ISREG(status.st_mode)
+    if regular and status.st_size <= most_bytes:
+        return file
+    file.close()
+    larger = f"it is larger than {most_bytes / 1e6:.0f} MB"
+    raise OSError(errno.EINVAL, larger if regular else "it is no regular file")
 
 
 def sealed(content: io.BytesIO) -> bytes:

@@ -70,7 +70,8 @@ class Scene:
 
     def __init__(self, look: "Look", stored: np.ndarray, pixel: np.ndarray) -> None:
         self.poses, self.moves = look.poses, look.data.moves
-        self.normal, self.offset = look.column("normal_world"), look.column("offset")
+        planes = (look.data.column(name) for name in ("normal_world", "offset"))
+        self.normal, self.offset = (one.numpy()[look.sampled] for one in planes)
         self.guess = np.asarray(look.recording.tool_from_camera, dtype=np.float64)
         self.rays = rays = look.rays[pixel]
         self.distance = stored / rays[..., 2] if look.recording.depth_kind == "z" else stored
