@@ -36,7 +36,9 @@ except ImportError:  # Not on Windows: leftovers are then named, and never remov
     fcntl = None
 
 _LOG = logging.getLogger("tofcorr")
-_OURS = re.compile(r"\.tofcorr-[0-9a-f]{8}\.part[^/]*|tofcorr-scratch-[0-9a-f]{8}", re.DOTALL)
+_OURS = re.compile(
+    r"\.(?:.+\.)?tofcorr-[0-9a-f]{8}\.part[^/]*|tofcorr-scratch-[0-9a-f]{8}", re.DOTALL
+)
 _BEGUN: dict[Path, Callable[[Path], object]] = {}
 """How to remove each file and folder that this process has begun, in the order of their making."""
 

@@ -91,6 +91,8 @@ def test_what_was_corrected_is_not_corrected_again(
     told = program(*CORRECT, model, "--recording", once, "--out", tmp_path / "twice")
     assert told.code == 2
     assert "once: its depth was corrected already, by tofcorr" in told.err
+    clouds = program(*CORRECT, model, "--recording", once, "--ply", tmp_path / "twice")
+    assert (clouds.code, clouds.err) == (2, told.err)
     assert not (tmp_path / "twice").exists()
     assert "was corrected already" in program("inspect", once).out
 

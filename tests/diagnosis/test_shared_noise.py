@@ -8,12 +8,12 @@ import pytest
 from diagnosed_recordings import STILL, altered, recorded
 from scipy.ndimage import uniform_filter
 
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, repeats_of
 from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.structure import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums import shared_noise
-from tofcorr.diagnosis.sums.observations import observe, same_exposure
+from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.shared_noise import Lags
 from tofcorr.diagnosis.sums.study import Study
 
@@ -169,7 +169,7 @@ def test_repeats_have_one_exposure(tmp_path: Path) -> None:
     changes = REPEATED | {"conditions": {"integration_time_us": [250.0, 1000.0]}}
     recording = recorded(tmp_path / "exposures", 49, [], changes)
     observations = observe(recording, 10_000)
-    groups = same_exposure(observations)
+    groups = repeats_of(observations.recording)
     assert sorted(np.concatenate(groups).tolist()) == list(range(recording.num_frames))
     time = recording.frames.by_name()["integration_time"]
     assert time is not None

@@ -10,7 +10,7 @@ import torch
 from numpy_camera import REFERENCE, Camera, Truth, record
 from scipy.ndimage import gaussian_filter1d
 
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, repeats_of
 from tofcorr.data.writing import write_recording
 from tofcorr.estimation.noise import NoiseModel, filter_width, neighbour_correlation
 from tofcorr.observables.measure import (
@@ -19,7 +19,7 @@ from tofcorr.observables.measure import (
     NoiseMeasurement,
     level_of_repeats,
 )
-from tofcorr.observables.read import Observed, pose_groups
+from tofcorr.observables.read import Observed
 
 AMPLITUDES = np.array([300.0, 1000.0, 2000.0])
 
@@ -192,11 +192,11 @@ def test_many_pixels_that_share_the_largest_amplitude_are_saturated(tmp_path: Pa
 
 def test_frames_without_pose_id_belong_together_where_nothing_moves(tmp_path: Path) -> None:
     recording = record(tmp_path / "wall", Camera(), 4, poses=3, repeats=2).recording
-    assert [group.tolist() for group in pose_groups(recording)] == [[0, 1], [2, 3], [4, 5]]
+    assert [group.tolist() for group in repeats_of(recording)] == [[0, 1], [2, 3], [4, 5]]
     lines = (recording.path / "frames.csv").read_text().splitlines()
     column = lines[0].split(",").index("pose_id")
     kept = [",".join(c for k, c in enumerate(line.split(",")) if k != column) for line in lines]
     (recording.path / "frames.csv").write_text("\n".join(kept) + "\n")
     reopened = type(recording).open(recording.path)
     assert reopened.frames.pose_id is None
-    assert [group.tolist() for group in pose_groups(reopened)] == [[0, 1], [2, 3], [4, 5]]
+    assert [group.tolist() for group in repeats_of(reopened)] == [[0, 1], [2, 3], [4, 5]]

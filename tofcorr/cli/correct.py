@@ -11,7 +11,7 @@ import click
 
 from tofcorr.cli.shared import FOLDER, option, out_option, recording_option, run_option
 from tofcorr.correction.export.registry import FORMATS
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
 from tofcorr.files import NewPath, ReplacedFile
 
 if TYPE_CHECKING:
@@ -50,18 +50,17 @@ def correct_command(
     recording = Recording.open(recording_path, check_contents=False)
     corrector, metadata = load_corrector(model, trusted=trust_model)
     _refuse_another_camera(metadata, recording, model)
-    if out is not None:
-        with _refused_by(model):
+    with _refused_by(model):
+        if out is not None:
             share = write_corrected(corrector, recording, out)
-        if recording.raw is not None:
-            left_out = "raw.npy was left out: it would disagree with the corrected depth."
-            click.echo(left_out, err=True)
-        inside = f"{share:.1%} of the pixels with a return lie in the calibrated range"
-        click.echo(f"{out}: {recording.num_frames} frames corrected; {inside}.")
-    if ply is not None:
-        with _refused_by(model):
+            if recording.raw is not None:
+                left_out = "raw.npy was left out: it would disagree with the corrected depth."
+                click.echo(left_out, err=True)
+            inside = f"{share:.1%} of the pixels with a return lie in the calibrated range"
+            click.echo(f"{out}: {recording.num_frames} frames corrected; {inside}.")
+        if ply is not None:
             write_point_clouds(corrector, recording, ply)
-        click.echo(f"{ply}: point clouds of {recording.num_frames} frames, before and after.")
+            click.echo(f"{ply}: point clouds of {recording.num_frames} frames, before and after.")
 
 
 @contextmanager
@@ -71,6 +70,8 @@ def _refused_by(model: Path) -> Iterator[None]:
 
     try:
         yield
+    except TofcorrError:  # Of the recording or the folder: it is one sentence already.
+        raise
     except (RuntimeError, ValueError, torch.jit.Error) as error:
         # TorchScript puts the message behind its traceback, after such as builtins.ValueError.
         last = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()

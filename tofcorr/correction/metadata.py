@@ -18,8 +18,8 @@ from tofcorr.geometry.camera import DepthKind, Distortion, PinholeMatrix
 from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size, not_a_truth_value
 
 _WHAT = "the corrector.ts of a run"
-EMBEDDED = "extra/calibration.pt"
-"""Where a TorchScript file holds its calibration."""
+EMBEDDED = "calibration.pt"
+"""What a TorchScript file calls the calibration that it holds, among its extra files."""
 _Range = tuple[FiniteNumber, FiniteNumber]
 
 
@@ -94,7 +94,7 @@ def load_corrector(path: Path, *, trusted: bool = False) -> tuple[nn.Module, Cor
     refuse_damaged(path, _WHAT)
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
-        inside = [archive.read(name) for name in names if name.endswith(EMBEDDED)]
+        inside = [archive.read(name) for name in names if name.endswith(f"/extra/{EMBEDDED}")]
     if inside:
         corrector: Any = DepthCorrector.from_state(load_calibration(path, inside[0]))
     elif path.with_name(STATE_FILE).exists():

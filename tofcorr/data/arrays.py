@@ -147,13 +147,11 @@ def read_frames(array: np.ndarray, indices: np.ndarray) -> np.ndarray:
     frames = np.empty((len(indices), *array.shape[1:]), dtype=array.dtype)
     path = Path(str(array.filename))
     try:
-        for frame, index in zip(frames, indices.tolist(), strict=True):
-            place = array.offset + index * frame.nbytes
-            frame[...] = np.fromfile(path, array.dtype, frame.size, offset=place).reshape(
-                frame.shape
-            )
-    except ValueError:
-        raise CalibrationDataError(f"{path}: cannot be read (it became shorter).") from None
+        with path.open("rb") as file:
+            for frame, index in zip(frames, indices.tolist(), strict=True):
+                file.seek(array.offset + index * frame.nbytes)
+                if file.readinto(frame) < frame.nbytes:
+                    raise CalibrationDataError(f"{path}: cannot be read (it became shorter).")
     except OSError as error:
         raise CalibrationDataError(f"{path}: cannot be read ({error.strerror or error}).") from None
     return frames

@@ -294,6 +294,12 @@ def repeat_numbers(recording: Recording) -> np.ndarray:
     return first.argsort().argsort()[number]
 
 
+def repeats_of(recording: Recording) -> list[np.ndarray]:
+    """Return the frames of each set of repeats, in the order of the first frame of each."""
+    numbers = repeat_numbers(recording)
+    return [np.flatnonzero(numbers == number) for number in range(numbers.max() + 1)]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameBatch:
     """Some frames of a recording.

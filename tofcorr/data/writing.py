@@ -293,11 +293,6 @@ def write_corrected(
         CalibrationDataError: `path` exists, cannot be written, or `recording` is broken or was
             corrected already.
     """
-    if recording.corrected_by is not None:
-        raise CalibrationDataError(
-            f"{recording.path}: its depth was corrected already, by {recording.corrected_by}; "
-            "correct the recording that it was made from."
-        )
     num_returns = num_valid = 0
     by = f"tofcorr {__version__}"
     with RecordingWriter.like(path, recording, corrected_by=by) as writer, torch.inference_mode():
@@ -324,7 +319,8 @@ def write_point_clouds(corrector: Corrector, recording: Recording, path: Path | 
         path: The folder, which must not exist yet.
 
     Raises:
-        CalibrationDataError: `path` exists, the disk refuses, or `recording` is broken.
+        CalibrationDataError: `path` exists, the disk refuses, or `recording` is broken or was
+            corrected already.
     """
     rays = ray_directions(recording.camera)
     directions = (rays / rays[..., 2:] if recording.depth_kind == "z" else rays).numpy()
@@ -348,6 +344,11 @@ def _frames(
         Depth as recorded; amplitude as recorded, or None; where a pixel looks at the target;
         corrected depth; where the correction is valid on the target: each of shape (B, H, W).
     """
+    if recording.corrected_by is not None:
+        raise CalibrationDataError(
+            f"{recording.path}: its depth was corrected already, by {recording.corrected_by}; "
+            "correct the recording that it was made from."
+        )
     with bar(recording.num_frames, "correcting") as advance:
         pixels, every = recording.depth[0].size, np.arange(recording.num_frames)
         for chunk in frame_chunks(every, pixels, most):

@@ -29,19 +29,17 @@ from tofcorr.diagnosis.sums.noise import PixelNoise, brightness_of, estimate_noi
 from tofcorr.diagnosis.sums.observations import (
     Observations,
     observe,
-    planes_in_camera,
     predicted_distance,
-    seen_points,
 )
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.estimation.linear import pose_products, robust_covariance
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.plausibility.alignment import judged
+from tofcorr.plausibility.alignment import Alignment, judged
 from tofcorr.plausibility.checks.geometry import agreement, shape
 from tofcorr.plausibility.finding import CAMERA, SIGMAS, WORTH_A_WORD
+from tofcorr.plausibility.linear import exact_camera
 from tofcorr.plausibility.look import Look
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import default_hand_eye
@@ -223,60 +221,49 @@ def rendered_error(
     """
     refuse_other_camera(observations.recording, rendered)
     frames = observe(rendered, options.most_pixels)
-    if rendered.true_depth is None:
-        refuse_mistaken_geometry(rendered)
+    limits = [] if rendered.true_depth is not None else refuse_mistaken_geometry(rendered)
     pose = torch.from_numpy(rendered.tool_from_camera)
     noise = estimate_noise(frames, pose)
     matches = match_frames(observations.recording, rendered)
     # Where half of the recorded frames have no render, renders of other poses say more.
     missing = sum(len(found) == 0 for found in matches)
     if missing > len(matches) / 2:
-        return simulated_elsewhere(frames, observations, options)
-    error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
-    limits = [_looks_beside(frames)] if rendered.true_depth is None else []
-    if missing:
-        limits.append(
-            f"{rendered.path}: {missing} of {len(matches)} recorded frames were not "
-            "rendered (no pose within 1 mm and 1 mrad); they are left out."
-        )
-    known = SimulatorError.exact(error, pose, sigma)
-    return replace(known, limits=tuple(filter(None, limits)))
+        known = simulated_elsewhere(frames, observations, options)
+    else:
+        error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
+        known = SimulatorError.exact(error, pose, sigma)
+        if missing:
+            limits.append(
+                f"{rendered.path}: {missing} of {len(matches)} recorded frames were not "
+                "rendered (no pose within 1 mm and 1 mrad); they are left out."
+            )
+    return replace(known, limits=(*limits, *known.limits))
 
 
-def _looks_beside(frames: Observations) -> str:
-    """Say by how much frames look beside where their camera matrix says; empty: they do not.
+def _looks_beside(look: Look, stated: Alignment) -> list[str]:
+    """Say by how much frames look beside where their camera matrix says, if they surely do.
 
-    Planes and hand-eye transform of a simulator are exact, so that a shift of the principal point
-    and other focal lengths show beside errors of distance t and place in the image. With the unit
-    ray r, the normal n and p = r / r_z, t changes by -t r_z (r - n / n.r) times 1 / f a pixel of
-    the principal point, and times p for a focal length in proportion, across and down.
+    Args:
+        look: The frames.
+        stated: Under their own hand-eye transform, which is exact, as their planes are.
     """
-    pose, camera = torch.from_numpy(frames.recording.tool_from_camera), frames.recording.camera
-    truth, slope, _ = seen_points(frames, pose)
-    aside = frames.rays - planes_in_camera(frames, pose)[0][frames.frame] / slope[:, None]
-    focal = torch.tensor([camera.matrix[0][0], camera.matrix[1][1]]).double()
-    place = frames.rays[:, :2] / frames.rays[:, 2:]
-    change = -(truth * frames.rays[:, 2])[:, None] * aside[:, :2]
-    columns = torch.cat([change / focal, change * place], dim=1)
-    left = (frames.measured - truth)[:, None]
-    others = [torch.ones_like(left), truth[:, None], place, place.square(), left]
-    sums = pose_products(torch.cat([columns, *others], dim=1), frames.frame)
-    sums = torch.cat([sums.sum(0)[None], sums.sum(0) - sums])  # Of all frames, and without each.
-    found = torch.linalg.solve(sums[:, :-1, :-1], sums[:, :-1, -1:])[:, :4, 0]
-    spread = robust_covariance(found[1:]).diagonal().sqrt()
-    moved = (columns * found[0]).square().mean(0).sqrt()
-    sure = (moved >= WORTH_A_WORD) & (found[0].abs() >= SIGMAS * spread)
-    if not bool(sure.any()):
-        return ""
-    named = ("{:+.2f} px in x", "{:+.2f} px in y", "{:+.1%} of fx", "{:+.1%} of fy")
-    zipped = zip(named, found[0].tolist(), sure.tolist(), strict=True)
-    said = ", ".join(words.format(value) for words, value, known in zipped if known)
-    size = 1e3 * float((columns @ found[0]).square().mean().sqrt())
-    return (
-        f"{frames.recording.path}: its frames agree with their planes if the camera matrix of "
-        f"recording.yaml changes by {said}; as it is, they are {size:.1f} mm off. Does the "
+    recording = look.recording
+    found, moved = exact_camera(look.near(stated), recording.depth_kind)
+    sure = np.sqrt(np.square(moved).mean(0)) >= WORTH_A_WORD
+    sure &= np.abs(found.value) >= SIGMAS * found.error
+    if not sure.any():
+        return []
+    # A focal length longer by a share k makes x and y shorter by k / (1 + k).
+    focal, longer = np.diag(recording.camera.matrix)[:2], 1 / (1 - found.value[2:])
+    value = [*(found.value[:2] * longer * focal), *(longer - 1)]
+    named = ("{:+.2f} px in x", "{:+.2f} px in y", "{:+.2%} of fx", "{:+.2%} of fy")
+    said = ", ".join(named[k].format(value[k]) for k in np.flatnonzero(sure))
+    off = 1e3 * float(np.sqrt(np.square(moved[:, sure].sum(1)).mean()))
+    return [
+        f"{recording.path}: its frames agree with their planes if the camera matrix of "
+        f"recording.yaml changes by {said}; as it is, they are {off:.1f} mm off. Does the "
         "renderer count pixel centres otherwise?"
-    )
+    ]
 
 
 def _pixel_by_pixel(
@@ -337,11 +324,14 @@ def refuse_other_camera(real: Recording, simulated: Recording) -> None:
         )
 
 
-def refuse_mistaken_geometry(simulated: Recording) -> None:
+def refuse_mistaken_geometry(simulated: Recording) -> list[str]:
     """Refuse frames that a usual mistake keeps from agreeing with their own planes.
 
     The recording under diagnosis is looked at in the same way. The hand-eye transform of a
     simulator is exact besides.
+
+    Returns:
+        What limits a comparison with the frames, a sentence each.
 
     Raises:
         CalibrationDataError: Images are mirrored, poses inverted, the unit or kind of depth is
@@ -359,18 +349,19 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
     first = next(odd, None)
     if first is not None:
         raise CalibrationDataError(f"{simulated.path}: {first}")
-    best, stated = look.as_given, np.asarray(simulated.tool_from_camera)
-    if best is None or not simulated.moves:
-        return
+    best, mount = look.as_given, np.asarray(simulated.tool_from_camera)
+    if best is None:
+        return []
     # Directions that the frames do not determine leave no misfit.
-    misfit = judged(look.scene, stated, best.constant, best.slope).misfit
-    if misfit > max(CAMERA, 4 * best.misfit):
-        shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
+    stated = judged(look.scene, mount, best.constant, best.slope)
+    if simulated.moves and stated.misfit > max(CAMERA, 4 * best.misfit):
+        shift, turn = se3.apart(torch.as_tensor(mount), torch.as_tensor(best.hand_eye))
         raise CalibrationDataError(
             f"{simulated.path}: its frames agree with its planes if the camera sits "
             f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "
             "tool_from_camera; write the one that they were rendered with."
         )
+    return [] if look.linear is None else _looks_beside(look, stated)
 
 
 def _refuse_guess(simulated: Recording) -> None:

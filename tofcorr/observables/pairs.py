@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofcorr.data.recording import repeats_of
 from tofcorr.estimation.noise import BINS
 from tofcorr.estimation.robust import LEVEL, student_quantile
-from tofcorr.observables.read import FEWEST_PIXELS, Observed, pose_groups, quotient
+from tofcorr.observables.read import FEWEST_PIXELS, Observed, quotient
 
 Interval = tuple[float, float]
 Random = np.random.Generator
@@ -284,7 +285,7 @@ def _shared_poses(real: Observed, sim: Observed) -> dict[int, int] | None:
         return None
     places = []  # Pose and plane of the first frame of each pose, (P, 20).
     for recording in (real.recording, sim.recording):
-        first, table = [frames[0] for frames in pose_groups(recording)], recording.frames
+        first, table = [frames[0] for frames in repeats_of(recording)], recording.frames
         poses = table.world_from_tool.reshape(len(table), 16)
         every = np.column_stack([poses, table.normal_world, table.offset])
         places.append(every[first])

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import torch
 
-from tofcorr.data.recording import Recording, iterate_frames, repeat_numbers
+from tofcorr.data.recording import Recording, iterate_frames, repeats_of
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING, tiles_of
 from tofcorr.estimation.robust import sigma_from_mad
@@ -25,12 +25,6 @@ _CLIP = 6.0
 # Frames of a pose and pixels of it that are read at most. Chosen to bound time and memory: 30 give
 # the variance of a pixel to 26 %, and 60 poses 240 000 rows, whose mean is known to 0.3 %.
 _MOST_REPEATS, _MOST_OF_POSE = 30, 4000
-
-
-def pose_groups(recording: Recording) -> list[np.ndarray]:
-    """Return the numbers of the frames of each set of repeats, in the order of the first frame."""
-    numbers = repeat_numbers(recording)
-    return [np.flatnonzero(numbers == number) for number in range(numbers.max() + 1)]
 
 
 class Observed:
@@ -88,7 +82,7 @@ class Observed:
         tables, sums, repeated, counts = ([] for _ in range(4))
         self.between_frames: list[np.ndarray] = []
         fit = _SurfaceFit(recording.camera)
-        for number, frames in enumerate(pose_groups(recording)):
+        for number, frames in enumerate(repeats_of(recording)):
             images = _PoseImages(recording, frames[:_MOST_REPEATS], fit)
             residual = images.residual
             whole.add(known_mean(residual), images.weight, images.place)

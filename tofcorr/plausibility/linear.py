@@ -6,6 +6,7 @@ a drift of the poses) adds its own columns to these: a function of some lines be
 """
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
 from itertools import pairwise
@@ -13,6 +14,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.estimation.linear import RESOLVED, Curvature
@@ -123,6 +125,18 @@ class LinearResiduals:
         own = self.columns if first is None else first
         changed.columns = np.concatenate([own, columns], axis=-1)
         return changed
+
+    def image_places(self) -> tuple[Tensor, Tensor]:
+        """Return x and y of the rays (x, y, 1), shape (F, P) each."""
+        rays = torch.from_numpy(self.rays)
+        return rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+
+    def by_moves(self, moves: Sequence[tuple[Tensor, Tensor]], declared: str) -> np.ndarray:
+        """Return what each of N moves of the `image_places` does to the residuals, (F, P, N)."""
+        rays, distance = torch.from_numpy(self.rays), torch.from_numpy(self.distance)
+        normal = torch.from_numpy(self.normal)[:, None].expand(rays.shape)
+        moved = [moved_rays(rays, normal, distance, move, declared) for move in moves]
+        return torch.stack(moved, dim=-1).numpy()
 
     def frame_rms(self, left: np.ndarray) -> np.ndarray:
         """Return the root mean square of what is left (F, P) of each frame, shape (F,), metres."""
@@ -256,9 +270,7 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
     # The errors estimated together are nine.
     if not scene.moves or len(scene.poses) <= problem.frames_for(9):
         return None
-    rays, distance = torch.from_numpy(problem.rays), torch.from_numpy(problem.distance)
-    normal = torch.from_numpy(problem.normal)[:, None].expand(rays.shape)
-    x, y = (rays[..., :2] / rays[..., 2:]).unbind(dim=-1)
+    x, y = problem.image_places()
     # In units of the corner's.
     square = (x * x + y * y) / (x * x + y * y).max().clamp(min=TINY)
     outward = square / (x * x + y * y).max().clamp(min=TINY).sqrt()
@@ -271,10 +283,7 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
         "corner": [(-x * outward, -y * outward)],
         "bend": [(-square, zero), (zero, -square)],
     }
-    blocks = {}
-    for name, own in moves.items():
-        moved = [moved_rays(rays, normal, distance, move, declared) for move in own]
-        blocks[name] = torch.stack(moved, dim=-1).numpy()
+    blocks = {name: problem.by_moves(own, declared) for name, own in moves.items()}
     found = {name: problem.added(block)[0] for name, block in blocks.items()}
     other = np.log(problem.rays[..., 2]) * (-1 if declared == "radial" else 1)
     kind = (problem.cosine * problem.distance * other)[..., None]
@@ -283,6 +292,29 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
     del blocks["bend"]
     found["curvature"], *_, found["kind"] = problem.added(bent, *blocks.values(), kind)
     return found
+
+
+def exact_camera(problem: LinearResiduals, declared: str) -> tuple[Estimate, np.ndarray]:
+    """Estimate how K should change where the hand-eye transform is exact, as a simulator's.
+
+    A shift of the principal point then shows beside all errors of distances: with a hand-eye
+    transform to be found, a turn of the camera looks much like it.
+
+    Args:
+        problem: The residuals near the exact transform; its turns and shifts are left out.
+        declared: `radial` or `z`.
+
+    Returns:
+        - principal point to the right and down in focal lengths, and the horizontal and the
+          vertical focal length as shares of themselves;
+        - what each of them does to the M residuals that are used, shape (M, 4), metres.
+    """
+    x, y = problem.image_places()
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    block = problem.by_moves([(-one, zero), (zero, -one), (-x, zero), (zero, -y)], declared)
+    of_camera = problem.columns[..., problem.rigid.shape[-1] :]
+    (found,) = problem.with_columns(of_camera, first=block[..., :0]).added(block)
+    return found, block[problem.used] * found.value
 
 
 def places_on_wall(problem: LinearResiduals) -> tuple[np.ndarray, np.ndarray]:

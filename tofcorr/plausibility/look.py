@@ -202,10 +202,13 @@ class Look:
 
         None where the recorded planes are not taken as right.
         """
-        given, known = self.as_given, self.scene.known
-        if given is None or self.planes != "known" or not known.any():
-            return None
-        seen = replace(given, rms=given.rms[known], angle=given.angle[known])
+        given, known = self.as_given, self.scene.known.any()
+        return self.near(given) if given and self.planes == "known" and known else None
+
+    def near(self, found: Alignment) -> LinearResiduals:
+        """Return the same near any alignment of the scene."""
+        known = self.scene.known
+        seen = replace(found, rms=found.rms[known], angle=found.angle[known])
         amplitude = None if self.amplitude is None else self.amplitude[self.usable][known]
         return LinearResiduals(self.scene.some(known), seen, amplitude)
 

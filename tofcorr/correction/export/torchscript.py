@@ -2,7 +2,7 @@
 
 import io
 import warnings
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import torch
 
@@ -33,7 +33,7 @@ def export_torchscript(
             warnings.filterwarnings("ignore", message=".*torch.jit")
             content = io.BytesIO()
             # Beside the code: `tofcorr correct` builds the corrector from it and runs no code.
-            own = {PurePath(EMBEDDED).name: calibration_bytes(reference)}
+            own = {EMBEDDED: calibration_bytes(reference)}
             torch.jit.save(torch.jit.script(corrector), content, _extra_files=own)
             part.write_bytes(sealed(content))
             loaded = torch.jit.load(str(part))

@@ -27,12 +27,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.data.recording import repeats_of
 from tofcorr.diagnosis.sums.observations import (
     TINY,
     Observations,
     frame_chunks,
     predicted_images,
-    same_exposure,
 )
 from tofcorr.estimation.noise import (
     SAME_BRIGHTNESS,
@@ -403,7 +403,7 @@ def _with_repeats(observations: Observations, noise: PixelNoise) -> PixelNoise:
     Two frames of one pose, target and exposure are repeats: they give one degree of freedom in each
     of thousands of pixels.
     """
-    together = [members for members in same_exposure(observations) if len(members) > 1]
+    together = [members for members in repeats_of(observations.recording) if len(members) > 1]
     found = [_repeats(observations, noise, members) for members in together]
     groups = [group for group in found if group is not None]
     if not groups:

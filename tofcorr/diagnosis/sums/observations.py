@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.recording import Recording, iterate_frames, pose_numbers, repeat_numbers
+from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.walls import name_walls
@@ -219,12 +219,6 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
     return every.choosing(torch.arange(len(chosen)).repeat_interleave(counts), torch.cat(chosen))
 
 
-def same_exposure(observations: Observations) -> list[np.ndarray]:
-    """Return the frames of each set of repeats, in the order of the recording."""
-    group = repeat_numbers(observations.recording)
-    return [np.flatnonzero(group == number) for number in range(group.max() + 1)]
-
-
 def small_tiles(observations: Observations, *, per_tile: float = 12.0) -> dict[str, Tensor]:
     """Return the tile of every pixel, (M,), int64, for squares, pieces of rows and of columns.
 
@@ -266,7 +260,7 @@ def seen_points(
         incidence, (M,); and the point in the world, (M, 3), metres.
     """
     frame, rays = observations.frame, observations.rays
-    normal, offset = planes_in_camera(observations, tool_from_camera)
+    normal, offset = _camera_planes(observations, tool_from_camera)
     slope = by_frame(rays, normal[:, :, None], frame)[:, 0]
     distance = -offset[frame] / slope
     pose = observations.facts.world_from_tool @ tool_from_camera
@@ -279,7 +273,7 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tu
 
     The twist acts from the right, tool_from_camera exp(twist), translation first.
     """
-    planes, offset = planes_in_camera(observations, tool_from_camera)
+    planes, offset = _camera_planes(observations, tool_from_camera)
     # One vector of all pixels after another: elementwise operations are fastest so.
     normal, rays = planes.T[:, observations.frame], observations.rays.T.contiguous()
     # A camera that moves by t and turns by w changes its height over the plane by n . t, and the
@@ -290,7 +284,7 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tu
     return distance, torch.cat([-normal / slope, by_rotation]).T
 
 
-def planes_in_camera(observations: Observations, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
+def _camera_planes(observations: Observations, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
     """Return normal (F, 3) and offset (F,) of each frame's plane in the camera's coordinates."""
     facts = observations.facts
     pose = facts.world_from_tool @ tool_from_camera
@@ -340,7 +334,7 @@ def predicted_images(
     rows: slice = slice(None),
 ) -> Tensor:
     """Return the distance of the plane in all pixels of some frames and rows; NaN where none."""
-    normal, offset = (x[part] for x in planes_in_camera(observations, tool_from_camera))
+    normal, offset = (x[part] for x in _camera_planes(observations, tool_from_camera))
     return ray_plane_distance(ray_directions(observations.recording.camera)[rows], normal, offset)
 
 

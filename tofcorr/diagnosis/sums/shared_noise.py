@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.data.recording import repeats_of
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR, LEAST_RATIO
 from tofcorr.diagnosis.sums.observations import (
     Observations,
-    same_exposure,
     small_tiles,
 )
 from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
@@ -196,7 +196,8 @@ def shared_noise(
         form: _image(observations, own, fullest, -1)[0]
         for form, own in small_tiles(observations).items()
     }
-    together = [np.flatnonzero(np.isin(frames, group)) for group in same_exposure(observations)]
+    groups = repeats_of(observations.recording)
+    together = [np.flatnonzero(np.isin(frames, group)) for group in groups]
     repeats = [group for group in together if len(group) > 1]
     # A standard error needs four repeats beyond the first frame of each pose.
     if sum(len(group) - 1 for group in repeats) >= 4:
