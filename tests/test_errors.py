@@ -17,10 +17,7 @@ from tofcorr.errors import CalibrationDataError, TofcorrError, printable
 from tofcorr.files import write_json
 from tofcorr.importing.run import RefusedViewError
 
-KINDS = [
-    *(kind for kind in vars(errors).values() if isinstance(kind, type)),
-    RefusedViewError,
-]
+KINDS = [*(kind for kind in vars(errors).values() if isinstance(kind, type)), RefusedViewError]
 TEXT = st.text(st.characters(codec=None), max_size=30)
 
 

@@ -54,9 +54,7 @@ def test_where_planes_come_from_and_the_names_of_frames_survive(tmp_path: Path) 
     assert (copy.planes, copy.frame_names) == ("estimated", names)
 
 
-def test_without_the_optional_keys_planes_are_recorded_and_names_usual(
-    folder: Path,
-) -> None:
+def test_without_the_optional_keys_planes_are_recorded_and_names_usual(folder: Path) -> None:
     assert {"planes", "frames"}.isdisjoint(yaml.safe_load((folder / "recording.yaml").read_text()))
     recording = Recording.open(folder)
     assert (recording.planes, recording.frame_names) == ("recorded", FrameNames())

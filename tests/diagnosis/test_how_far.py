@@ -6,13 +6,7 @@ import pytest
 import torch
 from diagnosis.resamples import resamples_of
 
-from tofcorr.diagnosis.findings.gap import (
-    Gap,
-    measure_gap,
-    resampled,
-    squared_gaps,
-    studentised,
-)
+from tofcorr.diagnosis.findings.gap import Gap, measure_gap, resampled, squared_gaps, studentised
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.structure import noise_floor
 from tofcorr.diagnosis.findings.where import interval_of

@@ -5,12 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tofcorr.diagnosis.sums.study import (
-    FittedMap,
-    Study,
-    with_poses_reestimated,
-    with_residual,
-)
+from tofcorr.diagnosis.sums.study import FittedMap, Study, with_poses_reestimated, with_residual
 
 
 def _with_ring(study: Study, size: float) -> Study:

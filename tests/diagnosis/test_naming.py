@@ -12,15 +12,8 @@ from diagnosis.resamples import resamples_of
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.findings.gap import (
-    OpenSet,
-    judge_remainder,
-    measure_gap,
-)
-from tofcorr.diagnosis.findings.naming import (
-    NamedEffects,
-    name_effects,
-)
+from tofcorr.diagnosis.findings.gap import OpenSet, judge_remainder, measure_gap
+from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base import SimulatorError
 from tofcorr.diagnosis.sums.study import Study

@@ -166,9 +166,7 @@ def test_a_filter_over_time_is_seen_in_five_frames_of_a_pose(tmp_path: Path) -> 
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.05)
 
 
-def test_two_frames_of_a_pose_leave_the_noise_open_and_the_residual_decides(
-    tmp_path: Path,
-) -> None:
+def test_two_frames_of_a_pose_leave_the_noise_open_and_the_residual_decides(tmp_path: Path) -> None:
     study = _recorded(tmp_path / "two", 2)
     noise = study.fit.noise
     assert noise.repeats == 4

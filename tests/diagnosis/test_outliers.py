@@ -112,9 +112,7 @@ def test_an_error_by_an_amplitude_that_was_not_recorded_is_no_other_effect(tmp_p
     assert name_effects(prepared.study).names == ()
 
 
-def test_the_columns_for_an_unknown_amplitude_hold_that_of_a_uniform_target(
-    tmp_path: Path,
-) -> None:
+def test_the_columns_for_an_unknown_amplitude_hold_that_of_a_uniform_target(tmp_path: Path) -> None:
     white = {
         "shots": [{"target": "white", "poses": 10}],
         "sensor": {"light": {"vignetting_exponent": 2.0}},

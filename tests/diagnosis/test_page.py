@@ -134,10 +134,7 @@ def rendered(time_diagnosis: DiagnosisResult) -> Callable[[Kind], str]:
 @needs_browser
 @pytest.mark.parametrize("kind", [with_simulator, without_effects])
 def test_nothing_of_the_page_is_cut_and_every_picture_has_a_text_beside_it(
-    kind: Kind,
-    rendered: Callable[[Kind], str],
-    time_diagnosis: DiagnosisResult,
-    tmp_path: Path,
+    kind: Kind, rendered: Callable[[Kind], str], time_diagnosis: DiagnosisResult, tmp_path: Path
 ) -> None:
     frames, console = looked_at(rendered(kind), tmp_path)
     assert console == ""

@@ -11,13 +11,7 @@ from tofcorr.simulation.effects.patterns import drawn_values
 from tofcorr.simulation.effects.registry import CATALOGUE
 
 _SPREAD, _SEED = 0.004, 6
-_PATTERN = {
-    "name": "fixed_pattern",
-    "height": 48,
-    "width": 64,
-    "rms_m": _SPREAD,
-    "seed": _SEED,
-}
+_PATTERN = {"name": "fixed_pattern", "height": 48, "width": 64, "rms_m": _SPREAD, "seed": _SEED}
 _LARGER = {
     "camera": {
         "width": 64,

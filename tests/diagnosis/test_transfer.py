@@ -46,9 +46,7 @@ def test_poses_that_are_held_out_have_no_influence_on_what_is_fitted(nothing_stu
     assert not torch.allclose(fitted[0], sums.ols.solve(()))
 
 
-def test_the_simulator_that_took_the_recording_has_its_noise(
-    nothing_missing: Recording,
-) -> None:
+def test_the_simulator_that_took_the_recording_has_its_noise(nothing_missing: Recording) -> None:
     frames = noisy_frames(nothing_missing, diagnosed_recordings.options(31), 7)
     assert frames.num_frames == nothing_missing.num_frames
     poses = torch.from_numpy(frames.frames.world_from_tool)

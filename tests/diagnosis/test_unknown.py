@@ -9,12 +9,7 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.findings.gap import (
-    allowed_scatter,
-    judge_remainder,
-    measure_gap,
-    resampled,
-)
+from tofcorr.diagnosis.findings.gap import allowed_scatter, judge_remainder, measure_gap, resampled
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.structure import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions

@@ -7,12 +7,7 @@ import pytest
 
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Estimated
-from tofcorr.diagnosis.report.words import (
-    effect_line,
-    moving_waves,
-    table_of_stages,
-    write_verdict,
-)
+from tofcorr.diagnosis.report.words import effect_line, moving_waves, table_of_stages, write_verdict
 
 STUDY: Any = SimpleNamespace(
     fit=SimpleNamespace(model=SimpleNamespace(groups=set())),

@@ -48,9 +48,7 @@ def test_planes_found_in_the_depth_show_no_offset_and_several_walls_are_not_one(
         check_drift(state, estimated, "one")
 
 
-def test_a_threshold_that_is_not_positive_and_no_run_are_refused(
-    tmp_path: Path,
-) -> None:
+def test_a_threshold_that_is_not_positive_and_no_run_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="threshold_mm: expected a positive number"):
         tofcorr.check(tmp_path, tmp_path, threshold_mm=0.0)
     with pytest.raises(CalibrationDataError, match="no such file; expected a calibration"):

@@ -20,9 +20,7 @@ def trained(generator: torch.Generator, domain: Domain = DOMAIN) -> ResidualNetw
     return network
 
 
-def test_it_adds_nothing_untrained_and_its_bound_at_most(
-    generator: torch.Generator,
-) -> None:
+def test_it_adds_nothing_untrained_and_its_bound_at_most(generator: torch.Generator) -> None:
     network = ResidualNetwork(ResidualNetworkOptions(), DOMAIN)
     distance = 1 + 2 * torch.rand(3, 5, 7, generator=generator, dtype=torch.float64)
     assert not network(distance, 100 * distance, ROWS, COLUMNS).any()

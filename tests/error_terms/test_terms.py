@@ -10,10 +10,7 @@ from kinds_of_terms import built, randomise
 from scipy.interpolate import BSpline
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.error_terms.base import (
-    ConditionTerm,
-    SignalTerm,
-)
+from tofcorr.error_terms.base import ConditionTerm, SignalTerm
 from tofcorr.error_terms.splines import placed, second_differences, spline_weights
 from tofcorr.geometry.rays import unambiguous_range
 

@@ -6,11 +6,7 @@ import torch
 from synthetic_scene import EA, make_scene
 
 from tofcorr.estimation.moments import MomentObjective, Parameters
-from tofcorr.estimation.solvers import (
-    initial_parameters,
-    rotation_from_normals,
-    with_linear_part,
-)
+from tofcorr.estimation.solvers import initial_parameters, rotation_from_normals, with_linear_part
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import planes_through
 

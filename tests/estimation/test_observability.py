@@ -13,12 +13,7 @@ from simulated_walls import fitted, simulated_wall, true_hand_eye
 import tofcorr
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import MomentObjective
-from tofcorr.estimation.uncertainty import (
-    PRIOR_SIGMA,
-    Direction,
-    effective_variance,
-    observability,
-)
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA, Direction, effective_variance, observability
 from tofcorr.fit.problem import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.judgement import judge
@@ -163,9 +158,7 @@ def test_undetermined_directions_can_be_refused(walls: dict[str, Dataset]) -> No
         fitted(walls["one axis"], free_directions="refuse")
 
 
-def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
-    fits: FitOf,
-) -> None:
+def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(fits: FitOf) -> None:
     result = fits("good")
     best = result.solution.parameters
     variance = effective_variance(result.moments, best)

@@ -12,12 +12,7 @@ from synthetic_scene import E0, EA, EB, Scene, make_scene, nearby, without_inval
 
 from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import MomentObjective, Parameters
-from tofcorr.estimation.solvers import (
-    Solution,
-    SolverOptions,
-    initial_parameters,
-    minimise,
-)
+from tofcorr.estimation.solvers import Solution, SolverOptions, initial_parameters, minimise
 
 
 @pytest.mark.parametrize("terms", [E0, EA, EB], ids=["E0", "EA", "EB"])

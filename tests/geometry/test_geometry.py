@@ -96,9 +96,7 @@ def test_inverse_cancels(values: list[float]) -> None:
     torch.testing.assert_close(transform @ se3.inverse(transform), eye, rtol=0, atol=1e-12)
 
 
-@given(
-    values=st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6),
-)
+@given(values=st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
 @example(values=[0.0] * 6)
 def test_logarithm_undoes_the_exponential_below_half_a_turn(values: list[float]) -> None:
     twist = torch.tensor(values, dtype=torch.float64)

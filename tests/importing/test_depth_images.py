@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from cameras import camera
 
-from tofcorr.importing.images import (
-    DepthCoding,
-    DepthImage,
-    coded_image,
-    of_size,
-    read_array,
-)
+from tofcorr.importing.images import DepthCoding, DepthImage, coded_image, of_size, read_array
 from tofcorr.importing.run import RefusedViewError
 
 CAMERA = camera((4, 3), (5.0, 5.0), (1.5, 1.0))

@@ -24,10 +24,7 @@ from tofcorr.pixels.passes import image_moments
     [
         ({"modulation_frequency": 30e6}, "its modulation_frequency is 30000000.0, that of .*one"),
         ({"depth_kind": "z"}, "its depth_kind is z, that of .*one is radial"),
-        (
-            {"frame_names": FrameNames(eye_to_hand=True)},
-            "eye_to_hand is True, that of .*one",
-        ),
+        ({"frame_names": FrameNames(eye_to_hand=True)}, "eye_to_hand is True, that of .*one"),
     ],
 )
 def test_a_recording_of_another_setting_is_refused_with_both_values(

@@ -20,7 +20,7 @@ ERROR = EB | {
         "distance": {"c0": 0.03, "c1": -0.02, "c2": 0.008, "c3": -0.001},
         "pixel": {"p1": 2e-5, "r0": 5.0, "p2": -1e-5, "c0": 8.0},
         "intensity": {"i3": 4e-6, "i4": -5e-10},
-    },
+    }
 }
 NOISE = {"floor_m": 0.001, "shot_m": 0.003, "read_m": 0.001, "reference_amplitude": 800.0}
 

@@ -2,15 +2,7 @@
 
 import pytest
 import torch
-from sensor.sensors import (
-    CONDITIONS,
-    EFFECTS,
-    ERROR,
-    NOISE,
-    entries,
-    plane_scene,
-    sensor,
-)
+from sensor.sensors import CONDITIONS, EFFECTS, ERROR, NOISE, entries, plane_scene, sensor
 from torch import Tensor
 from torch.func import functional_call
 

@@ -71,10 +71,7 @@ def test_a_state_of_another_sensor_is_refused() -> None:
         ({"validity": {"radial_distance_m": [0.5]}}, "radial_distance_m"),
         ({"depth_kind": "slant"}, "depth_kind"),
         # Found by fuzzing: maps of its size took 20 s.
-        (
-            {"camera": CAMERA.section() | {"height": 10**6}},
-            "16 x 1000000 pixels is larger",
-        ),
+        ({"camera": CAMERA.section() | {"height": 10**6}}, "16 x 1000000 pixels is larger"),
         ({"camera": CAMERA.section() | {"height": 1}}, "needs 2 x 2 at least"),
         ({"error": ERROR | {"coefficients": {"distance": {"c0": 0.01}}}}, "lack 'c1'"),
         ({"effects": [{"name": "wigling"}]}, "Did you mean 'wiggling'"),

@@ -10,10 +10,7 @@ from seen_wall import seen_wall
 
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.simulation.hooks import FrameState
-from tofcorr.simulation.signal import (
-    ReadoutOptions,
-    read_out,
-)
+from tofcorr.simulation.signal import ReadoutOptions, read_out
 
 CAMERA = camera((40, 30), (60.0, 60.0), (19.5, 14.5))
 
@@ -80,9 +77,7 @@ def test_converter_counts_whole_numbers_within_its_scale(generator: torch.Genera
     assert counts.max() == 4095
 
 
-def test_full_and_dim_pixels_have_no_distance(
-    generator: torch.Generator,
-) -> None:
+def test_full_and_dim_pixels_have_no_distance(generator: torch.Generator) -> None:
     state = measure(0.3, generator=generator, readout={"converter_bits": 14})
     full = (state.raw >= 2**14 - 1).any(0)
     assert full.any()

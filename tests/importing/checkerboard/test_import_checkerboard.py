@@ -5,13 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from importing.checkerboard.imported_board import (
-    ERROR,
-    PLACEMENTS,
-    Run,
-    read_image,
-    report,
-)
+from importing.checkerboard.imported_board import ERROR, PLACEMENTS, Run, read_image, report
 from importing.checkerboard.rendered_board import (
     CAMERA,
     angle_deg,

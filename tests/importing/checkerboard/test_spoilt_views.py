@@ -33,15 +33,9 @@ EVEN = np.full((240, 320), 200, np.uint16)
 SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "truncated": (cut("3_depth.png", 500), "3_depth.png is not a readable image"),
     "empty": (cut("3_ir.png", 0), "3_ir.png is not a readable image"),
-    "eight bits": (
-        written("3_ir.png", EVEN.astype(np.uint8)),
-        "3_ir.png has 8 bits a pixel",
-    ),
+    "eight bits": (written("3_ir.png", EVEN.astype(np.uint8)), "3_ir.png has 8 bits a pixel"),
     "colour": (written("3_ir.png", np.dstack([EVEN] * 3)), "has shape (240, 320, 3); one channel"),
-    "size": (
-        written("3_depth.png", EVEN[:120, :160]),
-        "its depth has 160x120 pixels, the",
-    ),
+    "size": (written("3_depth.png", EVEN[:120, :160]), "its depth has 160x120 pixels, the"),
     "board": (written("3_ir.png", EVEN), "no board of 5x7 inner corners found in 3_ir.png"),
     "depth": (written("3_depth.png", 0 * EVEN), "only 0 of "),
     "mixed up": (spoil_mixed_up, "are the two images of the same view?"),
@@ -92,16 +86,8 @@ def leave_two(folder: Path) -> None:
         (leave, {"lens": ("--focal", "290")}, "--focal and --centre go together"),
         (leave, {"lens": ("--focal", "a,b", "--centre", "1,2")}, "separated by commas"),
         (leave, {"lens": ("--intrinsics", "none.yaml")}, "none.yaml: neither a file nor a config"),
-        (
-            leave,
-            {"lens": (*LENS, "--depth-unit-mm", "0.1")},
-            "times the board's distance",
-        ),
-        (
-            leave,
-            {"lens": (*LENS, "--depth", "{view}_range.png")},
-            "no file matches depth",
-        ),
+        (leave, {"lens": (*LENS, "--depth-unit-mm", "0.1")}, "times the board's distance"),
+        (leave, {"lens": (*LENS, "--depth", "{view}_range.png")}, "no file matches depth"),
         (leave, {"lens": (*LENS, "--square-mm", "-1")}, "square_length"),
         (leave, {"lens": (*LENS, "--max-reprojection-px", "0.001")}, "at most 0.001 px"),
     ],

@@ -197,10 +197,7 @@ def imported(
 
 
 def found_in(
-    room: Room,
-    views: Views,
-    options: WallOptions | None = None,
-    targets: np.ndarray | None = None,
+    room: Room, views: Views, options: WallOptions | None = None, targets: np.ndarray | None = None
 ) -> FoundWalls:
     """Find the walls of views."""
     camera = intrinsics(room.camera)
