@@ -67,7 +67,7 @@ TIME: dict[str, Any] = {"name": "integration_time", "log_1": 0.006}
 """An effect of a few millimetres."""
 
 
-def options(
+def simulator(
     seed: int, effects: Sequence[Mapping[str, Any]] = (), changes: Mapping[str, Any] | None = None
 ) -> SimulatorOptions:
     """Return the plain simulator with another seed, effects and changed keys."""
@@ -84,7 +84,7 @@ def recorded(
     noise: bool = True,
 ) -> Recording:
     """Simulate a recording."""
-    simulate(options(seed, effects, changes), folder, noise=noise)
+    simulate(simulator(seed, effects, changes), folder, noise=noise)
     return Recording.open(folder)
 
 
@@ -95,10 +95,10 @@ def altered(recording: Recording, change: Callable[[np.ndarray], np.ndarray]) ->
     return Recording.open(recording.path)
 
 
-def true_inputs(recording: Recording, simulator: SimulatorOptions) -> EffectInputs:
+def true_inputs(recording: Recording, own: SimulatorOptions) -> EffectInputs:
     """Return what effects look at, with the true hand-eye transform."""
     observations = observe(recording, 10_000_000)
-    return effect_inputs(observations, simulator.hand_eye.tool_from_camera())
+    return effect_inputs(observations, own.hand_eye.tool_from_camera())
 
 
 def measured(recording: Recording) -> torch.Tensor:

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-import diagnosed_recordings
 import pytest
+from diagnosed_recordings import TIME, recorded
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose, prepare
@@ -22,12 +22,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def nothing_missing(folder: Path) -> Recording:
-    return diagnosed_recordings.recorded(folder / "nothing_missing", 31)
+    return recorded(folder / "nothing_missing", 31)
 
 
 @pytest.fixture(scope="session")
 def time_missing(folder: Path) -> Recording:
-    return diagnosed_recordings.recorded(folder / "time_missing", 32, [diagnosed_recordings.TIME])
+    return recorded(folder / "time_missing", 32, [TIME])
 
 
 @pytest.fixture(scope="session")

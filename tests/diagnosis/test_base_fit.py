@@ -3,10 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosed_recordings import altered, recorded, simulator
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
@@ -26,7 +26,7 @@ def fitted(recording: Recording) -> BaseFit:
 
 
 def test_the_hand_eye_transform_is_found_from_a_guess_far_off(nothing_missing: Recording) -> None:
-    truth = diagnosed_recordings.options(31).hand_eye.tool_from_camera()
+    truth = simulator(31).hand_eye.tool_from_camera()
     fit = fitted(replace(nothing_missing, tool_from_camera=np.eye(4)))
     # Robot noise of 0.3 mm and 0.3 mrad over 50 poses; the offset along the axis is the weak one.
     assert float((fit.tool_from_camera - truth)[:3, 3].norm()) < 2e-3
@@ -60,13 +60,13 @@ def test_the_noise_of_a_pixel_is_known_to_five_per_cent(
 
 def test_a_fixed_pattern_does_not_count_as_noise(folder: Path, nothing_study: Study) -> None:
     pattern = {"name": "fixed_pattern", "rms_m": 0.006, "height": 24, "width": 32}
-    fit = fitted(diagnosed_recordings.recorded(folder / "pattern_floor", 31, [pattern]))
+    fit = fitted(recorded(folder / "pattern_floor", 31, [pattern]))
     assert fit.floor == pytest.approx(nothing_study.fit.floor, rel=0.1)
 
 
 def test_repeats_measure_the_floor(folder: Path, nothing_study: Study) -> None:
     repeats = {"robot": {"repeat_poses": 2, "repeat_frames": 10}}
-    fit = fitted(diagnosed_recordings.recorded(folder / "repeats", 31, [], repeats))
+    fit = fitted(recorded(folder / "repeats", 31, [], repeats))
     assert fit.noise.repeats == 20
     assert fit.model.observations.num_units == 50
     assert fit.floor == pytest.approx(nothing_study.fit.floor, rel=0.15)
@@ -85,7 +85,7 @@ def test_undetermined_directions_of_the_hand_eye_transform_stay_near_the_guess(
     """Without tilts the poses do not determine roll, and a leaning wall would bias it."""
     lean = {"name": "target_registration", "lean_x": 0.01, "lean_y": -0.01}
     upright = {"robot": {"tilt_axes": "none"}}
-    recording = diagnosed_recordings.recorded(tmp_path / "upright", 44, [lean], upright)
+    recording = recorded(tmp_path / "upright", 44, [lean], upright)
     found = fitted(recording).tool_from_camera
     away = se3.log(se3.inverse(torch.from_numpy(recording.tool_from_camera)) @ found)
     assert float(away[:3].norm()) < 0.1
@@ -98,9 +98,9 @@ def test_depth_without_noise_or_coarsely_rounded_can_be_diagnosed(
 ) -> None:
     """Repeats of such frames are equal: their standard deviation is zero, or nearly."""
     repeats = {"robot": {"repeat_poses": 2, "repeat_frames": 5}}
-    recording = diagnosed_recordings.recorded(tmp_path / "odd", 31, [], repeats, noise=noise)
+    recording = recorded(tmp_path / "odd", 31, [], repeats, noise=noise)
     if step:
-        recording = diagnosed_recordings.altered(recording, lambda z: np.round(z / step) * step)
+        recording = altered(recording, lambda z: np.round(z / step) * step)
     few = DiagnosisOptions(catalogue=("wiggling", "saturation", "fixed_pattern"))
     study = prepare(recording, few).study
     assert bool(study.fit.sigma.isfinite().all())

@@ -7,9 +7,9 @@ from pathlib import Path
 from shutil import copytree
 from typing import Any
 
-import diagnosed_recordings
 import numpy as np
 import pytest
+from diagnosed_recordings import recorded
 from diagnosis.resamples import unnamed
 
 from tofcorr.data.recording import Recording
@@ -80,7 +80,7 @@ def test_a_term_whose_input_is_missing_is_refused_with_what_is_missing(
     kind: str, tmp_path: Path
 ) -> None:
     hidden = {"conditions": {"recorded": ["pose_id"]}}
-    recording = diagnosed_recordings.recorded(tmp_path / "hidden", 46, [], hidden)
+    recording = recorded(tmp_path / "hidden", 46, [], hidden)
     unknown = replace(recording, modulation_frequency=None)
     with pytest.raises(CalibrationDataError, match=f"{NEEDS[kind]}.*{kind}"):
         _fitted(unknown, kind)
@@ -113,7 +113,7 @@ def test_the_simulator_makes_the_error_of_the_base_model(
 
 
 def test_a_fixed_pattern_in_the_base_is_not_named(folder: Path) -> None:
-    recording = diagnosed_recordings.recorded(folder / "base_pattern", 45, [PATTERN])
+    recording = recorded(folder / "base_pattern", 45, [PATTERN])
     paper = ("distance_polynomial", "pixel_polynomial", "amplitude_polynomial")
     without, with_pattern = (
         name_effects(_study(recording, *kinds, catalogue=PATTERNS))

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import diagnosed_recordings
 import pytest
+from diagnosed_recordings import recorded
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
@@ -20,17 +20,17 @@ CLIP: dict[str, Any] = {"name": "saturation", "full_counts": 40_000.0, **KNEE}
 
 @pytest.fixture(scope="module")
 def straight(folder: Path) -> Recording:
-    return diagnosed_recordings.recorded(folder / "straight", 50, [], DIM)
+    return recorded(folder / "straight", 50, [], DIM)
 
 
 def _three_images_clipped(folder: Path, seed: int) -> Recording:
-    straight = diagnosed_recordings.recorded(folder / f"straight_{seed}", seed, [], DIM)
+    straight = recorded(folder / f"straight_{seed}", seed, [], DIM)
     images = observe(straight, 1000).amplitude_images
     assert images is not None
     fourth = float(images.flatten(1).amax(1).sort(descending=True).values[3])
     # The brightest tap of a pixel without ambient light: A (1 + 1 / contrast).
     clip = CLIP | {"full_counts": 3.0 * fourth}
-    return diagnosed_recordings.recorded(folder / f"clipped_{seed}", seed, [clip], DIM)
+    return recorded(folder / f"clipped_{seed}", seed, [clip], DIM)
 
 
 def _names_saturation(recording: Recording) -> bool:
@@ -57,7 +57,7 @@ def test_the_light_of_clipped_pixels_is_told_from_dim_ones(
 ) -> None:
     light = observe(straight, 10_000_000).amplitude_images
     assert light is not None
-    clipped = diagnosed_recordings.recorded(tmp_path / "clipped", 50, [CLIP], DIM)
+    clipped = recorded(tmp_path / "clipped", 50, [CLIP], DIM)
     study = prepare(clipped, DiagnosisOptions(), None).study
     inputs = study.inputs
     true = light.flatten(1)[inputs.frame, inputs.pixel].double()

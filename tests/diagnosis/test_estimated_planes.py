@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosed_recordings import recorded
 from importing.walls.rendered_room import (
     Camera,
     Room,
@@ -169,9 +169,7 @@ def test_the_simulator_rerun_on_the_walls_found_closes_the_gap(walls: Recording)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_each_effect_is_in_the_one_set_as_with_measured_planes(name: str, tmp_path: Path) -> None:
-    measured = diagnosed_recordings.recorded(
-        tmp_path / name, 830, [{"name": name, **EFFECTS[name]}]
-    )
+    measured = recorded(tmp_path / name, 830, [{"name": name, **EFFECTS[name]}])
     estimated = with_walls_found(measured)
     named = [name_effects(prepare(one, QUICK).study) for one in (measured, estimated)]
     assert [len(one.names) for one in named] == [1, 1]
@@ -182,7 +180,7 @@ def test_each_effect_is_in_the_one_set_as_with_measured_planes(name: str, tmp_pa
 @pytest.mark.parametrize("name", ["target_registration", "incidence_angle"])
 def test_nothing_is_named_in_place_of_what_planes_absorb(name: str, tmp_path: Path) -> None:
     size = {"secant": 0.06} if name == "incidence_angle" else {"offset_m": 0.01, "lean_x": 0.006}
-    recording = diagnosed_recordings.recorded(tmp_path / name, 831, [{"name": name, **size}])
+    recording = recorded(tmp_path / name, 831, [{"name": name, **size}])
     named = name_effects(prepare(with_walls_found(recording), QUICK).study)
     assert named.names == ()
 
@@ -244,7 +242,7 @@ def test_nothing_is_named_where_nothing_is_missing(walls: int, first: int, tmp_p
     for seed in range(first, first + 10):
         folder = tmp_path / str(seed)
         if walls == 1:
-            recording = with_walls_found(diagnosed_recordings.recorded(folder, seed))
+            recording = with_walls_found(recorded(folder, seed))
         else:
             recording = room_recording(folder, seed)
         named += name_effects(prepare(recording, QUICK).study).names

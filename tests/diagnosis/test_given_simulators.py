@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosed_recordings import recorded, simulator
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
@@ -54,7 +54,7 @@ class Frames:
 @pytest.fixture(scope="module")
 def options() -> SimulatorOptions:
     """The camera of `nothing_missing`, its effects and errors included."""
-    return diagnosed_recordings.options(31)
+    return simulator(31)
 
 
 @pytest.fixture(scope="module")
@@ -268,13 +268,13 @@ def test_a_recording_of_the_built_in_simulator_is_one_once_its_guess_is_exact(
     """A guess 3 mm off was taken as exact, and the gap was called the mounting of the camera."""
     few = {"shots": [{"target": "white", "poses": 20}]}
     changes = few if guess is None else few | {"hand_eye": {"guess": guess}}
-    guessed = diagnosed_recordings.recorded(tmp_path / "guess", 5, changes=changes)
+    guessed = recorded(tmp_path / "guess", 5, changes=changes)
     with pytest.raises(CalibrationDataError, match=r"--set hand_eye\.guess\.translation_mm=0"):
         refuse_mistaken_geometry(guessed)
-    true = diagnosed_recordings.options(5, changes=changes).hand_eye.tool_from_camera()
+    true = simulator(5, changes=changes).hand_eye.tool_from_camera()
     refuse_mistaken_geometry(replace(guessed, tool_from_camera=true.numpy()))
     exact = few | {"hand_eye": {"guess": {"translation_mm": 0.0, "rotation_deg": 0.0}}}
-    refuse_mistaken_geometry(diagnosed_recordings.recorded(tmp_path / "exact", 5, changes=exact))
+    refuse_mistaken_geometry(recorded(tmp_path / "exact", 5, changes=exact))
 
 
 def test_a_fixed_hand_eye_transform_is_that_of_the_simulator(
@@ -313,7 +313,7 @@ def test_what_a_simulator_does_elsewhere_is_carried_to_the_recording(
     tmp_path: Path,
 ) -> None:
     """The simulator saw 50 other poses; its error at the recording's own is known from options."""
-    elsewhere = diagnosed_recordings.recorded(tmp_path / "sim", 931, noise=False)
+    elsewhere = recorded(tmp_path / "sim", 931, noise=False)
     exact = options.hand_eye.tool_from_camera().numpy()
     simulated = rendered_error(replace(elsewhere, tool_from_camera=exact), observations, OPTIONS)
     truth = simulated_error(options, observations, OPTIONS).error

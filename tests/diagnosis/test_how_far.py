@@ -1,9 +1,9 @@
 """The gap in millimetres: what it may not depend on."""
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosed_recordings import TIME, measured, recorded
 from diagnosis.resamples import resamples_of
 
 from tofcorr.diagnosis.findings.gap import Gap, measure_gap, resampled, squared_gaps, studentised
@@ -21,10 +21,10 @@ def true_noise(
 ) -> list[float]:
     """Return the noise that the simulator drew, root mean square of each study, metres."""
     folder, sizes = tmp_path_factory.mktemp("without_noise"), []
-    effects = [diagnosed_recordings.TIME]
+    effects = [TIME]
     for study, seed, missing in ((time_study, 32, effects), (nothing_study, 31, [])):
-        ideal = diagnosed_recordings.recorded(folder / str(seed), seed, missing, noise=False)
-        images = diagnosed_recordings.measured(ideal).reshape(len(ideal.frames), -1)
+        ideal = recorded(folder / str(seed), seed, missing, noise=False)
+        images = measured(ideal).reshape(len(ideal.frames), -1)
         seen = study.observations
         noise = seen.measured - images[seen.frame, seen.pixel]
         sizes.append(float((study.fit.share * noise**2).sum() / study.fit.share.sum()) ** 0.5)

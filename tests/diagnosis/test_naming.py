@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosed_recordings import recorded
 from diagnosis.resamples import resamples_of
 
 from tofcorr.data.recording import Recording
@@ -68,7 +68,7 @@ def _judged(study: Study, named: NamedEffects) -> OpenSet:
 )
 def test_a_strong_effect_is_named_or_is_in_the_cause_set(name: str, tmp_path: Path) -> None:
     effect = {"name": name} | EFFECTS[name]
-    _, named = _selected(diagnosed_recordings.recorded(tmp_path / name, 40, [effect]))
+    _, named = _selected(recorded(tmp_path / name, 40, [effect]))
     assert len(named.names) == 1
     assert name in named.cause_sets[0]
     # Robot, target and incidence angle look alike before one wall, and multipath has many forms.
@@ -77,7 +77,7 @@ def test_a_strong_effect_is_named_or_is_in_the_cause_set(name: str, tmp_path: Pa
 
 def test_two_effects_are_both_named(tmp_path: Path) -> None:
     pair = [{"name": "integration_time", "log_1": 0.006}, {"name": "wiggling", "sin_8": 0.006}]
-    recording = diagnosed_recordings.recorded(tmp_path / "pair", 41, pair)
+    recording = recorded(tmp_path / "pair", 41, pair)
     _, named = _selected(recording)
     covered = {name for members in named.cause_sets for name in members}
     assert {"integration_time", "wiggling"} <= covered
@@ -112,7 +112,7 @@ def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
 def test_what_no_effect_explains_is_unknown_and_described(
     kind: str, trace: str, tmp_path: Path
 ) -> None:
-    recording = diagnosed_recordings.recorded(tmp_path / "odd", 42)
+    recording = recorded(tmp_path / "odd", 42)
     depth = np.load(recording.path / "depth.npy")
     random = np.random.default_rng(42)
     if kind == "third frame":
@@ -130,7 +130,7 @@ def test_what_no_effect_explains_is_unknown_and_described(
 
 def test_an_absent_base_term_is_named(tmp_path: Path) -> None:
     bowl = {"sensor": {"delays": {"pixel": {"bowl_mm": 40.0, "row_line_mm": 8.0}}}}
-    recording = diagnosed_recordings.recorded(tmp_path / "bowl", 43, [], bowl)
+    recording = recorded(tmp_path / "bowl", 43, [], bowl)
     base = {"terms": [{"kind": "distance_polynomial"}, {"kind": "amplitude_polynomial"}]}
     _, named = _selected(recording, base=base)
     assert named.names[:1] == ("pixel",)
@@ -138,7 +138,7 @@ def test_an_absent_base_term_is_named(tmp_path: Path) -> None:
 
 def test_an_effect_whose_column_is_missing_is_not_tested(tmp_path: Path) -> None:
     hidden = {"conditions": {"recorded": ["pose_id", "ambient"]}}
-    recording = diagnosed_recordings.recorded(
+    recording = recorded(
         tmp_path / "hidden", 44, [{"name": "room_temperature", "per_degree": 0.004}], hidden
     )
     study, named = _selected(recording, catalogue=("room_temperature", "warm_up", "ambient_light"))

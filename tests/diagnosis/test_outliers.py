@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosed_recordings import altered, recorded, simulator, true_inputs
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import Prepared, prepare
@@ -27,8 +27,8 @@ def _prepared(
     folder: Path, odd: np.ndarray, off: float, changes: Mapping[str, Any] = FEW
 ) -> Prepared:
     """A recording with nothing missing but pixels `odd` (N, H, W) that are off, metres."""
-    recording = diagnosed_recordings.recorded(folder, 45, [], changes)
-    return prepare(diagnosed_recordings.altered(recording, lambda z: z + off * odd), SMALL)
+    recording = recorded(folder, 45, [], changes)
+    return prepare(altered(recording, lambda z: z + off * odd), SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_few_outliers_are_a_warning_only_where_they_outweigh_the_noise(
 def test_an_error_by_an_amplitude_that_was_not_recorded_is_no_other_effect(tmp_path: Path) -> None:
     delays = {"amplitude": {"scale_mm": 2.0}}
     strong = {"shots": [{"target": "white", "poses": 40}], "sensor": {"delays": delays}}
-    recording = diagnosed_recordings.recorded(tmp_path / "dark", 46, [], strong)
+    recording = recorded(tmp_path / "dark", 46, [], strong)
     (recording.path / "amplitude.npy").unlink()
     prepared = prepare(Recording.open(recording.path), DiagnosisOptions())
     assert "amplitude cannot be named" in prepared.warnings[0]
@@ -118,9 +118,9 @@ def test_the_columns_for_an_unknown_amplitude_hold_that_of_a_uniform_target(tmp_
         "sensor": {"light": {"vignetting_exponent": 2.0}},
         "conditions": {"ambient_counts": [0.0, 0.0]},
     }
-    recording = diagnosed_recordings.recorded(tmp_path / "white", 47, [], white, noise=False)
-    own = diagnosed_recordings.options(47, [], white)
-    inputs = diagnosed_recordings.true_inputs(recording, own)
+    recording = recorded(tmp_path / "white", 47, [], white, noise=False)
+    own = simulator(47, [], white)
+    inputs = true_inputs(recording, own)
     amplitude = inputs.known_amplitude
     blind = replace(inputs, amplitude=None, amplitude_images=None)
     columns = unknown_amplitude_columns(observe(recording, 10_000_000), blind)
@@ -136,7 +136,7 @@ def _masked(recording: Recording, kept: np.ndarray) -> str:
 
 
 def test_a_mask_that_leaves_few_pixels_is_warned_of(tmp_path: Path) -> None:
-    recording = diagnosed_recordings.recorded(tmp_path / "masked", 60, noise=False)
+    recording = recorded(tmp_path / "masked", 60, noise=False)
     shape = np.load(recording.path / "depth.npy").shape
     random = np.random.default_rng(60)
     assert not mask_warning(observe(recording, 50_000))

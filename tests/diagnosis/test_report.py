@@ -5,11 +5,11 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from diagnosed_recordings import TIME, recorded, simulator
 
 from benchmarks.sealed.answers import contradictions
 from tofcorr.cli.simulate import diagnose_command as command
@@ -74,7 +74,7 @@ def test_a_contradiction_is_seen(report: Path, changed: dict[str, object], law: 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_infinite_amplitudes_are_pixels_that_are_not_used(tmp_path: Path) -> None:
     """In every second pixel of all images: a traceback, since columns were not finite."""
-    diagnosed_recordings.recorded(tmp_path / "one", 33)
+    recorded(tmp_path / "one", 33)
     amplitude = np.load(tmp_path / "one" / "amplitude.npy")
     amplitude.reshape(-1)[::2] = np.inf
     np.save(tmp_path / "one" / "amplitude.npy", amplitude)
@@ -118,7 +118,7 @@ def test_the_gap_is_gone_in_the_simulator_with_the_effect(time_diagnosis: Diagno
 def test_a_simulator_that_has_the_effect_already_lacks_nothing(
     time_missing: Recording, time_diagnosis: DiagnosisResult
 ) -> None:
-    complete = diagnosed_recordings.options(32, [diagnosed_recordings.TIME])
+    complete = simulator(32, [TIME])
     found = diagnose(time_missing, complete, {"bootstraps": 19})
     assert found.effects == ()
     # What the true simulator leaves as given is what the robot does not repeat.
@@ -130,7 +130,7 @@ def test_a_simulator_that_has_the_effect_already_lacks_nothing(
 
 @pytest.mark.slow
 def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_path: Path) -> None:
-    lacking = diagnosed_recordings.options(32)
+    lacking = simulator(32)
     found = diagnose(time_missing, lacking, {"bootstraps": 19})
     assert found.effects == ("integration_time",)
     assert found.simulator is not None

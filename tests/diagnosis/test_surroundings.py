@@ -4,10 +4,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosed_recordings import recorded, simulator
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.rerun.simulator import twin_distance
@@ -25,7 +25,7 @@ STRAY = {"name": "stray_light", **STRAY_SHARES}
 def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The target's left edge hidden by something near, and nothing at all above that."""
     folder = tmp_path_factory.mktemp("cluttered") / "recording"
-    diagnosed_recordings.recorded(folder, 44, noise=False)
+    recorded(folder, 44, noise=False)
     depth = np.load(folder / "depth.npy")
     mask = np.ones(depth.shape, dtype=np.uint8)
     mask[:, :, :WIDTH] = 0
@@ -37,7 +37,7 @@ def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def test_the_twin_keeps_what_stands_beside_the_target(cluttered: Recording) -> None:
-    options = diagnosed_recordings.options(44, [])
+    options = simulator(44, [])
     state = next(twin_frames(options, cluttered, reflectivity="from_recording"))
     plain = next(twin_frames(options, cluttered))
     beside = state.radial_distance[:, :WIDTH]
@@ -50,7 +50,7 @@ def test_the_twin_keeps_what_stands_beside_the_target(cluttered: Recording) -> N
 def test_pixels_of_the_plane_beside_the_mask_have_no_noise(tmp_path: Path) -> None:
     """Where a camera filters, measured neighbours would explain the noise of pixels at the edge."""
     folder = tmp_path / "recording"
-    diagnosed_recordings.recorded(folder, 44, [], {"shots": [{"target": "white", "poses": 4}]})
+    recorded(folder, 44, [], {"shots": [{"target": "white", "poses": 4}]})
     depth = np.load(folder / "depth.npy")
     mask = np.ones(depth.shape, dtype=np.uint8)
     mask[:, :, :WIDTH] = 0
@@ -58,7 +58,7 @@ def test_pixels_of_the_plane_beside_the_mask_have_no_noise(tmp_path: Path) -> No
     depth[:, :, : WIDTH // 2] = NEAR
     np.save(folder / "depth.npy", depth)
     observations = observe(Recording.open(folder), 100_000)
-    pose = default_hand_eye(diagnosed_recordings.options(44), observations.recording)
+    pose = default_hand_eye(simulator(44), observations.recording)
     inputs = effect_inputs(observations, pose)
     fit = SimpleNamespace(
         shared=SimpleNamespace(share={"rows": 0.3}),
@@ -78,7 +78,7 @@ def test_stray_light_of_the_surroundings_is_the_same_in_the_twin_and_in_the_fit(
     cluttered: Recording,
 ) -> None:
     observations = observe(cluttered, 100_000)
-    without, with_stray = (diagnosed_recordings.options(44, e) for e in ([], [STRAY]))
+    without, with_stray = (simulator(44, e) for e in ([], [STRAY]))
     pose = default_hand_eye(without, cluttered)
     shift = twin_distance(observations, with_stray, pose) - twin_distance(
         observations, without, pose

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-import diagnosed_recordings
 import numpy as np
 import pytest
 import torch
+from diagnosed_recordings import simulator
 from diagnosis.resamples import resamples_of
 
 from tofcorr.data.recording import Recording
@@ -47,7 +47,7 @@ def test_poses_that_are_held_out_have_no_influence_on_what_is_fitted(nothing_stu
 
 
 def test_the_simulator_that_took_the_recording_has_its_noise(nothing_missing: Recording) -> None:
-    frames = noisy_frames(nothing_missing, diagnosed_recordings.options(31), 7)
+    frames = noisy_frames(nothing_missing, simulator(31), 7)
     assert frames.num_frames == nothing_missing.num_frames
     poses = torch.from_numpy(frames.frames.world_from_tool)
     torch.testing.assert_close(poses, torch.from_numpy(nothing_missing.frames.world_from_tool))
@@ -61,7 +61,7 @@ def test_the_simulator_that_took_the_recording_has_its_noise(nothing_missing: Re
 def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
     nothing_missing: Recording,
 ) -> None:
-    frames = noisy_frames(nothing_missing, diagnosed_recordings.options(31), 3)
+    frames = noisy_frames(nothing_missing, simulator(31), 3)
     depth = np.asarray(frames.depth)
     found = []
     for sim in (frames, lambda _: depth):

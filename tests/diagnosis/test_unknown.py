@@ -3,9 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
-import diagnosed_recordings
 import pytest
 import torch
+from diagnosed_recordings import recorded, simulator, true_inputs
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
@@ -25,7 +25,7 @@ POOR_ROBOT = {"robot": {"repeatability_mm": 2.0, "repeatability_mrad": 2.0}}
 def test_poses_of_a_poor_robot_are_no_unknown_cause_unless_a_better_one_was_stated(
     tmp_path: Path,
 ) -> None:
-    recording = diagnosed_recordings.recorded(tmp_path / "poor", 50, [], POOR_ROBOT)
+    recording = recorded(tmp_path / "poor", 50, [], POOR_ROBOT)
     study = prepare(recording, DiagnosisOptions(catalogue=("wiggling", "lens"))).study
     named = name_effects(study)
     resamples = resampled(study.sums.num_units, 30, torch.Generator().manual_seed(1))
@@ -58,8 +58,8 @@ def test_pose_columns_are_what_a_small_motion_of_the_target_does(
     nothing_missing: Recording,
 ) -> None:
     """Turned by a milliradian about any point and shifted, a plane's distance is in their span."""
-    own = diagnosed_recordings.options(31)
-    inputs = diagnosed_recordings.true_inputs(nothing_missing, own)
+    own = simulator(31)
+    inputs = true_inputs(nothing_missing, own)
     here = inputs.frame == 3
     facts = inputs.facts
     moved = se3.exp(torch.tensor([1e-4, -2e-4, 3e-4, 1e-4, -2e-4, 1e-4], dtype=torch.float64))

@@ -1,6 +1,5 @@
 """A copy of the package with more files and more lines, as contributors would add them."""
 
-import copy
 import json
 import os
 import shutil
@@ -9,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import diagnosed_recordings
 import pytest
 import simulated_walls
+from diagnosed_recordings import PLAIN
 from docs.pages import ADDING, blocks
 from running import printed
 
@@ -70,9 +69,7 @@ class StripesEffect(LinearDelay):
         return torch.cos(6 * torch.pi * inputs.columns)[:, None]
 '''
 EFFECT_LINE = '# tofcorr/simulation/effects/registry.py\n    "stripes:StripesEffect",'
-SIMULATOR = copy.deepcopy(diagnosed_recordings.PLAIN) | {
-    "effects": [{"name": "stripes", "height_m": 0.006}]
-}
+SIMULATOR = PLAIN | {"effects": [{"name": "stripes", "height_m": 0.006}]}
 DIAGNOSIS = {"catalogue": ["stripes", "incidence_angle"], "bootstraps": 19}
 DIAGNOSIS |= {"simulate_anew": False, "page": False}
 PIECES = {

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-import diagnosed_recordings
 import pytest
 import torch
 from cameras import camera
+from diagnosed_recordings import recorded
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.diagnosis.sums.base import BaseModel
@@ -31,7 +31,7 @@ def test_a_range_leaves_a_share_outside_and_a_condition_is_known_of_every_frame(
 
 
 def test_training_and_diagnosis_scale_by_the_same_variables(tmp_path: Path) -> None:
-    recording = diagnosed_recordings.recorded(tmp_path / "recording", 47)
+    recording = recorded(tmp_path / "recording", 47)
     training = covered_domain(Dataset((recording,)), range(recording.num_frames))
     observed = observe(recording, 1_000_000)
     diagnosis = BaseModel(observed, ErrorModelOptions(), hand_eye_free=False).domain

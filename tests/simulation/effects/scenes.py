@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import diagnosed_recordings
 import torch
+from diagnosed_recordings import measured, recorded, simulator, true_inputs
 
 from tofcorr.data.recording import Recording
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
@@ -26,13 +26,13 @@ class Scene:
 
     def __init__(self, folder: Path, changes: dict[str, Any]) -> None:
         self.folder, self.changes = folder, changes
-        self.options: SimulatorOptions = diagnosed_recordings.options(7, (), changes)
+        self.options: SimulatorOptions = simulator(7, (), changes)
         self.plain = self.record("plain", [])
-        self.inputs: EffectInputs = diagnosed_recordings.true_inputs(self.plain, self.options)
+        self.inputs: EffectInputs = true_inputs(self.plain, self.options)
 
     def record(self, name: str, effects: list[dict[str, Any]]) -> Recording:
         folder = self.folder / name
-        return diagnosed_recordings.recorded(folder, 7, effects, self.changes, noise=False)
+        return recorded(folder, 7, effects, self.changes, noise=False)
 
     def change(self, effect: CatalogueEffect) -> torch.Tensor:
         """Return by how much an effect changes the measured distances, shape (M,)."""
@@ -40,11 +40,11 @@ class Scene:
         if isinstance(effect, MapEffect):
             entry = effect.listed(decimals=20)  # A float64 of 0.1 mm has no more.
         simulated = self.record(f"with_{effect.name}_{torch.rand(()).item()}", [entry])
-        return diagnosed_recordings.measured(simulated) - diagnosed_recordings.measured(self.plain)
+        return measured(simulated) - measured(self.plain)
 
 
 def plain_inputs(folder: Path, target: str, poses: int) -> EffectInputs:
     """Return what is true of a few noise-free poses of a camera without effects."""
     few = {"shots": [{"target": target, "poses": poses}]}
-    recording = diagnosed_recordings.recorded(folder / "few", 5, [], few, noise=False)
-    return diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], few))
+    recording = recorded(folder / "few", 5, [], few, noise=False)
+    return true_inputs(recording, simulator(5, [], few))
