@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
+from optional import present
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
@@ -101,8 +102,7 @@ def followed(folder: Path, seed: int, robot: dict[str, Any]) -> dict[str, float]
     before = fitted(first)
     frames = np.arange(first.num_frames)
     random = np.random.default_rng(seed)
-    pool = draw_pool(first, frames, before, random)
-    assert pool is not None
+    pool = present(draw_pool(first, frames, before, random))
     advised, _ = advise(first, pool, before)
     at_random = random.choice(len(pool.target), len(advised), replace=False).tolist()
     worst = {"before": before.observability.directions[0].sigma}

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from cameras import camera
+from optional import present
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -154,7 +155,6 @@ def write_scene(scene: Scene, path: Path, guess: Tensor | None = None, **changes
         guess: The recorded hand-eye transform (4, 4); the identity if None.
         changes: Parts of the recording to replace.
     """
-    assert scene.batch.amplitude is not None
     rows = [
         FrameRow(
             timestamp=0.1 * frame,
@@ -171,7 +171,7 @@ def write_scene(scene: Scene, path: Path, guess: Tensor | None = None, **changes
         "depth_kind": "radial",
         "rows": rows,
         "depth": scene.batch.radial_distance.float().numpy(),
-        "amplitude": scene.batch.amplitude.float().numpy(),
+        "amplitude": present(scene.batch.amplitude).float().numpy(),
         "tool_from_camera": None if guess is None else guess.numpy(),
     }
     write_recording(path, **(parts | changes))
@@ -181,11 +181,10 @@ def write_scene(scene: Scene, path: Path, guess: Tensor | None = None, **changes
 def without_invalid_pixels(scene: Scene) -> Scene:
     """Return the scene with harmless numbers where pixels are not valid, which stay so."""
     batch = scene.batch
-    assert batch.amplitude is not None
     filled = replace(
         batch,
         radial_distance=torch.where(batch.valid, batch.radial_distance, 1.5),
-        amplitude=torch.where(batch.valid, batch.amplitude, 700.0),
+        amplitude=torch.where(batch.valid, present(batch.amplitude), 700.0),
     )
     return replace(scene, batch=filled)
 

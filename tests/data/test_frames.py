@@ -10,6 +10,7 @@ import torch
 from broken_recordings import value as damaged
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optional import present
 from small_recordings import CAMERA, NUM_FRAMES, frame_rows, write_small_recording
 
 from tofcorr.data.recording import FrameBatch, Recording, iterate_frames, valid_pixels
@@ -50,13 +51,13 @@ def test_batches_agree_with_plain_numpy_whatever_the_chunk(
     if not len(chosen):
         assert batches == []
         return
-    assert radial.amplitude is not None
-    assert radial.mask is not None
-    depth, amplitude = radial.depth[chosen], radial.amplitude[chosen]
+    depth, amplitude, mask = (
+        present(images)[chosen] for images in (radial.depth, radial.amplitude, radial.mask)
+    )
     np.testing.assert_array_equal(joined(batches, "indices"), chosen)
     np.testing.assert_array_equal(joined(batches, "radial_distance"), depth.astype(np.float64))
     np.testing.assert_array_equal(joined(batches, "amplitude"), amplitude.astype(np.float64))
-    expected = np.isfinite(depth) & (depth > 0) & (radial.mask[chosen] == 1) & (amplitude < 800.0)
+    expected = np.isfinite(depth) & (depth > 0) & (mask == 1) & (amplitude < 800.0)
     np.testing.assert_array_equal(joined(batches, "valid"), expected)
     assert all(b.valid.numel() <= max(chunk_pixels, PIXELS) for b in batches)
 
@@ -83,8 +84,7 @@ def test_planes_in_the_tool_frame_hold_the_same_points(radial: Recording) -> Non
 
 def test_float32_is_given_when_asked_for(along_axis: Recording) -> None:
     batch = next(iterate_frames(along_axis, image_dtype=torch.float32))
-    assert batch.amplitude is not None
-    assert {batch.radial_distance.dtype, batch.amplitude.dtype} == {torch.float32}
+    assert {batch.radial_distance.dtype, present(batch.amplitude).dtype} == {torch.float32}
     assert {batch.normal_tool.dtype, batch.offset_tool.dtype} == {torch.float64}
 
 

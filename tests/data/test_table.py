@@ -9,6 +9,7 @@ import pytest
 from broken_recordings import cells
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optional import present
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
@@ -16,8 +17,7 @@ from tofcorr.data.table import FrameRow, read_table, table_text
 
 
 def test_an_empty_optional_cell_is_unknown_and_not_zero(folder: Path) -> None:
-    ambient = Recording.open(folder).frames.ambient
-    assert ambient is not None
+    ambient = present(Recording.open(folder).frames.ambient)
     np.testing.assert_array_equal(np.isnan(ambient), [False, True] + 4 * [False])
     assert Recording.open(folder).frames.row(1).ambient is None
 
@@ -95,7 +95,6 @@ def test_any_pose_and_time_survive_the_table(
     table = read_table(path)
     np.testing.assert_allclose(table.world_from_tool[0], pose, atol=ROUNDING)
     # Fifteen digits are written of a time in microseconds.
-    assert table.integration_time is not None
-    np.testing.assert_allclose(table.integration_time, [seconds], rtol=1e-14)
+    np.testing.assert_allclose(present(table.integration_time), [seconds], rtol=1e-14)
     assert (table.offset[0], table.timestamp[0]) == (pytest.approx(metres, rel=1e-14), metres)
     assert table.target[0] == 'a, "b"'

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from diagnosed_recordings import recorded
+from optional import present
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
@@ -25,8 +26,7 @@ def straight(folder: Path) -> Recording:
 
 def _three_images_clipped(folder: Path, seed: int) -> Recording:
     straight = recorded(folder / f"straight_{seed}", seed, [], DIM)
-    images = observe(straight, 1000).amplitude_images
-    assert images is not None
+    images = present(observe(straight, 1000).amplitude_images)
     fourth = float(images.flatten(1).amax(1).sort(descending=True).values[3])
     # The brightest tap of a pixel without ambient light: A (1 + 1 / contrast).
     clip = CLIP | {"full_counts": 3.0 * fourth}
@@ -55,8 +55,7 @@ def test_nothing_is_called_saturation_where_nothing_clips(straight: Recording) -
 def test_the_light_of_clipped_pixels_is_told_from_dim_ones(
     straight: Recording, tmp_path: Path
 ) -> None:
-    light = observe(straight, 10_000_000).amplitude_images
-    assert light is not None
+    light = present(observe(straight, 10_000_000).amplitude_images)
     clipped = recorded(tmp_path / "clipped", 50, [CLIP], DIM)
     study = prepare(clipped, DiagnosisOptions(), None).study
     inputs = study.inputs

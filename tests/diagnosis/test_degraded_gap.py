@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from diagnosed_recordings import PLAIN
+from optional import present
 
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.report.result import DiagnosisResult
@@ -19,8 +20,7 @@ def test_a_diagnosis_degrades_ideal_frames_of_poses_held_out(
     time_diagnosis: DiagnosisResult, page: str
 ) -> None:
     """Where every effect can be shown in an image, they are as near as the last stage."""
-    found, gap = time_diagnosis.degraded, time_diagnosis.gap
-    assert found is not None
+    found, gap = present(time_diagnosis.degraded), time_diagnosis.gap
     assert found.left_out == ()
     assert found.poses == time_diagnosis.evidence.study.observations.num_units
     # Same poses, pixels and floor; ten folds against single poses.

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from diagnosed_recordings import recorded, simulator
+from optional import present
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
@@ -101,9 +102,7 @@ def test_rendered_frames_of_the_built_in_simulator_are_the_simulator_itself(
 ) -> None:
     one = prepare(nothing_missing, OPTIONS, options)
     other = prepare(nothing_missing, OPTIONS, rendered())
-    assert one.as_given is not None
-    assert other.as_given is not None
-    assert torch.allclose(one.as_given, other.as_given, atol=ROUNDING)
+    assert torch.allclose(present(one.as_given), present(other.as_given), atol=ROUNDING)
     # The noise of rendered frames is estimated, so that weights differ by a trace.
     assert torch.allclose(one.study.fit.residual, other.study.fit.residual, atol=1e-4)
 
@@ -125,8 +124,7 @@ def test_a_function_gives_what_its_frames_give(
 ) -> None:
     pose = options.hand_eye.tool_from_camera().numpy()
     returned = {"depth": frames.depth, "tool_from_camera": pose}
-    function = open_simulator(lambda _: returned, observations.recording)
-    assert function is not None
+    function = present(open_simulator(lambda _: returned, observations.recording))
     ours = simulated_error(function, observations, OPTIONS)
     theirs = rendered_error(rendered(), observations, OPTIONS)
     assert torch.allclose(ours.error, theirs.error, atol=ROUNDING, equal_nan=True)
@@ -155,8 +153,7 @@ def test_the_noise_of_dark_pixels_of_camera_and_renders_is_that_of_their_differe
     drawn = generator.standard_normal(frames.depth.shape) * sd
     noisy = rendered(Frames(frames.depth + drawn.astype(np.float32), frames.amplitude))
     study = prepare(nothing_missing, OPTIONS, noisy).study
-    fit, amplitude = study.fit, study.inputs.amplitude
-    assert amplitude is not None
+    fit, amplitude = study.fit, present(study.inputs.amplitude)
     darkest = amplitude < amplitude.quantile(0.05)
     seen = fit.residual[darkest].square().mean().sqrt()
     assert float(fit.sigma[darkest].square().mean().sqrt()) == pytest.approx(float(seen), rel=0.1)
@@ -296,11 +293,11 @@ def test_the_gap_as_given_is_that_of_the_simulators_own_parameters(
     found = diagnose(nothing_missing, ideal, OPTIONS)
     error = simulated_error(options, observations, OPTIONS).error
     truth = float(error.square().mean().sqrt())
+    as_given = present(found.gap.as_given)
     assert truth > 0.01
-    assert found.gap.as_given is not None
-    assert found.gap.as_given == pytest.approx(truth, rel=0.05)
+    assert as_given == pytest.approx(truth, rel=0.05)
     assert found.gap.before < 0.1 * truth
-    assert f"{found.gap.as_given * 1e3:.1f} mm" in ".".join(found.verdict.split(".")[:2])
+    assert f"{as_given * 1e3:.1f} mm" in ".".join(found.verdict.split(".")[:2])
     shares = {share.cause: share.share for share in found.shares}
     assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
     assert abs(shares["hand_eye"]) < 0.05

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnosed_recordings import recorded
+from optional import present
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose, prepare
@@ -67,8 +68,7 @@ def test_the_one_near_pose_is_named(far: Recording, tmp_path: Path) -> None:
     (words,) = [one for one in result.remarks if one.startswith(f"Frame {far.num_frames}, at")]
     assert "no other pose is like this one" in words
     pattern = r"at ([0-9.]+) to ([0-9.]+) m, makes (\d+) % .* The others make ([0-9.]+) mm"
-    found = re.search(pattern, words)
-    assert found is not None
+    found = present(re.search(pattern, words))
     near, distant, share, others = map(float, found.groups())
     assert 0.4 < near <= distant < 1.0
     assert share > 90
@@ -84,6 +84,5 @@ def test_a_last_pose_without_a_pixel_is_one_without_a_say(time_missing: Recordin
     assert float(study.sums.count[-1]) == 0.0
     assert name_effects(study).names == ("integration_time",)
     # What was asked next of its distance ended in a traceback.
-    candidates = make_candidates(study, ["integration_time"])
-    assert candidates is not None
+    candidates = present(make_candidates(study, ["integration_time"]))
     assert max(candidates[1]) == len(depth) - 2

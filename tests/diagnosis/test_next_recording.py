@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import torch
+from optional import present
 
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.next.advice import make_candidates, next_recording
@@ -19,8 +20,8 @@ def without_conditions(study: Study, timestamp: torch.Tensor) -> Study:
 def test_time_is_varied_only_where_the_stamps_are_of_a_clock(nothing_study: Study) -> None:
     number = torch.arange(nothing_study.observations.num_frames).double()
     for stamps, is_clock in ((number, False), (10.0 + 0.7 * number, True)):
-        candidates = make_candidates(without_conditions(nothing_study, stamps), ["distance"])
-        assert candidates is not None
+        study = without_conditions(nothing_study, stamps)
+        candidates = present(make_candidates(study, ["distance"]))
         assert ("after all others" in candidates[0]) == is_clock
 
 

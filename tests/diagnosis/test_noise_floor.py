@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from diagnosed_recordings import STILL, altered, recorded
+from optional import present
 from scipy.ndimage import gaussian_filter, uniform_filter
 from torch import Tensor
 
@@ -148,8 +149,7 @@ def _recorded(folder: Path, frames: int) -> Study:
     repeats = STILL["robot"] | {"repeat_poses": 2, "repeat_frames": frames}
     recording = recorded(folder, 48, [], STILL | {"robot": repeats}, noise=False)
     noise = SIGMA * np.random.default_rng(7).standard_normal(recording.depth.shape)
-    pose = recording.frames.pose_id
-    assert pose is not None
+    pose = present(recording.frames.pose_id)
     for frame in range(1, len(noise)):
         if pose[frame] != "" and pose[frame] == pose[frame - 1]:
             noise[frame] = KEPT * noise[frame - 1] + np.sqrt(1 - KEPT**2) * noise[frame]

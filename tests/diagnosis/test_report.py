@@ -10,6 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 from diagnosed_recordings import TIME, recorded, simulator
+from optional import present
 
 from benchmarks.sealed.answers import contradictions
 from tofcorr.cli.simulate import diagnose_command as command
@@ -109,8 +110,7 @@ def test_the_fitted_simulator_measures_what_the_fit_predicts(
 
 
 def test_the_gap_is_gone_in_the_simulator_with_the_effect(time_diagnosis: DiagnosisResult) -> None:
-    closure = time_diagnosis.closure
-    assert closure is not None
+    closure = present(time_diagnosis.closure)
     assert closure.with_effects < 0.5 * closure.without_effects
 
 
@@ -122,8 +122,7 @@ def test_a_simulator_that_has_the_effect_already_lacks_nothing(
     found = diagnose(time_missing, complete, {"bootstraps": 19})
     assert found.effects == ()
     # What the true simulator leaves as given is what the robot does not repeat.
-    assert found.gap.as_given is not None
-    assert found.gap.as_given < 1.5e-3
+    assert present(found.gap.as_given) < 1.5e-3
     # Without a simulator there is nothing as given.
     assert time_diagnosis.gap.as_given is None
 
@@ -133,8 +132,7 @@ def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_pat
     lacking = simulator(32)
     found = diagnose(time_missing, lacking, {"bootstraps": 19})
     assert found.effects == ("integration_time",)
-    assert found.simulator is not None
-    slope = found.simulator.effects[0]["log_1"]
+    slope = present(found.simulator).effects[0]["log_1"]
     assert slope == pytest.approx(0.006, rel=0.2)
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnosed_recordings import STILL, altered, recorded
+from optional import present
 from scipy.ndimage import uniform_filter
 
 from tofcorr.data.recording import Recording, repeats_of
@@ -171,8 +172,7 @@ def test_repeats_have_one_exposure(tmp_path: Path) -> None:
     observations = observe(recording, 10_000)
     groups = repeats_of(observations.recording)
     assert sorted(np.concatenate(groups).tolist()) == list(range(recording.num_frames))
-    time = recording.frames.by_name()["integration_time"]
-    assert time is not None
+    time = present(recording.frames.by_name()["integration_time"])
     for group in groups:
         assert len(set(np.asarray(time)[group].tolist())) == 1
         assert len(set(observations.unit[group].tolist())) == 1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from diagnosed_recordings import recorded, simulator
+from optional import present
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.rerun.simulator import twin_distance
@@ -65,8 +66,7 @@ def test_pixels_of_the_plane_beside_the_mask_have_no_noise(tmp_path: Path) -> No
         tool_from_camera=pose,
         sigma=torch.full_like(observations.measured, 0.002),
     )
-    seen = filtered_inputs(inputs, observations, cast("BaseFit", fit)).distance_images
-    assert seen is not None
+    seen = present(filtered_inputs(inputs, observations, cast("BaseFit", fit)).distance_images)
     plane = predicted_images(observations, pose, slice(None)).float()
     whole = (observations.distance_images > 0).all((1, 2))  # The others are saturated in part.
     assert bool(whole.any())

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import torch
 from diagnosed_recordings import recorded
+from optional import present
 
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.sums.observations import observe
@@ -45,8 +46,7 @@ def test_a_fixed_pattern_is_named_and_handed_on_in_all_pixels(tmp_path: Path) ->
         recording, config={"most_pixels": 24 * 300, "bootstraps": 19, "simulate_anew": False}
     )
     assert found.effects == ("fixed_pattern",)
-    assert found.simulator is not None
-    (entry,) = found.simulator.effects
+    (entry,) = present(found.simulator).effects
     values = {key: value for key, value in entry.items() if key != "name"}
     pattern = CATALOGUE["fixed_pattern"].from_mapping(values, "the file").coefficients
     truth = drawn_values(64 * 48, _SPREAD, _SEED)

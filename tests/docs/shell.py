@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 from docs.pages import blocks
+from optional import present
 
 from tofcorr.cli.main import group
 
@@ -35,8 +36,7 @@ def parsed(line: str) -> click.Context | None:
     name, rest = "tofcorr", shlex.split(line, comments=True)[1:]
     while isinstance(command, click.Group) and rest and not rest[0].startswith("-"):
         found, under, rest = command.resolve_command(click.Context(command), rest)
-        assert under is not None
-        name, command = str(found), under
+        name, command = str(found), present(under)
     try:
         return command.make_context(name, list(rest))
     except click.exceptions.Exit:

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from drift.few_walls import FEW, Walls, sensor
+from optional import present
 from simulated_walls import EA, fitted, simulated_wall
 
 from tofcorr.correction.state import CalibrationState
@@ -24,9 +25,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Fit]:
 @pytest.fixture(scope="session")
 def reference(calibrated: tuple[Dataset, Fit], state: CalibrationState) -> Reference:
     dataset, fit = calibrated
-    found = estimate_reference(dataset, np.arange(dataset.num_frames), fit, state.noise)
-    assert found is not None
-    return found
+    return present(estimate_reference(dataset, np.arange(dataset.num_frames), fit, state.noise))
 
 
 @pytest.fixture(scope="session")

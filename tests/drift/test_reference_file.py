@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from optional import present
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import CalibrationDataError
@@ -29,13 +30,11 @@ def rewrite(path: Path, removed: tuple[str, ...] = (), **changes: Any) -> None:
 def test_the_reference_comes_back_from_its_file(
     state: CalibrationState, reference: Reference, path: Path
 ) -> None:
-    back = load_reference(path, state)
-    assert back is not None
+    back = present(load_reference(path, state))
     assert back.to_mapping() == reference.to_mapping()
     # One of an older version has neither scatter nor what came with it.
     rewrite(path, removed=("scatter", "covariance_within", "views"))
-    back = load_reference(path, state)
-    assert back is not None
+    back = present(load_reference(path, state))
     assert (back.scatter, back.covariance_within, back.views) == (1.0, None, None)
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from optional import present
 
 from tofcorr.estimation.linear import AddedColumns, NormalEquations
 
@@ -42,8 +43,7 @@ def test_values_and_shift_are_those_of_two_least_squares(generator: torch.Genera
     compared = AddedColumns(_products(known, further, residual[..., None]), _no_prior())
     for chosen in ([0], [2, 1]):
         joint = _least_squares(torch.cat([known, further[..., chosen]], dim=2), residual)
-        moved = compared(chosen)
-        assert moved is not None
+        moved = present(compared(chosen))
         torch.testing.assert_close(moved.values, joint[OWN:])
         torch.testing.assert_close(moved.shift, joint[:OWN] - _least_squares(known, residual))
 
@@ -55,8 +55,7 @@ def test_the_p_value_is_that_of_leaving_out_each_pose(generator: torch.Generator
     others = [torch.arange(POSES) != left_out for left_out in range(POSES)]
     without = torch.stack([_least_squares(both[kept], residual[kept])[-1] for kept in others])
     variance = (POSES - 1) / POSES * (without - without.mean()).square().sum()
-    moved = compared([0])
-    assert moved is not None
+    moved = present(compared([0]))
     ratio = float(moved.values[0].square() / variance)
     from scipy.stats import t
 
@@ -68,8 +67,9 @@ def test_nothing_is_found_as_often_as_the_level_says(generator: torch.Generator)
     p_values = []
     for _ in range(200):
         known, further, residual = _columns(generator, 0.0, 1.0)
-        moved = AddedColumns(_products(known, further, residual[..., None]), _no_prior())([0])
-        assert moved is not None
+        moved = present(
+            AddedColumns(_products(known, further, residual[..., None]), _no_prior())([0])
+        )
         p_values.append(moved.p_value)
     # Of 200 draws at 5 %, more than 19 have a probability of 0.2 %.
     assert sum(value < 0.05 for value in p_values) <= 19
@@ -89,8 +89,7 @@ def test_a_prior_counts_as_further_observations(generator: torch.Generator) -> N
     rows = torch.randn(6, OWN, generator=generator, dtype=torch.float64)
     off = torch.randn(6, generator=generator, dtype=torch.float64)
     prior = NormalEquations(off @ off, rows.T @ off, rows.T @ rows)
-    moved = AddedColumns(_products(known, further, residual[..., None]), prior)([0])
-    assert moved is not None
+    moved = present(AddedColumns(_products(known, further, residual[..., None]), prior)([0]))
     flat = torch.cat([known, further[..., :1]], dim=2).reshape(-1, OWN + 1)
     padded = torch.cat([flat, torch.cat([rows, torch.zeros(6, 1).double()], dim=1)])
     joint = _least_squares(padded[None], torch.cat([residual.flatten(), off])[None])
@@ -100,8 +99,7 @@ def test_a_prior_counts_as_further_observations(generator: torch.Generator) -> N
 def test_a_direction_without_information_stays_where_it_is(generator: torch.Generator) -> None:
     known, further, residual = _columns(generator, 0.3, 0.5)
     known[..., 1] = known[..., 0]
-    moved = AddedColumns(_products(known, further, residual[..., None]), _no_prior())([0])
-    assert moved is not None
+    moved = present(AddedColumns(_products(known, further, residual[..., None]), _no_prior())([0]))
     torch.testing.assert_close(moved.shift[0], moved.shift[1])
     alone = torch.cat([known[..., 1:], further[..., :1]], dim=2)
     torch.testing.assert_close(moved.values, _least_squares(alone, residual)[-1:])

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from optional import present
 from torch import Tensor
 
 from tofcorr.estimation.robust import deviation, fit_plane, largest_plane
@@ -33,8 +34,7 @@ def test_a_robust_fit_does_not_mind_a_few_other_pixels(
 
 def test_the_largest_plane_is_found_among_more_clutter(generator: torch.Generator) -> None:
     rays, distance, on_plane = view(0.6, generator)
-    found = largest_plane(rays, distance, 0.01, generator)
-    assert found is not None
+    found = present(largest_plane(rays, distance, 0.01, generator))
     near = deviation(rays, distance, found).abs() < 0.01
     assert bool(near[on_plane].all())
     assert float(near[~on_plane].double().mean()) < 0.1

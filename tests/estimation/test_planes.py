@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from optional import present
 from simulated_walls import QUIET, SENSOR, fitted, simulated_wall, true_hand_eye
 
 from tofcorr.errors import CalibrationDataError
@@ -39,11 +40,10 @@ def found(wall: Dataset) -> Fit:
 
 
 def test_a_wall_recorded_30_cm_and_17_degrees_wrong_is_found(wall: Dataset, found: Fit) -> None:
-    assert found.walls is not None
-    assert [one["wall"] for one in found.walls.summary()] == ["checkerboard", "white"]
-    normals, offsets = found.walls.walls.normal_world, found.walls.walls.offset
-    assert float(normals[:, 2].min()) > np.cos(2e-3)
-    assert float(offsets.abs().max()) < 6e-3
+    walls = present(found.walls)
+    assert [one["wall"] for one in walls.summary()] == ["checkerboard", "white"]
+    assert float(walls.walls.normal_world[:, 2].min()) > np.cos(2e-3)
+    assert float(walls.walls.offset.abs().max()) < 6e-3
     apart = found.solution.parameters.tool_from_camera - true_hand_eye(wall)
     half_mm = hand_eye_summary(found, FrameNames())["translation_ci95_mm"]
     assert bool((1e3 * apart[:3, 3].abs() < 1.5 * torch.tensor(half_mm)).all())
@@ -88,8 +88,7 @@ def test_without_tilt_the_unknown_wall_is_undetermined_with_t_z_and_the_constant
 
 
 def test_the_derivative_by_the_walls_is_that_of_the_loss(wall: Dataset, found: Fit) -> None:
-    assert found.walls is not None
-    walls, best = found.walls.walls, found.solution.parameters
+    walls, best = present(found.walls).walls, found.solution.parameters
     equations = joint_image_equations(walls.seen_by(found.moments), best, walls)
 
     def loss(step: torch.Tensor) -> torch.Tensor:
@@ -107,8 +106,7 @@ def test_the_derivative_by_the_walls_is_that_of_the_loss(wall: Dataset, found: F
 
 
 def test_the_marginal_curvature_is_the_inverse_of_the_covariances_block(found: Fit) -> None:
-    assert found.walls is not None
-    walls, best = found.walls.walls, found.solution.parameters
+    walls, best = present(found.walls).walls, found.solution.parameters
     hessian = joint_image_equations(found.moments, best, walls).hessian.sum(dim=0)
     block = torch.linalg.inv(hessian)[: best.size, : best.size]
     marginal = marginal_hessian(found.moments, best, walls)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from optional import present
 from synthetic_scene import CAMERA, DOMAIN, frame_batch
 from torch import Tensor
 
@@ -99,10 +100,10 @@ def test_joined_priors_weigh_as_both_alone(generator: torch.Generator) -> None:
     point = zero(moments).moved(
         torch.randn(len(moments.symbols), generator=generator, dtype=torch.float64)
     )
-    one = smoothness(penalties_of(model), 100.0, zero(moments))
-    other = smoothness(penalties_of(model), 5.0, point)
-    assert one is not None
-    assert other is not None
+    one, other = (
+        present(smoothness(penalties_of(model), weight, where))
+        for weight, where in ((100.0, zero(moments)), (5.0, point))
+    )
     first = replace(one, centre=point, factor=torch.eye(len(point.coefficients)).double())
     here = point.moved(0.3 * torch.ones(len(moments.symbols), dtype=torch.float64))
     both = first.joined(other).equations(here)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from optional import present
 from simulated_walls import fitted, simulated_wall, true_hand_eye
 from synthetic_scene import frame_batch
 
@@ -128,8 +129,7 @@ def test_grazing_pixels_are_those_beyond_the_angle() -> None:
 
 def test_edges_are_the_pixels_next_to_a_step_of_brightness() -> None:
     batch, _ = planar_batch([0.0, 0.0, -1.0], 1.0)
-    assert batch.amplitude is not None
-    batch.amplitude[:, :, 12:] = 400.0
+    present(batch.amplitude)[:, :, 12:] = 400.0
     found = edges(2.0)(batch)[0]
     assert bool(found[:, 11:13].all())
     assert not bool(found[:, :11].any())

@@ -8,6 +8,8 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
 
+from optional import present
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
@@ -135,10 +137,8 @@ def ros_modules() -> dict[str, ModuleType]:
 
 def load_example(name: str) -> Any:
     """Import a file of `examples/` as a module of its own."""
-    spec = spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
+    spec = present(spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py"))
     module = module_from_spec(spec)
     sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    present(spec.loader).exec_module(module)
     return module

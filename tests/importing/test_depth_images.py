@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cameras import camera
+from optional import present
 
 from tofcorr.importing.images import DepthCoding, DepthImage, coded_image, of_size, read_array
 from tofcorr.importing.run import RefusedViewError
@@ -26,8 +27,7 @@ def test_an_image_of_another_size_than_the_intrinsics_is_refused_with_both_sizes
 def test_amplitudes_turn_with_the_images_and_keep_their_counts() -> None:
     counts = np.arange(12, dtype=np.uint16).reshape(3, 4)
     depth = np.ones((3, 4)), "d.png"
-    found = coded_image(DepthCoding(rotate=90), depth, (counts, "a.png")).amplitude
-    assert found is not None
+    found = present(coded_image(DepthCoding(rotate=90), depth, (counts, "a.png")).amplitude)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, np.rot90(counts, -1))
     with pytest.raises(RefusedViewError, match=r"^a.png has 8 bits a pixel; .* as amplitude "):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from module.modules import CAMERA
+from optional import present
 from simulated_walls import simulated_wall
 
 from tofcorr.data.recording import Recording
@@ -34,8 +35,7 @@ def trained(wall: Recording, run_folder: Path) -> TrainingResult:
 
 
 def some(recording: Recording) -> tuple[torch.Tensor, torch.Tensor]:
-    assert recording.amplitude is not None
-    return torch.tensor(recording.depth[:3]), torch.tensor(recording.amplitude[:3])
+    return torch.tensor(recording.depth[:3]), torch.tensor(present(recording.amplitude)[:3])
 
 
 def test_a_fitted_module_is_the_run_of_a_training(
@@ -130,8 +130,7 @@ def test_a_network_that_was_dropped_adds_nothing_and_exports(
     module = DepthCorrection(wall.camera, terms=options)
     report = module.fit(wall)
     dropped = any("was dropped" in text for text in report.warnings)
-    network = module.error_model.residual
-    assert network is not None
+    network = present(module.error_model.residual)
     assert dropped == (not bool(network.last.weight.any()))
     module.export("torchscript", tmp_path / "corrector.ts")
     corrected, _ = torch.jit.load(str(tmp_path / "corrector.ts"))(*some(wall))

@@ -9,6 +9,7 @@ import pytest
 import torch
 from kinds_of_terms import KINDS
 from module.modules import conditions, frames, module_of, wall_batch, with_missing
+from optional import present
 from torch.func import functional_call, stack_module_state, vmap
 
 from tofcorr.module.depth_correction import DepthCorrection
@@ -135,8 +136,7 @@ def test_vmap_over_hand_eyes_agrees_with_a_loop() -> None:
 
 def test_the_loss_is_the_mean_squared_distance_to_the_planes(module: DepthCorrection) -> None:
     batch = wall_batch(module)
-    assert batch.conditions is not None
-    times, exposures, degrees = batch.conditions[:, :3].unbind(1)
+    times, exposures, degrees = present(batch.conditions)[:, :3].unbind(1)
     given = {"timestamp_s": times, "integration_time_us": 1e6 * exposures}
     given["room_temperature_c"] = degrees
     points = module.points_tool(batch.radial_distance, batch.amplitude, **given)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from optional import present
 from simulation.small import expected_frames, planned, small
 
 from tofcorr.geometry import se3
@@ -90,8 +91,7 @@ def test_speed_on_a_path_agrees_with_the_poses_before_and_after() -> None:
     options = small(shots=shots, robot=robot, conditions=conditions)
     frames = planned(options)
     facts = frames[-1].facts
-    truth = facts.tool_twist
-    assert truth is not None
+    truth = present(facts.tool_twist)
     error = (tool_twists(facts.timestamp, facts.world_from_tool) - truth).abs() / truth.abs().max()
     # Parabolas over 0.2 s of a path bent within seconds; at its ends they look to one side.
     assert error[1:-1].max() < 0.05

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from correction.export.states import EYE_TO_HAND, NAMES, TRANSFORMS, calibration, write
+from optional import present
 from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.state import HandEyeAccuracy
@@ -40,14 +41,12 @@ def rotation_of_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
 
 def by_urdf(text: str) -> Pose:
     robot = ElementTree.fromstring(text)
-    joint = robot.find("joint")
+    joint = present(robot.find("joint"))
     assert robot.tag == "robot"
-    assert joint is not None
     assert joint.get("type") == "fixed"
     frames = [joint.find(tag).get("link") for tag in ("parent", "child")]  # type: ignore[union-attr]
     assert [link.get("name") for link in robot.findall("link")] == frames[1:]
-    origin = joint.find("origin")
-    assert origin is not None
+    origin = present(joint.find("origin"))
     xyz, rpy = ([float(word) for word in origin.attrib[key].split()] for key in ("xyz", "rpy"))
     return Pose(xyz, rotation_of_rpy(*rpy), frames)
 

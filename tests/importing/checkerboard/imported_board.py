@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 from importing.checkerboard.rendered_board import varied_placements
+from optional import present
 from running import Said
 
 PLACEMENTS = varied_placements(6)
@@ -18,9 +19,7 @@ LENS = (*FOCAL, "--distortion", "0.06,-0.12,0.0008,-0.0005,0.02")
 
 
 def read_image(path: Path) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert image is not None
-    return image
+    return present(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
 
 
 def report(tmp_path: Path) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from importing.checkerboard.rendered_board import angle_deg
+from optional import present
 
 from tofcorr.data.recording import Recording
 from tofcorr.geometry.rays import ray_directions
@@ -33,11 +34,9 @@ def test_every_tenth_view_is_imported_and_depth_agrees_to_centimetres(
     report, recording = import_views(real_data, "0??5", tmp_path / "recording")
     assert report["refused"] == []
     assert recording.num_frames == 10
-    assert recording.mask is not None
     rays = ray_directions(recording.camera).numpy()
-    for view, normal, depth, mask in zip(
-        report["views"], recording.frames.normal_world, recording.depth, recording.mask, strict=True
-    ):
+    images = recording.frames.normal_world, recording.depth, present(recording.mask)
+    for view, normal, depth, mask in zip(report["views"], *images, strict=True):
         assert view["reprojection_rms_px"] < 0.2
         assert abs(view["depth_error_mm"]) < 40
         # An independent look at the tilt: the plane through the depth itself.

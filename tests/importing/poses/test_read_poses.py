@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from optional import present
 from scipy.spatial.transform import Rotation
 
 from tofcorr.errors import CalibrationDataError
@@ -64,8 +65,7 @@ def test_stamps_since_1970_may_count_finer_units_than_seconds(
     header = "timestamp,x,y,z,qx,qy,qz,qw\n"
     path = tmp_path / name
     path.write_text(row if name.endswith(".txt") else header + row.replace(" ", ","), "utf-8")
-    stamps = read_poses(path).timestamp
-    assert stamps is not None
+    stamps = present(read_poses(path).timestamp)
     np.testing.assert_allclose(stamps, [1_700_000_000.5], rtol=0, atol=1e-6)
 
 

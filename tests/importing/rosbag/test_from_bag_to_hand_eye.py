@@ -9,6 +9,7 @@ from cameras import apart
 from importing.posed_scene import Drive, Recorded
 from importing.rosbag import written_bags as bags
 from importing.rosbag.test_import_rosbag import WITH_INFRARED, import_bag
+from optional import present
 from running import Program
 from scipy.spatial.transform import Rotation
 
@@ -20,8 +21,7 @@ LAG_NEAR_S = 0.010
 
 def exported_hand_eye(urdf: Path) -> np.ndarray:
     """Read the joint's origin as the URDF specification defines it, shape (4, 4)."""
-    origin = ElementTree.parse(urdf).find("joint/origin")
-    assert origin is not None
+    origin = present(ElementTree.parse(urdf).find("joint/origin"))
     xyz, rpy = ([float(word) for word in origin.attrib[key].split()] for key in ("xyz", "rpy"))
     transform = np.eye(4)
     transform[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()

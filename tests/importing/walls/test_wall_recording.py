@@ -17,6 +17,7 @@ from importing.walls.rendered_room import (
     poses_in_room,
 )
 from importing.walls.rendered_room import imported as imported_room
+from optional import present
 
 import tofcorr
 from tofcorr.data.recording import Recording
@@ -65,10 +66,8 @@ def test_each_image_and_wall_is_a_frame_with_a_mask_of_its_own(imported: Importe
     recording, views, table = imported.recording, imported.views, imported.recording.frames
     of_image = np.array([int(view["view"]) for view in imported.report["views"]])
     assert recording.num_frames == len(of_image) > len(views.depth)
-    assert recording.mask is not None
-    assert table.pose_id is not None
     walls = {wall["name"]: wall for wall in imported.report["walls"]}
-    masks = np.asarray(recording.mask, dtype=int)
+    masks = np.asarray(present(recording.mask), dtype=int)
     for frame, image in enumerate(of_image):
         wall = walls[str(table.target[frame])]
         np.testing.assert_allclose(table.normal_world[frame], wall["normal_world"], atol=1e-12)
@@ -80,7 +79,7 @@ def test_each_image_and_wall_is_a_frame_with_a_mask_of_its_own(imported: Importe
         assert np.bincount(true + 1).max() > 0.9 * len(true)
     for image in set(of_image):
         own = of_image == image
-        assert len(set(table.pose_id[own])) == 1
+        assert len(set(present(table.pose_id)[own])) == 1
         assert masks[own].sum(axis=0).max() == 1
     assert len(np.unique(Dataset((recording,)).pose_groups())) == len(set(of_image))
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from optional import present
 from simulation.effects.scenes import Scene
 from torch import Tensor
 
@@ -18,8 +19,7 @@ ERROR_AT_EDGES = torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.f
 @pytest.fixture(scope="module")
 def shaded(at_rest: Scene) -> EffectInputs:
     """A target without a pattern; what is farther away is darker."""
-    assert at_rest.inputs.distance_images is not None
-    distances = at_rest.inputs.distance_images.double()
+    distances = present(at_rest.inputs.distance_images).double()
     inputs = replace(at_rest.inputs, modulation_frequency=FREQUENCY, distance_images=distances)
     nearest = distances.amin((1, 2), keepdim=True)
     return _lit(inputs, (nearest / distances) ** 2)
@@ -35,16 +35,14 @@ def _lit(inputs: EffectInputs, images: Tensor, noise: float | None = None) -> Ef
 def _explained(inputs: EffectInputs, generator: torch.Generator, noise: float | None) -> float:
     """Return the product of errors at edges and noise of the phase, in standard errors."""
     effect = MixedPixelsEffect.for_recording(inputs)
-    assert inputs.amplitude_images is not None
-    assert inputs.distance_images is not None
-    phase = inputs.distance_images / inputs.metres_per_radian
+    phase = present(inputs.distance_images) / inputs.metres_per_radian
     products = []
     for _ in range(DRAWS):
         white = torch.randn(*phase.shape, 2, dtype=torch.float64, generator=generator)
         filtered = blur(torch.view_as_complex(white), 1.0)
         filtered = filtered * NOISE / filtered.real.std()
         turned = 1 + filtered * torch.polar(torch.ones_like(phase), -phase)
-        seen = _lit(inputs, inputs.amplitude_images * turned.abs(), noise)
+        seen = _lit(inputs, present(inputs.amplitude_images) * turned.abs(), noise)
         edges = effect.shift(seen, ERROR_AT_EDGES)
         error = turned.angle().flatten(1)[inputs.frame, inputs.pixel]
         sums = torch.zeros(len(phase), dtype=torch.float64)
@@ -63,9 +61,8 @@ def test_filtered_noise_of_distances_is_not_explained_by_that_of_amplitudes(
 
 def test_edges_that_exceed_the_noise_stay(at_rest: Scene) -> None:
     inputs = at_rest.inputs
-    assert inputs.amplitude_images is not None
     effect = MixedPixelsEffect.for_recording(inputs)
-    images = inputs.amplitude_images
+    images = present(inputs.amplitude_images)
     seen = [_lit(inputs, images, noise) for noise in (None, NOISE)]
     plain, shared = (effect.shift(one, ERROR_AT_EDGES) for one in seen)
     strong = plain > 0.95
