@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from cameras import rigid
 from scipy.ndimage import convolve1d
 from scipy.spatial.transform import Rotation
 
@@ -119,10 +120,8 @@ def record(
 
 def _looking_at_wall(random: np.random.Generator) -> np.ndarray:
     angles, distance = random.uniform(-0.5, 0.5, 2), random.uniform(0.6, 1.8)
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("XY", angles).as_matrix() @ np.diag([1.0, -1.0, -1.0])
-    pose[:3, 3] = -distance * pose[:3, 2]
-    return pose
+    turn = Rotation.from_euler("XY", angles) * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+    return rigid(turn, -distance * turn.as_matrix()[:, 2])
 
 
 def _white(random: np.random.Generator, width: float) -> np.ndarray:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cameras import camera
+from cameras import camera, rigid
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.table import FrameRow
@@ -14,12 +14,9 @@ NUM_FRAMES = 6
 CAMERA = camera((7, 5), (9.0, 9.5), (3.2, 1.9), -0.08, 0.02, 0.0005, -0.0004, 0.0)
 
 
-def rigid(generator: np.random.Generator) -> np.ndarray:
+def drawn_transform(generator: np.random.Generator) -> np.ndarray:
     """Draw a rigid transform (4, 4)."""
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_quat(generator.normal(size=4)).as_matrix()
-    transform[:3, 3] = generator.normal(size=3)
-    return transform
+    return rigid(Rotation.from_quat(generator.normal(size=4)), generator.normal(size=3))
 
 
 def frame_rows(generator: np.random.Generator, num_frames: int = NUM_FRAMES) -> list[FrameRow]:
@@ -30,7 +27,7 @@ def frame_rows(generator: np.random.Generator, num_frames: int = NUM_FRAMES) -> 
         rows.append(
             FrameRow(
                 timestamp=0.1 * frame,
-                world_from_tool=rigid(generator),
+                world_from_tool=drawn_transform(generator),
                 normal_world=normal / np.linalg.norm(normal),
                 offset=float(generator.normal()),
                 target="white" if frame % 2 else "checkerboard",
@@ -66,7 +63,7 @@ def write_small_recording(path: Path, seed: int = 0, **changes: Any) -> Path:
         "rows": frame_rows(generator),
         "modulation_frequency": 20e6,
         "saturation_amplitude": 800.0,
-        "tool_from_camera": rigid(generator),
+        "tool_from_camera": drawn_transform(generator),
         **small_images(generator),
     }
     write_recording(path, **(parts | changes))

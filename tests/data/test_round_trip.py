@@ -9,7 +9,13 @@ import pytest
 import yaml
 from broken_recordings import header
 from optional import present
-from small_recordings import CAMERA, frame_rows, rigid, small_images, write_small_recording
+from small_recordings import (
+    CAMERA,
+    drawn_transform,
+    frame_rows,
+    small_images,
+    write_small_recording,
+)
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
@@ -23,7 +29,7 @@ ROUNDING = 1e-14
 
 def test_every_part_survives_writing_and_opening(folder: Path) -> None:
     generator = np.random.default_rng(0)
-    rows, tool_from_camera = frame_rows(generator), rigid(generator)
+    rows, tool_from_camera = frame_rows(generator), drawn_transform(generator)
     images, recording = small_images(generator), Recording.open(folder)
     assert (recording.camera, recording.depth_kind) == (CAMERA, "radial")
     assert (recording.modulation_frequency, recording.saturation_amplitude) == (20e6, 800.0)

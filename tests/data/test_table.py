@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from broken_recordings import cells
+from cameras import rigid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optional import present
@@ -83,9 +84,7 @@ def test_any_pose_and_time_survive_the_table(
     metres: float,
     microseconds: float,
 ) -> None:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    pose[:3, 3] = metres
+    pose = rigid(Rotation.from_quat(quaternion), metres)
     seconds = microseconds * 1e-6
     of_frame: dict[str, Any] = {"normal_world": pose[2, :3], "offset": metres, "target": 'a, "b"'}
     of_frame |= {"timestamp": metres, "integration_time": seconds}

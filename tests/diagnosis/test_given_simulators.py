@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from cameras import rigid
 from diagnosed_recordings import recorded, simulator
 from optional import present
+from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
@@ -37,8 +39,7 @@ OPTIONS = DiagnosisOptions(
     bootstraps=40, simulate_anew=False, page=False, catalogue=("integration_time",)
 )
 # Where no camera of these recordings sits on the tool.
-MOUNT = np.eye(4)
-MOUNT[:3, 3] = 0.0, 0.2, 0.1
+MOUNT = rigid(Rotation.identity(), [0.0, 0.2, 0.1])
 # Rounding of depth to float32 at two metres.
 ROUNDING = 3e-7
 Render = Callable[..., Recording]

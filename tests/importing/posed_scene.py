@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from cameras import rigid
 from scipy.spatial.transform import Rotation, Slerp
 
 # Planes n . x + d = 0 around the robot, normals inwards, z up.
@@ -20,9 +21,7 @@ ROOM = (FLOOR, FRONT, LEFT)
 FARTHEST = 6.5
 """Metres from which on nothing returns: 0.1 mm in 16 bits reach 6.55 m."""
 
-HAND_EYE = np.eye(4)
-HAND_EYE[:3, :3] = Rotation.from_rotvec([0.3, -0.4, 1.1]).as_matrix()
-HAND_EYE[:3, 3] = [0.05, -0.03, 0.08]
+HAND_EYE = rigid(Rotation.from_rotvec([0.3, -0.4, 1.1]), [0.05, -0.03, 0.08])
 
 DISTORTION = (-0.06, 0.02, 0.0008, -0.0005, 0.0)
 """Of a plumb_bob lens."""
@@ -157,11 +156,9 @@ class Drive:
         smooth[number == len(stops) - 1] = 0.0
         turned = Slerp(np.arange(len(stops)), Rotation.from_matrix(stops[:, :3, :3]))
         following = np.minimum(number + 1, len(stops) - 1)
-        poses = np.tile(np.eye(4), (len(times), 1, 1))
-        poses[:, :3, :3] = turned(number + smooth).as_matrix()
         weight = smooth[:, None]
-        poses[:, :3, 3] = (1 - weight) * stops[number, :3, 3] + weight * stops[following, :3, 3]
-        return poses, np.where(share > 0, -1, number)
+        place = (1 - weight) * stops[number, :3, 3] + weight * stops[following, :3, 3]
+        return rigid(turned(number + smooth), place), np.where(share > 0, -1, number)
 
     def _matrix(self) -> np.ndarray:
         focal = 0.95 * self.width
@@ -234,11 +231,8 @@ def looking(place: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
     z = (at - place) / np.linalg.norm(at - place)
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0, 0, roll]).as_matrix()
-    pose[:3, 3] = place
-    return pose
+    upright = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
+    return rigid(upright * Rotation.from_rotvec([0, 0, roll]), place)
 
 
 def met(

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from cameras import rigid
 from kinds_of_terms import DOMAIN
 from scipy.spatial.transform import Rotation
 from small_recordings import CAMERA
@@ -57,10 +58,8 @@ def calibration(
 
 def transform_of(euler_deg: tuple[float, float, float]) -> np.ndarray:
     """Return a transform (4, 4) of fixed-axis angles about x, y, z."""
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_euler("xyz", euler_deg, degrees=True).as_matrix()
-    transform[:3, 3] = (0.0312, -0.0541, 0.1273)
-    return transform
+    turn = Rotation.from_euler("xyz", euler_deg, degrees=True)
+    return rigid(turn, (0.0312, -0.0541, 0.1273))
 
 
 # Upright, general, at both ends of the pitch (where roll and yaw are not unique), and half turns.

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cameras import apart
+from cameras import apart, rigid
 from importing import scene_files
 from importing.frames.imported import assert_equal_recordings, import_png, run_import
 from importing.posed_scene import Drive, Recorded
+from scipy.spatial.transform import Rotation
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +36,7 @@ def test_a_bop_scene_gives_the_recording_of_the_same_images_and_poses_in_files(
 def test_the_walls_speak_where_poses_are_not_those_of_the_camera(
     scene: Recorded, tmp_path: Path
 ) -> None:
-    aside = np.eye(4)
-    aside[:3, 3] = [0.12, -0.05, 0.03]
+    aside = rigid(Rotation.identity(), [0.12, -0.05, 0.03])
     shifted = replace(scene, exact=scene.exact @ aside)
     imported = run_import("bop", scene_files.write_bop(shifted, tmp_path / "s"), out=tmp_path / "o")
     assert "away from its poses" in imported.text

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cameras import rigid
 from importing.frames.imported import Imported, run_import
 from optional import present
 from scipy.spatial.transform import Rotation
@@ -63,11 +64,9 @@ MATRIX = np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]])
 
 def board_pose(number: int) -> np.ndarray:
     generator = np.random.default_rng(number)
-    pose = np.eye(4)
-    tilt = generator.uniform(-30, 30, 2)
-    pose[:3, :3] = Rotation.from_euler("xyz", [*tilt, 20 * number], degrees=True).as_matrix()
-    pose[:3, 3] = [0.0, 0.0, 0.45 + 0.03 * number]
-    return pose
+    angles = [*generator.uniform(-30, 30, 2), 20 * number]
+    turn = Rotation.from_euler("xyz", angles, degrees=True)
+    return rigid(turn, [0.0, 0.0, 0.45 + 0.03 * number])
 
 
 def write_views(folder: Path, drawn: np.ndarray, size: tuple[float, float], count: int) -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cameras import rigid
 from optional import present
 from scipy.spatial.transform import Rotation
 
@@ -11,9 +12,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.pose_files import read_poses
 
 TURN = Rotation.from_rotvec([0.2, -0.5, 0.9])
-POSE = np.eye(4)
-POSE[:3, :3] = TURN.as_matrix()
-POSE[:3, 3] = [0.1, -0.2, 0.3]
+POSE = rigid(TURN, [0.1, -0.2, 0.3])
 X, Y, Z, W = TURN.as_quat()
 ROW = " ".join(f"{number:.9f}" for number in POSE.ravel())
 AXIS = ",".join(f"{number:.9f}" for number in TURN.as_rotvec())

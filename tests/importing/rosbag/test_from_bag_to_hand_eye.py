@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from cameras import apart
+from cameras import apart, rigid
 from importing.posed_scene import Drive, Recorded
 from importing.rosbag import written_bags as bags
 from importing.rosbag.test_import_rosbag import WITH_INFRARED, import_bag
@@ -23,10 +23,7 @@ def exported_hand_eye(urdf: Path) -> np.ndarray:
     """Read the joint's origin as the URDF specification defines it, shape (4, 4)."""
     origin = present(ElementTree.parse(urdf).find("joint/origin"))
     xyz, rpy = ([float(word) for word in origin.attrib[key].split()] for key in ("xyz", "rpy"))
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
-    transform[:3, 3] = xyz
-    return transform
+    return rigid(Rotation.from_euler("xyz", rpy), xyz)
 
 
 @pytest.fixture(scope="module", params=[0, 2026])

@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from cameras import rigid
 from importing.posed_scene import Recorded
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -20,10 +21,8 @@ INFO = "/camera/depth/camera_info"
 TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms"
 BASE, TOOL, CAMERA = "base_link", "tool0", "tof_optical"
 
-ARM = np.eye(4)
+ARM = rigid(Rotation.from_rotvec([0.0, 0.5, 0.2]), [0.02, 0.0, 0.11])
 """tool_from_wrist's inverse: the static last hop."""
-ARM[:3, :3] = Rotation.from_rotvec([0.0, 0.5, 0.2]).as_matrix()
-ARM[:3, 3] = [0.02, 0.0, 0.11]
 
 
 class Bag:
@@ -150,10 +149,8 @@ def write_robot(bag: Bag, recorded: Recorded) -> None:
     bag.transform("/tf_static", first, "world", BASE, np.diag([-1.0, -1.0, 1.0, 1.0]))
     bag.transform("/tf_static", first, "wrist", TOOL, ARM)
     for time, pose in zip(recorded.pose_times, recorded.world_from_tool, strict=True):
-        shoulder = np.eye(4)
         turn = np.arctan2(pose[1, 3], pose[0, 3] + 3.0)
-        shoulder[:3, :3] = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
-        shoulder[2, 3] = 0.4
+        shoulder = rigid(Rotation.from_rotvec([0.0, 0.0, turn]), [0.0, 0.0, 0.4])
         wrist = np.linalg.inv(shoulder) @ pose @ np.linalg.inv(ARM)
         bag.transform("/tf", time, BASE, "shoulder", shoulder)
         bag.transform("/tf", time, "shoulder", "wrist", wrist)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cameras import rigid
 from importing.posed_scene import Drive, Recorded
 from optional import present
 from scipy.spatial.transform import Rotation
@@ -13,10 +14,8 @@ from tofcorr.importing.timing import estimate_lag, far_lags, find_stops, pair
 
 def screw(times: np.ndarray) -> PoseTrack:
     """A tool that moves at 0.2 m/s along x and turns at 0.5 rad/s about z."""
-    poses = np.tile(np.eye(4), (len(times), 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(0.5 * times[:, None] * [0, 0, 1.0]).as_matrix()
-    poses[:, 0, 3] = 0.2 * times
-    return PoseTrack.checked(poses, "screw", times)
+    turns = Rotation.from_rotvec(0.5 * times[:, None] * [0, 0, 1.0])
+    return PoseTrack.checked(rigid(turns, 0.2 * times[:, None] * [1.0, 0, 0]), "screw", times)
 
 
 def test_motion_is_interpolated_up_to_a_gap_which_is_named() -> None:

@@ -157,10 +157,8 @@ def poses_in_room(
 
 def hand_eye_anywhere(generator: np.random.Generator) -> np.ndarray:
     """Draw a hand-eye transform: any rotation, up to 150 mm along each axis."""
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_quat(generator.normal(size=4)).as_matrix()
-    transform[:3, 3] = generator.uniform(-0.15, 0.15, 3)
-    return transform
+    turn = Rotation.from_quat(generator.normal(size=4))
+    return cameras.rigid(turn, generator.uniform(-0.15, 0.15, 3))
 
 
 RADIAL = PosedOptions(depth_kind="radial")
@@ -221,12 +219,10 @@ def found_in_images(
 
 def looking_straight(number: int, roll: float, generator: np.random.Generator) -> np.ndarray:
     """Draw camera poses (N, 4, 4) that look at FRONT head-on, rolled by up to `roll` radians."""
-    poses = poses_in_room(number, generator)
-    straight = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    for pose in poses:
-        turn = Rotation.from_rotvec([0, 0, generator.uniform(-1, 1) * roll]).as_matrix()
-        pose[:3, :3] = straight @ turn
-    return poses
+    places = poses_in_room(number, generator)[:, :3, 3]
+    straight = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    rolls = Rotation.from_rotvec(roll * generator.uniform(-1, 1, (number, 1)) * [0, 0, 1])
+    return cameras.rigid(straight * rolls, places)
 
 
 def intrinsics(camera: Camera) -> CameraIntrinsics:
