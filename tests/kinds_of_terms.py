@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import Domain, Interval
@@ -47,7 +47,7 @@ def model_of(kind: str, domain: Domain = DOMAIN, **options: Any) -> ErrorModel:
 
 
 def randomise(
-    model: torch.nn.Module, generator: torch.Generator, size: float = 1.0, of_network: float = 1.0
+    model: torch.nn.Module, generator: Generator, size: float = 1.0, of_network: float = 1.0
 ) -> None:
     """Give every parameter, and the map of the pixels, random values of these sizes."""
     with torch.no_grad():
@@ -57,7 +57,7 @@ def randomise(
                 value.copy_(scale * torch.randn(value.shape, generator=generator))
 
 
-def inputs(generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+def inputs(generator: Generator) -> tuple[Tensor, Tensor, Tensor]:
     """Draw distances and amplitudes (3, 5, 7), and conditions (3, C)."""
     u = torch.rand(2, 3, 5, 7, generator=generator, dtype=torch.float64)
     conditions = 1.0 + 3.0 * torch.rand(3, len(CONDITIONS), generator=generator).double()

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 import yaml
 from optional import present
+from torch import Generator
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
@@ -106,7 +107,7 @@ def followed(folder: Path, seed: int, robot: dict[str, Any]) -> dict[str, float]
     advised, _ = advise(first, pool, before)
     at_random = random.choice(len(pool.target), len(advised), replace=False).tolist()
     worst = {"before": before.observability.directions[0].sigma}
-    generator = torch.Generator().manual_seed(seed)
+    generator = Generator().manual_seed(seed)
     for name, chosen in (("advised", advised), ("random", at_random)):
         targets = [pool.target[k] for k in chosen]
         more = taken(folder / name, seed, pool.world_from_tool[chosen], targets, generator)
@@ -116,16 +117,12 @@ def followed(folder: Path, seed: int, robot: dict[str, Any]) -> dict[str, float]
 
 
 def taken(
-    folder: Path,
-    seed: int,
-    world_from_tool: torch.Tensor,
-    targets: list[str],
-    generator: torch.Generator,
+    folder: Path, seed: int, world_from_tool: torch.Tensor, targets: list[str], generator: Generator
 ) -> Dataset:
     """Simulate a recording at given poses, with the robot's repeatability and sensor noise."""
     shots = tuple((target, 1) for target in targets)
     options = wall_options(seed, shots, conditions={"recorded": ()})
-    plan = draw_plan(options, torch.Generator().manual_seed(seed))
+    plan = draw_plan(options, Generator().manual_seed(seed))
     robot = options.robot
     scale = torch.tensor([robot.repeatability_mm] * 3 + [robot.repeatability_mrad] * 3) / 1e3
     slips = scale.double() * torch.randn(len(targets), 6, generator=generator, dtype=torch.float64)

@@ -9,7 +9,7 @@ import torch
 from cameras import camera
 from optional import present
 from scipy.spatial.transform import Rotation
-from torch import Tensor
+from torch import Generator, Tensor
 
 from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.data.table import FrameRow
@@ -99,7 +99,7 @@ class Scene:
 
 
 def make_scene(
-    generator: torch.Generator,
+    generator: Generator,
     terms: dict = EA,
     num_frames: int = 14,
     noise: float = 0.003,
@@ -189,18 +189,18 @@ def without_invalid_pixels(scene: Scene) -> Scene:
     return replace(scene, batch=filled)
 
 
-def nearby(truth: Parameters, generator: torch.Generator, size: float = 0.01) -> Parameters:
+def nearby(truth: Parameters, generator: Generator, size: float = 0.01) -> Parameters:
     """Return parameters a random step away: `size` metres and radians."""
     step = size * torch.randn(truth.size, generator=generator, dtype=torch.float64)
     return truth.moved(step)
 
 
-def _hand_eye(generator: torch.Generator) -> Tensor:
+def _hand_eye(generator: Generator) -> Tensor:
     twist = torch.tensor([0.05, -0.02, 0.12, 0.3, -0.2, 1.5], dtype=torch.float64)
     return se3.exp(twist + 0.05 * torch.randn(6, generator=generator, dtype=torch.float64))
 
 
-def _camera_pose(generator: torch.Generator) -> Tensor:
+def _camera_pose(generator: Generator) -> Tensor:
     """Return world_from_camera before the wall z = 0, looking at it tilted and rolled."""
     tilt, roll, distance = _uniform(generator, 3).tolist(), _uniform(generator, 1), 0.0
     distance = 0.8 + 1.0 * float(_uniform(generator, 1))
@@ -210,5 +210,5 @@ def _camera_pose(generator: torch.Generator) -> Tensor:
     return se3.assemble(rotation, place)
 
 
-def _uniform(generator: torch.Generator, *shape: int) -> Tensor:
+def _uniform(generator: Generator, *shape: int) -> Tensor:
     return torch.rand(*shape, generator=generator, dtype=torch.float64)

@@ -27,9 +27,7 @@ def imports() -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("library", CONFINED)
-def test_library_is_imported_only_where_it_may_be(
-    library: str, imports: dict[str, set[str]]
-) -> None:
+def test_a_library_is_imported_where_it_may_be(library: str, imports: dict[str, set[str]]) -> None:
     users = {
         path
         for path, names in imports.items()

@@ -4,13 +4,14 @@ import pytest
 import torch
 from kinds_of_terms import built
 from module.modules import CAMERA
+from torch import Generator
 
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
 
 
-def transform(generator: torch.Generator) -> torch.Tensor:
+def transform(generator: Generator) -> torch.Tensor:
     return se3.exp(torch.randn(6, generator=generator, dtype=torch.float64))
 
 
@@ -19,13 +20,13 @@ def model_of(hand_eye: HandEye) -> CalibrationModel:
     return CalibrationModel(built(*terms), hand_eye)
 
 
-def test_training_starts_at_the_guess_and_may_be_moved_or_fixed(generator: torch.Generator) -> None:
+def test_training_starts_at_the_guess_and_may_be_moved_or_fixed(generator: Generator) -> None:
     guess = transform(generator)
     torch.testing.assert_close(HandEye(guess)(), guess, rtol=0, atol=1e-15)
     assert not [p for p in HandEye(fixed=True).parameters() if p.requires_grad]
 
 
-def test_rebasing_moves_the_guess_and_forgets_the_twist(generator: torch.Generator) -> None:
+def test_rebasing_moves_the_guess_and_forgets_the_twist(generator: Generator) -> None:
     hand_eye, other = HandEye(transform(generator)), transform(generator)
     hand_eye.twist.data.copy_(torch.randn(6, generator=generator, dtype=torch.float64))
     hand_eye.rebase(other)
@@ -40,9 +41,7 @@ def test_what_is_no_rigid_transform_is_refused() -> None:
             HandEye(wrong)
 
 
-def test_residual_is_the_distance_of_the_corrected_point_to_the_plane(
-    generator: torch.Generator,
-) -> None:
+def test_the_residual_is_the_distance_of_a_point_to_the_plane(generator: Generator) -> None:
     """Written out pixel by pixel, without the model's rearrangement."""
     tool_from_camera = transform(generator)
     model = model_of(HandEye(tool_from_camera))

@@ -84,7 +84,7 @@ def test_a_calibration_survives_its_file_and_an_older_one_is_read(tmp_path: Path
 
 
 @pytest.mark.parametrize("name", STATES)
-def test_a_state_that_was_changed_is_refused_by_key(tmp_path: Path, name: str) -> None:
+def test_a_changed_state_is_refused_by_key(tmp_path: Path, name: str) -> None:
     change, message = STATES[name]
     save_calibration(tmp_path / "state.pt", calibration(TRANSFORMS["general"]))
     values = torch.load(tmp_path / "state.pt", weights_only=True)
@@ -116,9 +116,7 @@ def module_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_a_module_that_was_changed_is_refused_by_key(
-    tmp_path: Path, module_file: Path, name: str
-) -> None:
+def test_a_changed_module_is_refused_by_key(tmp_path: Path, module_file: Path, name: str) -> None:
     change, message = MODULES[name]
     values = torch.load(module_file, weights_only=True)
     change(values)
@@ -128,9 +126,7 @@ def test_a_module_that_was_changed_is_refused_by_key(
     assert "\n" not in str(refusal.value)
 
 
-def test_every_tensor_of_a_module_is_compared_in_shape_and_number(
-    tmp_path: Path, module_file: Path
-) -> None:
+def test_every_tensor_of_a_module_is_compared(tmp_path: Path, module_file: Path) -> None:
     values = torch.load(module_file, weights_only=True)
     for name in ("_extra_state", "hand_eye.twist", list(values["state"])[-1]):
         tensor = values["state"][name]

@@ -37,8 +37,6 @@ def test_a_folder_in_place_of_a_file_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("amplitude", [np.nan, np.inf, 0.0])
-def test_an_amplitude_that_is_not_negative_is_no_reason_to_refuse(
-    folder: Path, amplitude: float
-) -> None:
+def test_only_a_negative_amplitude_is_a_reason_to_refuse(folder: Path, amplitude: float) -> None:
     value("amplitude", (4, 2, 3), amplitude)(folder)
     assert Recording.open(folder).num_frames == 6

@@ -37,9 +37,7 @@ def test_rows_taken_from_a_table_give_the_same_table(folder: Path, tmp_path: Pat
         np.testing.assert_array_equal(getattr(again, name), getattr(table, name)[[4, 1]])
 
 
-def test_a_table_from_windows_with_other_columns_in_another_order_is_read_alike(
-    folder: Path,
-) -> None:
+def test_a_table_from_windows_with_more_columns_in_any_order_is_read_alike(folder: Path) -> None:
     before = Recording.open(folder).frames
     path = folder / "frames.csv"
     with path.open(newline="") as file:

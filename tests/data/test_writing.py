@@ -38,9 +38,7 @@ def write(
 
 
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt, RuntimeError, SystemExit])
-def test_an_interrupted_write_leaves_nothing(
-    tmp_path: Path, interruption: type[BaseException]
-) -> None:
+def test_an_interrupted_write_is_undone(tmp_path: Path, interruption: type[BaseException]) -> None:
     with pytest.raises(interruption):
         write(tmp_path / "a" / "b", {"truth": {"x": np.ones(2)}}, end=interruption)
     assert contents(tmp_path) == []

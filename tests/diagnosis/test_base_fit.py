@@ -79,9 +79,7 @@ def test_ordinary_residuals_keep_their_weight_and_gross_ones_lose_it() -> None:
     assert weights[6:].tolist() == [0.0, 0.0]
 
 
-def test_undetermined_directions_of_the_hand_eye_transform_stay_near_the_guess(
-    tmp_path: Path,
-) -> None:
+def test_undetermined_directions_of_the_hand_eye_stay_near_the_guess(tmp_path: Path) -> None:
     """Without tilts the poses do not determine roll, and a leaning wall would bias it."""
     lean = {"name": "target_registration", "lean_x": 0.01, "lean_y": -0.01}
     upright = {"robot": {"tilt_axes": "none"}}

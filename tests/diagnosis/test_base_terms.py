@@ -76,9 +76,7 @@ def test_every_kind_of_term_can_be_the_base_of_a_diagnosis(kind: str, demo: Reco
 
 
 @pytest.mark.parametrize("kind", NEEDS)
-def test_a_term_whose_input_is_missing_is_refused_with_what_is_missing(
-    kind: str, tmp_path: Path
-) -> None:
+def test_a_term_without_its_input_is_refused_by_what_is_missing(kind: str, tmp_path: Path) -> None:
     hidden = {"conditions": {"recorded": ["pose_id"]}}
     recording = recorded(tmp_path / "hidden", 46, [], hidden)
     unknown = replace(recording, modulation_frequency=None)
@@ -124,9 +122,7 @@ def test_a_fixed_pattern_in_the_base_is_not_named(folder: Path) -> None:
     assert not {"fixed_pattern", "row_column_pattern"} & set(with_pattern.ranking)
 
 
-def test_an_integration_time_term_in_the_base_takes_the_effect_away(
-    time_missing: Recording,
-) -> None:
+def test_an_integration_time_term_of_the_base_takes_the_effect(time_missing: Recording) -> None:
     paper = ("distance_polynomial", "pixel_polynomial", "amplitude_polynomial")
     few = ["integration_time", "ambient_light", "incidence_angle"]
     study = _study(time_missing, *paper, catalogue=few)

@@ -52,9 +52,7 @@ def test_nothing_is_called_saturation_where_nothing_clips(straight: Recording) -
     assert not _names_saturation(straight)
 
 
-def test_the_light_of_clipped_pixels_is_told_from_dim_ones(
-    straight: Recording, tmp_path: Path
-) -> None:
+def test_the_light_of_clipped_pixels_is_recovered(straight: Recording, tmp_path: Path) -> None:
     light = present(observe(straight, 10_000_000).amplitude_images)
     clipped = recorded(tmp_path / "clipped", 50, [CLIP], DIM)
     study = prepare(clipped, DiagnosisOptions(), None).study

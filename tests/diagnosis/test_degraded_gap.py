@@ -32,9 +32,7 @@ def test_a_diagnosis_degrades_ideal_frames_of_poses_held_out(
 
 
 @pytest.mark.slow
-def test_a_simulator_under_diagnosis_keeps_its_own_effects_and_errors_in_the_file(
-    tmp_path: Path,
-) -> None:
+def test_a_given_simulator_keeps_its_effects_and_errors_in_the_file(tmp_path: Path) -> None:
     """The file turns ideal depth into the camera's, whatever simulator was compared with it."""
     shots = [{"target": "white", "poses": 25}, {"target": "checkerboard", "poses": 25}]
     options = PLAIN | {"seed": 43, "shots": shots, "effects": [WIGGLING]}

@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 import torch
 from diagnosed_recordings import recorded
-from importing.walls.rendered_room import (
-    Camera,
-    Room,
-    hand_eye_anywhere,
-    imported,
-    intrinsics,
-    poses_in_room,
-)
+from importing.walls.rendered_room import Room, hand_eye_anywhere, imported, pinhole, poses_in_room
 from optional import present
 
 from tofcorr.data.recording import Recording
@@ -191,7 +184,7 @@ def room_recording(
 ) -> Recording:
     """Render three walls and a floor, add errors by hand, and find the walls."""
     generator = np.random.default_rng(seed)
-    room = Room(camera=Camera(48, 40, 46.0), tool_from_camera=hand_eye_anywhere(generator))
+    room = Room(pinhole(48, 40, 46.0), tool_from_camera=hand_eye_anywhere(generator))
     views = room.views(poses_in_room(40, generator), generator)
     time = generator.choice([250.0, 500.0, 1000.0], len(views.depth))
     # The fourth harmonic of the phase of light modulated at 20 MHz.
@@ -211,7 +204,7 @@ def room_recording(
     ]
     write_recording(
         folder / "source",
-        camera=intrinsics(room.camera),
+        camera=room.camera,
         depth_kind="radial",
         modulation_frequency=20e6,
         rows=rows,

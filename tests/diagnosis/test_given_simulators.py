@@ -251,7 +251,7 @@ def test_what_a_function_returned_is_refused_by_what_it_is(nothing_missing: Reco
 
 
 @pytest.mark.parametrize("sim", [None, np.ones(3)])
-def test_what_names_no_simulator_is_refused(
+def test_what_is_no_simulator_is_refused(
     sim: Any, nothing_missing: Recording, tmp_path: Path
 ) -> None:
     words = r"recording\.yaml" if sim is None else r"got ndarray\. Frames in memory are handed"

@@ -37,9 +37,7 @@ def _selected(recording: Recording, **changes: Any) -> tuple[Study, NamedEffects
     return study, name_effects(study)
 
 
-def test_an_error_carried_from_other_poses_hides_what_a_form_error_may_be(
-    nothing_study: Study,
-) -> None:
+def test_an_error_carried_from_other_poses_hides_a_form_error(nothing_study: Study) -> None:
     pixels = len(nothing_study.observations.measured)
     there = SimulatorError(
         error=torch.zeros(pixels),
@@ -109,9 +107,7 @@ def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
         ("stripes", "is similar within rows of an image"),
     ],
 )
-def test_what_no_effect_explains_is_unknown_and_described(
-    kind: str, trace: str, tmp_path: Path
-) -> None:
+def test_what_no_effect_explains_is_unknown_in_words(kind: str, trace: str, tmp_path: Path) -> None:
     recording = recorded(tmp_path / "odd", 42)
     depth = np.load(recording.path / "depth.npy")
     random = np.random.default_rng(42)

@@ -51,7 +51,7 @@ def _noise(study: Study, seed: int, width: float = 0.0) -> Tensor:
 
 
 @pytest.mark.parametrize("width", [0.0, 1.2])
-def test_noise_has_the_same_energy_in_all_waves_filtered_or_not(
+def test_noise_filtered_or_not_has_one_energy_in_all_waves(
     nothing_study: Study, width: float
 ) -> None:
     """P-values are uniform at most: Bonferroni's correction makes them larger."""
@@ -63,9 +63,7 @@ def test_noise_has_the_same_energy_in_all_waves_filtered_or_not(
     assert np.median(found) > 0.3
 
 
-def test_stripes_that_move_from_frame_to_frame_are_found_under_filtered_noise(
-    nothing_study: Study,
-) -> None:
+def test_stripes_that_move_are_found_under_filtered_noise(nothing_study: Study) -> None:
     observations, inputs = nothing_study.observations, nothing_study.inputs
     phase = torch.linspace(0, 50, observations.num_frames)[observations.frame]
     size = 1e-3
@@ -131,9 +129,7 @@ def test_a_bent_target_is_no_filter_of_the_noise_once_it_is_known(tmp_path: Path
     assert _floor(study, "target_shape") == pytest.approx(SIGMA, rel=0.1)
 
 
-def test_structure_that_waves_and_poses_both_show_is_taken_off_the_noise_once(
-    tmp_path: Path,
-) -> None:
+def test_structure_of_waves_and_of_poses_is_taken_off_the_noise_once(tmp_path: Path) -> None:
     """Quadrants of the image that are off by 4 mm in all images are waves, and poses share them."""
     recording = recorded(tmp_path / "quadrants", 61, noise=False)
     shape = recording.depth.shape

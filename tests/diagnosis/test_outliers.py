@@ -67,7 +67,7 @@ def test_gross_errors_of_single_pixels_are_no_noise(
     assert most[0] == pytest.approx(most[1], rel=0.05)
 
 
-def test_many_outliers_are_a_warning_that_says_where(
+def test_many_outliers_are_warned_of_with_their_place(
     scattered: tuple[Prepared, np.ndarray],
 ) -> None:
     warning = scattered[0].warnings[-1]

@@ -175,9 +175,7 @@ def test_every_picture_of_every_kind_of_report_has_words(
                 assert re.fullmatch(r"[A-Z].*\.", present(words)[1], re.DOTALL)
 
 
-def test_the_first_strip_is_the_one_that_the_text_beside_it_names(
-    time_diagnosis: DiagnosisResult,
-) -> None:
+def test_the_first_strip_is_what_the_text_beside_it_names(time_diagnosis: DiagnosisResult) -> None:
     # Of several biases at the least p-value the text named the largest, often a straight line over
     # a few far pixels: "distance: it changes by -5.1 mm" beside a strip from 0.5 to -1.1 mm.
     where = time_diagnosis.where
@@ -191,7 +189,7 @@ def test_the_first_strip_is_the_one_that_the_text_beside_it_names(
     assert (covariate, ends) == ("integration time", f"from {low:.1f} to {high:.1f} mm")
 
 
-def test_the_verdict_comes_first_and_the_causes_next(
+def test_the_verdict_comes_first_and_causes_next(
     page: str, time_diagnosis: DiagnosisResult
 ) -> None:
     places = [page.index('class="verdict'), page.index("<h2"), page.index("<svg")]
@@ -224,9 +222,7 @@ def test_the_interval_of_a_share_that_is_not_determined_is_cut_off() -> None:
     assert interval_words((-1.0, 2.0)) == "[-100 %, 200 %]"
 
 
-def test_base_terms_and_their_higher_orders_have_names_of_their_own(
-    time_diagnosis: DiagnosisResult,
-) -> None:
+def test_base_terms_and_higher_orders_have_their_own_names(time_diagnosis: DiagnosisResult) -> None:
     study = time_diagnosis.evidence.study
     assert effect_words(study, "distance") == "distance (higher order)"
     assert effect_words(study, "wiggling") == "wiggling"

@@ -98,9 +98,7 @@ def test_the_simulator_written_runs_and_repeats_the_effect(report: Path, tmp_pat
     assert Recording.open(tmp_path / "again").num_frames == 3
 
 
-def test_the_fitted_simulator_measures_what_the_fit_predicts(
-    time_diagnosis: DiagnosisResult,
-) -> None:
+def test_the_fitted_simulator_measures_what_is_predicted(time_diagnosis: DiagnosisResult) -> None:
     """Tables, hand-eye transform and effect pass through the whole simulator unharmed."""
     study, named = time_diagnosis.evidence.study, time_diagnosis.evidence.named
     twin = time_diagnosis.evidence.distance()
@@ -136,9 +134,7 @@ def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_pat
     assert slope == pytest.approx(0.006, rel=0.2)
 
 
-def test_the_result_prints_stages_verdict_causes_remarks_and_warnings(
-    time_diagnosis: DiagnosisResult,
-) -> None:
+def test_the_result_prints_stages_verdict_and_warnings(time_diagnosis: DiagnosisResult) -> None:
     warned = replace(time_diagnosis, warnings=("The lens was dirty.",))
     causes = [f"- {cause}" for cause in time_diagnosis.causes]
     lines = [*table_of_stages(time_diagnosis), time_diagnosis.verdict, *causes]
@@ -197,7 +193,7 @@ def test_the_shipped_configuration_is_what_happens_without_one() -> None:
 
 
 @pytest.mark.slow
-def test_many_recordings_go_without_page_and_simulation(
+def test_many_recordings_need_no_page_or_simulation(
     time_missing: Recording, tmp_path: Path
 ) -> None:
     options = DiagnosisOptions(simulate_anew=False, page=False)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from tofcorr.diagnosis.findings.shares import (
     Parts,
@@ -24,7 +24,7 @@ from tofcorr.diagnosis.report.result import DiagnosisResult
 
 def _toy(seed: int, causes: int = 4, size: int = 60) -> tuple[Tensor, Tensor]:
     """Return parts (size, causes) and a residual that is their sum and something else."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = Generator().manual_seed(seed)
     parts = torch.randn(size, causes, generator=generator, dtype=torch.float64)
     parts = parts + parts[:, :1]
     rest = torch.randn(size, generator=generator, dtype=torch.float64)
@@ -105,12 +105,12 @@ def _beside_base(
     return _of_poses(causes, *one[:2], none, *one[2:]), residual
 
 
-def _random(generator: torch.Generator, *shape: int) -> Tensor:
+def _random(generator: Generator, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
 def test_beside_the_base_a_value_is_the_mean_fall_by_fits_over_all_orders() -> None:
-    generator = torch.Generator().manual_seed(9)
+    generator = Generator().manual_seed(9)
     base, effects = _random(generator, 300, 2), [_random(generator, 300, k) for k in (2, 1, 3)]
     effects[2] = 0.3 * effects[2] + base.sum(1, keepdim=True)  # The base absorbs most of it.
     effects[1] = effects[1] + effects[0][:, :1]
@@ -137,7 +137,7 @@ def test_an_effect_that_resembles_the_cause_gets_no_more_than_it_explains() -> N
 
     The true one gets the larger share, and no share is negative.
     """
-    generator = torch.Generator().manual_seed(10)
+    generator = Generator().manual_seed(10)
     base, cause = _random(generator, 500, 2), _random(generator, 500, 1)
     alike = cause + 0.02 * _random(generator, 500, 1)
     error = cause[:, 0] + 0.5 * _random(generator, 500)
@@ -165,7 +165,7 @@ def test_effects_that_are_one_share_as_their_prior_has_it_and_the_interval_says_
     Of coefficients a and b the data tell the sum. Their difference has the variance 2, so that
     either is off by its half: a standard deviation of 1 / sqrt(2).
     """
-    column = _random(torch.Generator().manual_seed(11), 1000)
+    column = _random(Generator().manual_seed(11), 1000)
     column -= column.mean()
     parts = _of_simulator([column, column], 1.0, 3.0 * column)
     best = parts.refitted(torch.ones(1).double())
@@ -178,7 +178,7 @@ def test_effects_that_are_one_share_as_their_prior_has_it_and_the_interval_says_
 
 
 def test_effects_that_the_data_tell_apart_owe_nothing_to_their_prior() -> None:
-    generator = torch.Generator().manual_seed(12)
+    generator = Generator().manual_seed(12)
     one, other = _random(generator, 4000), _random(generator, 4000)
     parts = _of_simulator([one, other], 1.0, one + 2 * other)
     best = parts.refitted(torch.ones(1).double())
@@ -216,7 +216,7 @@ _CAUSES = (
 
 def _columns(seed: int) -> tuple[Tensor, Tensor]:
     """Return a constant, a shift along the axis, a slope and a drift, (U, M, 4), and noise."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = Generator().manual_seed(seed)
     tilt = 0.15 * torch.rand(_POSES, _PIXELS, generator=generator, dtype=torch.float64)
     distance = torch.rand(_POSES, _PIXELS, generator=generator, dtype=torch.float64)
     time = torch.linspace(0, 1, _POSES, dtype=torch.float64)[:, None].expand(_POSES, _PIXELS)

@@ -74,9 +74,7 @@ def test_pixels_of_the_plane_beside_the_mask_have_no_noise(tmp_path: Path) -> No
     assert not bool((seen == plane)[whole, :, : WIDTH // 2].any())
 
 
-def test_stray_light_of_the_surroundings_is_the_same_in_the_twin_and_in_the_fit(
-    cluttered: Recording,
-) -> None:
+def test_stray_light_of_surroundings_is_the_same_in_twin_and_fit(cluttered: Recording) -> None:
     observations = observe(cluttered, 100_000)
     without, with_stray = (simulator(44, e) for e in ([], [STRAY]))
     pose = default_hand_eye(without, cluttered)

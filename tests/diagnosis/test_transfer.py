@@ -8,6 +8,7 @@ import torch
 from diagnosed_recordings import simulator
 from diagnosis.resamples import resamples_of
 from optional import present
+from torch import Generator
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
@@ -23,7 +24,7 @@ def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetr
     nothing_study: Study, nothing_named: NamedEffects
 ) -> None:
     named = nothing_named
-    generator = torch.Generator().manual_seed(1)
+    generator = Generator().manual_seed(1)
     resamples = resamples_of(nothing_study, 2)
     found = Evidence(study=nothing_study, named=named)
     transfer = present(measure_transfer(found, generator, resamples))
@@ -58,9 +59,7 @@ def test_the_simulator_that_took_the_recording_has_its_noise(nothing_missing: Re
     assert found.explained_by == ()
 
 
-def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
-    nothing_missing: Recording,
-) -> None:
+def test_frames_of_any_simulator_are_compared_as_rendered(nothing_missing: Recording) -> None:
     frames = noisy_frames(nothing_missing, simulator(31), 3)
     depth = np.asarray(frames.depth)
     found = []
@@ -74,7 +73,7 @@ def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
     assert without_amplitude["ratio"] == pytest.approx(compared["ratio"], abs=0.15)
 
 
-def test_hand_eye_options_hold_any_transform(generator: torch.Generator) -> None:
+def test_hand_eye_options_hold_any_transform(generator: Generator) -> None:
     transform = se3.exp(torch.randn(6, generator=generator, dtype=torch.float64))
     found = mount_at(transform).tool_from_camera()
     torch.testing.assert_close(found, transform, rtol=0, atol=1e-12)

@@ -22,9 +22,7 @@ from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_dist
 POOR_ROBOT = {"robot": {"repeatability_mm": 2.0, "repeatability_mrad": 2.0}}
 
 
-def test_poses_of_a_poor_robot_are_no_unknown_cause_unless_a_better_one_was_stated(
-    tmp_path: Path,
-) -> None:
+def test_poses_of_a_poor_robot_are_unknown_only_if_a_better_one_is_stated(tmp_path: Path) -> None:
     recording = recorded(tmp_path / "poor", 50, [], POOR_ROBOT)
     study = prepare(recording, DiagnosisOptions(catalogue=("wiggling", "lens"))).study
     named = name_effects(study)
@@ -38,9 +36,7 @@ def test_poses_of_a_poor_robot_are_no_unknown_cause_unless_a_better_one_was_stat
     assert judge_remainder(replace(study, options=stated), named, gap).unknown
 
 
-def test_poses_may_scatter_by_three_millimetres_and_three_milliradians(
-    nothing_study: Study,
-) -> None:
+def test_poses_may_scatter_by_three_millimetres_and_milliradians(nothing_study: Study) -> None:
     """The turns' share is compared with distances seen after a small turn about each axis."""
     observations, pose = nothing_study.observations, nothing_study.fit.tool_from_camera
     share, squares = nothing_study.fit.share, 0.0
@@ -54,9 +50,7 @@ def test_poses_may_scatter_by_three_millimetres_and_three_milliradians(
     assert allowed_scatter(nothing_study, after) == pytest.approx(expected, rel=1e-3)
 
 
-def test_pose_columns_are_what_a_small_motion_of_the_target_does(
-    nothing_missing: Recording,
-) -> None:
+def test_pose_columns_are_what_small_motions_of_the_target_do(nothing_missing: Recording) -> None:
     """Turned by a milliradian about any point and shifted, a plane's distance is in their span."""
     own = simulator(31)
     inputs = true_inputs(nothing_missing, own)

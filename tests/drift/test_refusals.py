@@ -18,9 +18,7 @@ from tofcorr.fit.reference import REFERENCE_FILE, Reference, save_reference
 from tofcorr.pixels.dataset import Dataset
 
 
-def test_another_camera_and_a_wall_outside_the_range_are_refused(
-    state: CalibrationState, walls: Walls
-) -> None:
+def test_another_camera_and_a_far_wall_are_refused(state: CalibrationState, walls: Walls) -> None:
     few = walls(11).first
     other = replace(few, camera=replace(few.camera, distortion=(0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(CalibrationDataError, match="not the camera that was calibrated"):

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from kinds_of_terms import built, inputs, randomise
+from torch import Generator
 
 D: dict[str, Any] = {"kind": "distance_polynomial"}
 P1: dict[str, Any] = {"kind": "pixel_polynomial", "degree": 1}
@@ -16,7 +17,7 @@ MODELS = {"E0": (D, P1), "EA": (D, P2, I1), "EB": (D, P2, I2), "P3": (D, P2 | {"
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_coefficients_survive_the_papers_symbols(name: str, generator: torch.Generator) -> None:
+def test_coefficients_survive_the_papers_symbols(name: str, generator: Generator) -> None:
     model = built(*MODELS[name])
     randomise(model, generator)
     again = built(*MODELS[name])
@@ -26,7 +27,7 @@ def test_coefficients_survive_the_papers_symbols(name: str, generator: torch.Gen
     )
 
 
-def test_ea_in_the_papers_symbols_is_the_papers_formula(generator: torch.Generator) -> None:
+def test_ea_in_the_papers_symbols_is_the_papers_formula(generator: Generator) -> None:
     model = built(D, P2, I1)
     c, i = (0.01, -0.02, 0.015, -0.003), (3e-5, -1e-8)
     p, r0, c0 = (2e-4, -1e-4), 3.3, 7.1

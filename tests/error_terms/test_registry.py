@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from kinds_of_terms import DOMAIN, inputs, model_of, randomise
+from torch import Generator
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import SignalTerm
@@ -47,7 +48,7 @@ def test_a_domain_without_what_a_term_needs_is_refused(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", TERMS)
-def test_a_term_reads_only_what_it_says_it_needs(kind: str, generator: torch.Generator) -> None:
+def test_a_term_reads_only_what_it_says_it_needs(kind: str, generator: Generator) -> None:
     model = model_of(kind)
     randomise(model, generator)
     distance, amplitude, conditions = inputs(generator)
@@ -67,9 +68,9 @@ def test_a_larger_member_of_a_family_contains_the_smaller(kind: str, name: str) 
     assert set(first.symbols) < set(second.symbols)
     same = [second.symbols.index(symbol) for symbol in first.symbols]
     given = {
-        "signal": inputs(torch.Generator().manual_seed(1))[:2],
+        "signal": inputs(Generator().manual_seed(1))[:2],
         "pixel": (torch.arange(5.0).double(), torch.arange(5.0).double()),
-        "condition": inputs(torch.Generator().manual_seed(1))[2:],
+        "condition": inputs(Generator().manual_seed(1))[2:],
     }
     group = first.group if first.group in given else "signal"
     small, large = (one.basis(*given[group]) for one in (first, second))  # type: ignore[attr-defined]
@@ -77,7 +78,7 @@ def test_a_larger_member_of_a_family_contains_the_smaller(kind: str, name: str) 
 
 
 @pytest.mark.parametrize("kind", TERMS)
-def test_the_polynomial_of_a_term_is_the_term(kind: str, generator: torch.Generator) -> None:
+def test_the_polynomial_of_a_term_is_the_term(kind: str, generator: Generator) -> None:
     model = model_of(kind)
     randomise(model, generator)
     for term in model.signal_terms:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import kinds_of_terms
 import torch
+from torch import Generator
 
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
@@ -13,14 +14,14 @@ ROWS = torch.arange(5, dtype=torch.float64)[:, None]
 COLUMNS = torch.arange(7, dtype=torch.float64)[None, :]
 
 
-def trained(generator: torch.Generator, domain: Domain = DOMAIN) -> ResidualNetwork:
+def trained(generator: Generator, domain: Domain = DOMAIN) -> ResidualNetwork:
     network = ResidualNetwork(ResidualNetworkOptions(bound_mm=15.0), domain)
     size = network.weight_vector().shape
     network.set_weight_vector(3 * torch.randn(size, generator=generator, dtype=torch.float64))
     return network
 
 
-def test_it_adds_nothing_untrained_and_its_bound_at_most(generator: torch.Generator) -> None:
+def test_it_adds_nothing_untrained_and_its_bound_at_most(generator: Generator) -> None:
     network = ResidualNetwork(ResidualNetworkOptions(), DOMAIN)
     distance = 1 + 2 * torch.rand(3, 5, 7, generator=generator, dtype=torch.float64)
     assert not network(distance, 100 * distance, ROWS, COLUMNS).any()
@@ -30,7 +31,7 @@ def test_it_adds_nothing_untrained_and_its_bound_at_most(generator: torch.Genera
     assert 0.010 < float(found.max()) <= 0.015
 
 
-def test_it_fades_to_zero_outside_the_calibrated_ranges(generator: torch.Generator) -> None:
+def test_it_fades_to_zero_outside_the_calibrated_ranges(generator: Generator) -> None:
     network = trained(generator)
     inside = torch.full((5, 7), 2.0, dtype=torch.float64)
     amplitude = torch.full((5, 7), 100.0, dtype=torch.float64)
@@ -46,7 +47,7 @@ def test_it_fades_to_zero_outside_the_calibrated_ranges(generator: torch.Generat
     assert float(found.detach().diff(dim=0).abs().max()) < 1e-4
 
 
-def test_it_scripts_identically_and_needs_no_amplitude(generator: torch.Generator) -> None:
+def test_it_scripts_identically_and_needs_no_amplitude(generator: Generator) -> None:
     bare = Domain(height=5, width=7, radial_distance=Interval(1.0, 3.0))
     for domain in (DOMAIN, bare):
         network = trained(generator, domain)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from correction.export.states import calibration
 from synthetic_scene import EB
+from torch import Generator
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.geometry.rays import ray_directions
@@ -18,14 +19,14 @@ MODELS: dict[str, list[dict[str, Any]]] = {
 }
 
 
-def frames(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+def frames(generator: Generator) -> tuple[torch.Tensor, torch.Tensor]:
     depth = 0.6 + 2.2 * torch.rand(3, 5, 7, generator=generator)
     return depth, 20.0 + 800.0 * torch.rand(3, 5, 7, generator=generator)
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_calibration_sigma_is_the_spread_of_models_drawn_from_the_covariance(
-    name: str, generator: torch.Generator
+    name: str, generator: Generator
 ) -> None:
     size = len(calibration(terms=MODELS[name]).coefficients)
     root = 1e-3 * torch.randn(size, size, generator=generator, dtype=torch.float64)
@@ -43,9 +44,7 @@ def test_calibration_sigma_is_the_spread_of_models_drawn_from_the_covariance(
     torch.testing.assert_close(found.double(), square.sqrt(), rtol=1e-4, atol=1e-7)
 
 
-def test_noise_sigma_follows_the_amplitude_and_the_kind_of_depth(
-    generator: torch.Generator,
-) -> None:
+def test_noise_sigma_follows_the_amplitude_and_the_kind_of_depth(generator: Generator) -> None:
     depth, amplitude = frames(generator)
     depth[0, 0, 0], depth[0, 0, 1] = torch.nan, -1.0
     noise = (1e-6, 1e-4, 2e-3)
@@ -60,7 +59,7 @@ def test_noise_sigma_follows_the_amplitude_and_the_kind_of_depth(
     torch.testing.assert_close(in_z, expected * cosine, equal_nan=True)
 
 
-def test_what_the_calibration_does_not_tell_is_nan(generator: torch.Generator) -> None:
+def test_what_the_calibration_does_not_tell_is_nan(generator: Generator) -> None:
     depth, amplitude = frames(generator)
     state = calibration(terms=MODELS["EB"])
     for unknown in DepthCorrector.from_state(state).sigma(depth, amplitude):

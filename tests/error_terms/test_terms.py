@@ -8,6 +8,7 @@ import pytest
 import torch
 from kinds_of_terms import built, randomise
 from scipy.interpolate import BSpline
+from torch import Generator
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import ConditionTerm, SignalTerm
@@ -44,7 +45,7 @@ def only_signal_term(**term: Any) -> SignalTerm:
     return one
 
 
-def signals(generator: torch.Generator, size: int = 400) -> tuple[torch.Tensor, torch.Tensor]:
+def signals(generator: Generator, size: int = 400) -> tuple[torch.Tensor, torch.Tensor]:
     """Draw distances and amplitudes in the domain and around it, the ends included."""
     u = torch.rand(2, size, generator=generator, dtype=torch.float64) * 1.2 - 0.1
     u[:, 0], u[:, 1] = 0.0, 1.0
@@ -62,7 +63,7 @@ def condition_term(request: pytest.FixtureRequest) -> ConditionTerm:
 
 
 def test_signal_term_is_its_coefficients_times_its_basis_scripted_too(
-    signal_term: SignalTerm, generator: torch.Generator
+    signal_term: SignalTerm, generator: Generator
 ) -> None:
     distance, amplitude = signals(generator)
     assert not signal_term(distance, amplitude).any()  # Nothing before training.
@@ -76,7 +77,7 @@ def test_signal_term_is_its_coefficients_times_its_basis_scripted_too(
 
 
 def test_signal_term_leaves_the_constant_to_the_model(
-    signal_term: SignalTerm, generator: torch.Generator
+    signal_term: SignalTerm, generator: Generator
 ) -> None:
     distance, amplitude = signals(generator, 20_000)
     basis = signal_term.basis(distance, amplitude)
@@ -86,7 +87,7 @@ def test_signal_term_leaves_the_constant_to_the_model(
 
 
 def test_condition_term_is_zero_at_mean_conditions_and_scripts(
-    condition_term: ConditionTerm, generator: torch.Generator
+    condition_term: ConditionTerm, generator: Generator
 ) -> None:
     randomise(condition_term, generator)
     mean = torch.full((len(CONDITIONS),), 2.0, dtype=torch.float64)
@@ -98,7 +99,7 @@ def test_condition_term_is_zero_at_mean_conditions_and_scripts(
 
 
 def test_conditions_beyond_the_calibrated_range_are_held_at_its_edge(
-    condition_term: ConditionTerm, generator: torch.Generator
+    condition_term: ConditionTerm, generator: Generator
 ) -> None:
     randomise(condition_term, generator)
     edge = torch.full((len(CONDITIONS),), 4.0, dtype=torch.float64)
@@ -138,7 +139,7 @@ def test_only_what_is_straight_over_the_knots_is_free_of_roughness(term: dict[st
     assert float((rows @ straight).abs().max()) < 1e-9
 
 
-def test_table_interpolates_like_numpy(generator: torch.Generator) -> None:
+def test_table_interpolates_like_numpy(generator: Generator) -> None:
     table = only_signal_term(kind="lookup_table", segments=4)
     randomise(table, generator)
     entries = np.insert(table.coefficients.detach().numpy(), 2, 0.0)
@@ -148,7 +149,7 @@ def test_table_interpolates_like_numpy(generator: torch.Generator) -> None:
 
 
 def test_circular_error_returns_after_a_quarter_of_the_unambiguous_range(
-    generator: torch.Generator,
+    generator: Generator,
 ) -> None:
     term = only_signal_term(kind="periodic", harmonics=2)
     randomise(term, generator)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from synthetic_scene import EA, make_scene
+from torch import Generator
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import MomentObjective, Parameters
@@ -18,7 +19,7 @@ def step_between(origin: Parameters, end: Parameters) -> torch.Tensor:
 
 def relative_gap(noise: float) -> float:
     """Return how far the jackknife is from refitting, relative to the shifts, in their metric."""
-    scene = make_scene(torch.Generator().manual_seed(0), EA, noise=noise)
+    scene = make_scene(Generator().manual_seed(0), EA, noise=noise)
     moments = scene.moments()
     optimum = minimise(MomentObjective(moments), scene.truth).parameters
     refits = []
@@ -38,9 +39,7 @@ def test_the_jackknife_is_leaving_out_each_image_in_turn() -> None:
     assert gap_at_a_tenth < 0.2 * gap
 
 
-def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(
-    generator: torch.Generator,
-) -> None:
+def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(generator: Generator) -> None:
     """Independent of any formula: draw the noise anew and look."""
     ends = []
     for _ in range(40):
@@ -55,6 +54,6 @@ def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(
 
 
 def test_two_poses_are_too_few() -> None:
-    scene = make_scene(torch.Generator().manual_seed(0), EA, num_frames=2)
+    scene = make_scene(Generator().manual_seed(0), EA, num_frames=2)
     with pytest.raises(CalibrationDataError, match="at least 3 poses, got 2"):
         jackknife_covariance(scene.moments(), scene.truth)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import torch
 from synthetic_scene import EA, make_scene
+from torch import Generator
 
 from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.solvers import initial_parameters, rotation_from_normals, with_linear_part
@@ -11,7 +12,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.rays import planes_through
 
 
-def test_planes_are_fitted_to_the_points_of_each_image(generator: torch.Generator) -> None:
+def test_planes_are_fitted_to_the_points_of_each_image(generator: Generator) -> None:
     scene = make_scene(generator, noise=0.0, error_size=0.0)
     moments = scene.moments()
     expected = moments.normal_tool @ scene.truth.tool_from_camera[:3, :3]
@@ -23,7 +24,7 @@ def test_planes_are_fitted_to_the_points_of_each_image(generator: torch.Generato
     torch.testing.assert_close(offset, moments.offset_tool + lever, rtol=0.0, atol=1e-12)
 
 
-def test_error_free_data_give_the_hand_eye_from_nothing(generator: torch.Generator) -> None:
+def test_error_free_data_give_the_hand_eye_from_nothing(generator: Generator) -> None:
     scene = make_scene(generator, EA, noise=0.0, error_size=0.0)
     true = scene.truth.tool_from_camera
     found = initial_parameters(scene.moments()).tool_from_camera
@@ -33,9 +34,7 @@ def test_error_free_data_give_the_hand_eye_from_nothing(generator: torch.Generat
     torch.testing.assert_close(knowing, true, rtol=0.0, atol=1e-10)
 
 
-def test_parallel_normals_leave_the_turn_about_them_to_the_guess(
-    generator: torch.Generator,
-) -> None:
+def test_parallel_normals_leave_the_turn_about_them_to_the_guess(generator: Generator) -> None:
     normal = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(5, 3)
     turn = se3.exp(torch.tensor([0, 0, 0, 0, 0, 0.7], dtype=torch.float64))[:3, :3]
     tilt = se3.exp(torch.tensor([0, 0, 0, 0.2, 0, 0], dtype=torch.float64))[:3, :3]
@@ -48,7 +47,7 @@ def test_parallel_normals_leave_the_turn_about_them_to_the_guess(
         assert (other - turn).norm() > (found - turn).norm()
 
 
-def test_the_linear_part_is_the_optimum_at_that_rotation(generator: torch.Generator) -> None:
+def test_the_linear_part_is_the_optimum_at_that_rotation(generator: Generator) -> None:
     scene = make_scene(generator, EA)
     moments = scene.moments()
     zero = torch.zeros_like(scene.truth.coefficients)
@@ -61,7 +60,7 @@ def test_the_linear_part_is_the_optimum_at_that_rotation(generator: torch.Genera
     assert torch.equal(found.tool_from_camera[:3, :3], start.tool_from_camera[:3, :3])
 
 
-def test_with_a_fixed_hand_eye_only_coefficients_are_solved_for(generator: torch.Generator) -> None:
+def test_with_a_fixed_hand_eye_only_coefficients_are_solved_for(generator: Generator) -> None:
     scene = make_scene(generator, EA, noise=0.0)
     zero = torch.zeros_like(scene.truth.coefficients)
     start = Parameters(scene.truth.tool_from_camera, zero, hand_eye_is_free=False)
@@ -74,9 +73,7 @@ def test_with_a_fixed_hand_eye_only_coefficients_are_solved_for(generator: torch
     assert torch.equal(found.tool_from_camera, known.tool_from_camera)
 
 
-def test_a_column_of_zeros_changes_nothing_and_its_coefficient_stays_zero(
-    generator: torch.Generator,
-) -> None:
+def test_a_column_of_zeros_changes_nothing_and_stays_zero(generator: Generator) -> None:
     # A condition that never changed: where rounding mixed its direction with others, its
     # coefficient came out as 5e120, and no number of the fit was finite any more.
     plain = make_scene(generator, EA).moments()

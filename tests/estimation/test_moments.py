@@ -16,7 +16,7 @@ from synthetic_scene import (
     nearby,
     without_invalid_pixels,
 )
-from torch import Tensor
+from torch import Generator, Tensor
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -30,17 +30,17 @@ RELATIVE = 1e-10
 
 
 @pytest.fixture(params=[E0, EA, EB], ids=["E0", "EA", "EB"])
-def scene(request: pytest.FixtureRequest, generator: torch.Generator) -> Scene:
+def scene(request: pytest.FixtureRequest, generator: Generator) -> Scene:
     return make_scene(generator, request.param)
 
 
 @pytest.fixture
-def weights(scene: Scene, generator: torch.Generator) -> Tensor:
+def weights(scene: Scene, generator: Generator) -> Tensor:
     return 0.2 + torch.rand(scene.batch.valid.shape, generator=generator, dtype=torch.float64)
 
 
 def test_the_loss_of_the_moments_is_that_of_the_reference_model(
-    scene: Scene, weights: Tensor, generator: torch.Generator
+    scene: Scene, weights: Tensor, generator: Generator
 ) -> None:
     parameters = nearby(scene.truth, generator)
     used = scene.batch.valid
@@ -50,7 +50,7 @@ def test_the_loss_of_the_moments_is_that_of_the_reference_model(
 
 
 def test_gradient_and_hessian_are_those_of_autograd_over_all_pixels(
-    scene: Scene, weights: Tensor, generator: torch.Generator
+    scene: Scene, weights: Tensor, generator: Generator
 ) -> None:
     origin = nearby(scene.truth, generator)
     whole = without_invalid_pixels(scene)
@@ -74,7 +74,7 @@ def test_gradient_and_hessian_are_those_of_autograd_over_all_pixels(
 
 
 def test_the_sum_over_the_images_has_their_normal_equations(
-    scene: Scene, generator: torch.Generator
+    scene: Scene, generator: Generator
 ) -> None:
     objective = MomentObjective(scene.moments())
     parameters = nearby(scene.truth, generator)
@@ -117,7 +117,7 @@ def test_losses_of_disjoint_subsets_add_up_and_weights_count_images(scene: Scene
     assert twice.count.tolist() == (moments.count[:5] * torch.tensor([1, 1, 1, 2, 2])).tolist()
 
 
-def test_moments_of_some_columns_are_those_of_the_smaller_model(generator: torch.Generator) -> None:
+def test_moments_of_some_columns_are_those_of_the_smaller_model(generator: Generator) -> None:
     scene = make_scene(generator, EA)
     small = scene.moments(E0)
     found = scene.moments().columns(small.symbols)
@@ -128,16 +128,14 @@ def test_moments_of_some_columns_are_those_of_the_smaller_model(generator: torch
     assert len(bare.symbols) == 0
 
 
-def test_without_amplitudes_a_model_that_needs_none_is_unaffected(
-    generator: torch.Generator,
-) -> None:
+def test_without_amplitudes_a_model_that_needs_none_is_unaffected(generator: Generator) -> None:
     scene = make_scene(generator, E0)
     blind = replace(scene, batch=replace(scene.batch, amplitude=None))
     assert torch.equal(blind.moments().gram, scene.moments().gram)
 
 
 def test_images_of_several_blocks_have_the_same_moments(
-    monkeypatch: pytest.MonkeyPatch, generator: torch.Generator
+    monkeypatch: pytest.MonkeyPatch, generator: Generator
 ) -> None:
     # The rows of every block were once those of the last, which were written over them.
     camera = cameras.camera((320, 100), (250.0, 250.0), (160.0, 50.0))

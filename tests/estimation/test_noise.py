@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from simulated_walls import SENSOR, simulated_wall
+from torch import Generator
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
@@ -14,7 +15,7 @@ from tofcorr.pixels.sample import estimate_noise
 TRUE = DistanceNoise(1e-6, 2e-3, 0.5, "repeats")
 
 
-def drawn(generator: torch.Generator, number: int = 200_000) -> tuple[torch.Tensor, torch.Tensor]:
+def drawn(generator: Generator, number: int = 200_000) -> tuple[torch.Tensor, torch.Tensor]:
     uniform = torch.rand(number, generator=generator, dtype=torch.float64)
     amplitude = 100.0 * 100.0**uniform
     normal = torch.randn(2, number, generator=generator, dtype=torch.float64)
@@ -24,7 +25,7 @@ def drawn(generator: torch.Generator, number: int = 200_000) -> tuple[torch.Tens
 
 @pytest.mark.parametrize(("off", "most"), [(0.0, 1.1), (1.0, 1.6)])
 def test_the_variance_is_found_though_a_tenth_of_the_pixels_is_off(
-    off: float, most: float, generator: torch.Generator
+    off: float, most: float, generator: Generator
 ) -> None:
     difference, amplitude = drawn(generator)
     difference[::10] += off

@@ -139,9 +139,7 @@ def test_undetermined_directions_keep_the_prior_and_it_moves_no_other(fits: FitO
     assert float(apart.max()) < 0.1 * PRIOR_SIGMA
 
 
-def test_a_direction_known_only_through_jitter_stays_near_the_recorded_guess(
-    tmp_path: Path,
-) -> None:
+def test_a_direction_known_only_by_jitter_stays_near_the_recorded_guess(tmp_path: Path) -> None:
     # A robot that tilts by a ten-thousandth of a radian leaves t_x and t_y metres uncertain.
     robot = {"tilt_deg": 0.006}
     dataset = simulated_wall(tmp_path / "jitter", robot=robot)

@@ -3,14 +3,14 @@
 import pytest
 import torch
 from optional import present
-from torch import Tensor
+from torch import Generator, Tensor
 
 from tofcorr.estimation.robust import deviation, fit_plane, largest_plane
 
 PLANE = torch.tensor([0.2, -0.1, 0.7], dtype=torch.float64)
 
 
-def view(share_off: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+def view(share_off: float, generator: Generator) -> tuple[Tensor, Tensor, Tensor]:
     """Return rays, distances with noise, and which of the pixels lie on the plane."""
     place = torch.rand(3000, 2, generator=generator, dtype=torch.float64) - 0.5
     rays = torch.nn.functional.normalize(torch.cat([place, torch.ones(3000, 1)], dim=1), dim=1)
@@ -22,9 +22,7 @@ def view(share_off: float, generator: torch.Generator) -> tuple[Tensor, Tensor, 
 
 
 @pytest.mark.parametrize("share_off", [0.0, 0.1])
-def test_a_robust_fit_does_not_mind_a_few_other_pixels(
-    share_off: float, generator: torch.Generator
-) -> None:
+def test_a_robust_fit_ignores_a_few_other_pixels(share_off: float, generator: Generator) -> None:
     rays, distance, _ = view(share_off, generator)
     valid = torch.ones(1, len(rays), dtype=torch.bool)
     found = fit_plane(rays, distance[None], valid)[0]
@@ -32,7 +30,7 @@ def test_a_robust_fit_does_not_mind_a_few_other_pixels(
     torch.testing.assert_close(found, PLANE, rtol=0.0, atol=5e-4)
 
 
-def test_the_largest_plane_is_found_among_more_clutter(generator: torch.Generator) -> None:
+def test_the_largest_plane_is_found_among_more_clutter(generator: Generator) -> None:
     rays, distance, on_plane = view(0.6, generator)
     found = present(largest_plane(rays, distance, 0.01, generator))
     near = deviation(rays, distance, found).abs() < 0.01
@@ -40,7 +38,7 @@ def test_the_largest_plane_is_found_among_more_clutter(generator: torch.Generato
     assert float(near[~on_plane].double().mean()) < 0.1
 
 
-def test_pixels_on_one_line_determine_no_plane(generator: torch.Generator) -> None:
+def test_pixels_on_one_line_determine_no_plane(generator: Generator) -> None:
     rays = torch.nn.functional.normalize(torch.rand(50, 1).double() * torch.tensor([[1.0, 0, 0]]))
     assert largest_plane(rays, torch.ones(50).double(), 0.01, generator) is None
     assert largest_plane(rays[:2], torch.ones(2).double(), 0.01, generator) is None

@@ -73,9 +73,7 @@ def test_not_knowing_the_wall_costs_certainty(wall: Dataset, found: Fit) -> None
     assert found.observability.directions[0].sigma > known.observability.directions[0].sigma
 
 
-def test_without_tilt_the_unknown_wall_is_undetermined_with_t_z_and_the_constant(
-    tmp_path: Path,
-) -> None:
+def test_without_tilt_an_unknown_wall_is_undetermined_with_t_z_and_c0(tmp_path: Path) -> None:
     dataset = simulated_wall(tmp_path / "flat", sensor=BRIGHT, robot={"tilt_axes": "none"})
     result = fitted(dataset, planes="unknown")
     unknown = [d for d in result.observability.directions if d.sigma > 0.05]

@@ -5,6 +5,7 @@ import torch
 from cameras import camera
 from kinds_of_terms import DOMAIN, built
 from synthetic_scene import EA, error_model, frame_batch
+from torch import Generator
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
@@ -20,7 +21,7 @@ def design_of(model: ErrorModel) -> Design:
     return Design(model, DOMAIN, ray_directions(CAMERA))
 
 
-def frames(generator: torch.Generator) -> FrameBatch:
+def frames(generator: Generator) -> FrameBatch:
     """Distances and amplitudes of twice the calibrated range; a fifth of the pixels is missing."""
     distance, amplitude, chance = torch.rand(3, 4, 66, 66, generator=generator, dtype=torch.float64)
     valid = chance > 0.2
@@ -33,7 +34,7 @@ def frames(generator: torch.Generator) -> FrameBatch:
 @pytest.mark.parametrize("with_distance", [True, False])
 @pytest.mark.parametrize("kind", TERMS)
 def test_moments_are_those_of_the_columns_pixel_by_pixel(
-    kind: str, *, with_distance: bool, generator: torch.Generator
+    kind: str, *, with_distance: bool, generator: Generator
 ) -> None:
     beside = [DISTANCE] if with_distance and kind != DISTANCE["kind"] else []
     design, batch = design_of(built({"kind": kind}, *beside)), frames(generator)

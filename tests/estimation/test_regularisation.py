@@ -6,7 +6,7 @@ import pytest
 import torch
 from optional import present
 from synthetic_scene import CAMERA, DOMAIN, frame_batch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.base import Domain, SignalTerm
@@ -28,7 +28,7 @@ NUM_FRAMES = 24
 KNOWN = Parameters(torch.eye(4, dtype=torch.float64), torch.zeros(0), hand_eye_is_free=False)
 
 
-def frontal_frames(error: Tensor, generator: torch.Generator, noise: float) -> FrameBatch:
+def frontal_frames(error: Tensor, generator: Generator, noise: float) -> FrameBatch:
     """Return frames of frontal walls, camera known, with an error (B, H, W) in metres."""
     offset = torch.linspace(0.6, 2.2, NUM_FRAMES, dtype=torch.float64)
     normal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(NUM_FRAMES, 3)
@@ -50,9 +50,7 @@ def zero(moments: ImageMoments) -> Parameters:
     return replace(KNOWN, coefficients=torch.zeros(len(moments.symbols), dtype=torch.float64))
 
 
-def test_penalised_fit_is_least_squares_with_the_roughness_as_further_rows(
-    generator: torch.Generator,
-) -> None:
+def test_a_penalised_fit_is_least_squares_with_roughness_as_rows(generator: Generator) -> None:
     batch = frontal_frames(torch.zeros(1), generator, 0.01)
     model = spline_model(DOMAIN, 1e-4)
 
@@ -80,7 +78,7 @@ def test_penalised_fit_is_least_squares_with_the_roughness_as_further_rows(
     torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-5)
 
 
-def test_a_straight_truth_is_smoothed_more_than_a_wavy_one(generator: torch.Generator) -> None:
+def test_a_straight_truth_is_smoothed_more_than_a_wavy_one(generator: Generator) -> None:
     folds = [list(range(k, NUM_FRAMES, 6)) for k in range(6)]
     true = torch.linspace(0.6, 2.2, NUM_FRAMES, dtype=torch.float64)[:, None, None]
     chosen = {}
@@ -93,7 +91,7 @@ def test_a_straight_truth_is_smoothed_more_than_a_wavy_one(generator: torch.Gene
     assert chosen["straight"] > 10 * chosen["wavy"]
 
 
-def test_joined_priors_weigh_as_both_alone(generator: torch.Generator) -> None:
+def test_joined_priors_weigh_as_both_alone(generator: Generator) -> None:
     batch = frontal_frames(torch.zeros(1), generator, 0.01)
     model = spline_model(DOMAIN, 1e-3)
     moments = moments_of(model, batch)
@@ -112,9 +110,7 @@ def test_joined_priors_weigh_as_both_alone(generator: torch.Generator) -> None:
         torch.testing.assert_close(joint, a + b)
 
 
-def test_condition_columns_are_what_a_pass_over_the_pixels_would_give(
-    generator: torch.Generator,
-) -> None:
+def test_condition_columns_are_what_a_pass_over_the_pixels_would_give(generator: Generator) -> None:
     batch = frontal_frames(torch.zeros(1), generator, 0.01)
     model = ErrorModel(ErrorModelOptions(), DOMAIN)
     numbers = torch.randn(NUM_FRAMES, 1, generator=generator, dtype=torch.float64)
@@ -128,7 +124,7 @@ def test_condition_columns_are_what_a_pass_over_the_pixels_would_give(
 
 
 @pytest.mark.parametrize("truth", [20.0, 90.0])
-def test_time_constant_of_a_warm_up_is_found(truth: float, generator: torch.Generator) -> None:
+def test_time_constant_of_a_warm_up_is_found(truth: float, generator: Generator) -> None:
     time = torch.linspace(0.0, 300.0, NUM_FRAMES, dtype=torch.float64)
     shuffled = time[torch.randperm(NUM_FRAMES, generator=generator)]
     error = 0.015 * torch.exp(-shuffled / truth)[:, None, None]

@@ -10,6 +10,7 @@ import torch
 from optional import present
 from simulated_walls import fitted, simulated_wall, true_hand_eye
 from synthetic_scene import frame_batch
+from torch import Generator
 
 from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.estimation.robust import outlying_images, robust_scale, robust_weights
@@ -77,7 +78,7 @@ def test_weights_are_the_slope_of_the_loss_over_the_residual(loss: Any) -> None:
 
 
 def test_the_robust_scale_of_normal_residuals_is_their_standard_deviation(
-    generator: torch.Generator,
+    generator: Generator,
 ) -> None:
     residuals = 0.003 * torch.randn(100_000, generator=generator, dtype=torch.float64)
     assert robust_scale(residuals) == pytest.approx(0.003, rel=0.02)

@@ -86,7 +86,7 @@ def padded(message: Image, padding: int) -> Image:
     return message
 
 
-def test_depth_and_points_are_those_of_the_corrector(
+def test_depth_and_points_are_as_by_the_corrector(
     start: Callable[..., Any], tmp_path: Path
 ) -> None:
     node = start()

@@ -33,9 +33,7 @@ def test_a_new_term_trains_loads_and_deploys(extension: Extension) -> None:
     assert found["apart"] < 1e-6
 
 
-def test_a_new_effect_is_simulated_from_yaml_and_named_by_the_diagnosis(
-    extension: Extension,
-) -> None:
+def test_a_new_effect_is_simulated_from_yaml_and_diagnosed(extension: Extension) -> None:
     folder = extension.folder_of("stripes")
     report = json.loads((folder / "report/diagnosis.json").read_text(encoding="utf-8"))
     assert report["effects"] == ["stripes"]

@@ -35,9 +35,7 @@ def test_any_name_that_can_be_shown_is_written_to(tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_a_name_that_a_message_cannot_show_is_refused_in_one_line(
-    tmp_path: Path, name: str
-) -> None:
+def test_a_name_that_no_message_can_show_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     for write, kind in ((write_file, ExportError), (write_folder, CalibrationDataError)):
         with pytest.raises(kind, match="the name holds a control character") as refusal:
             write(tmp_path / name)
@@ -46,9 +44,7 @@ def test_a_name_that_a_message_cannot_show_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("name", ["x" * 256, "é" * 128])
-def test_a_name_too_long_for_the_file_system_is_refused_before_the_work(
-    tmp_path: Path, name: str
-) -> None:
+def test_a_name_too_long_for_the_disk_is_refused_at_once(tmp_path: Path, name: str) -> None:
     with pytest.raises(CalibrationDataError, match=r"cannot be written \(File name too long"):
         write_folder(tmp_path / "new" / name)
     with pytest.raises(ExportError, match="File name too long"):

@@ -56,9 +56,7 @@ MANY = pytest.param(1000, marks=pytest.mark.slow)
 @pytest.mark.filterwarnings("ignore")  # What is drawn to be odd: numbers of other types.
 @pytest.mark.parametrize("examples", [40, MANY])
 @pytest.mark.parametrize("target", fuzz.imports(), ids=lambda target: target.name)
-def test_a_damaged_file_is_read_or_refused(
-    target: fuzz.Target, examples: int, tmp_path: Path
-) -> None:
+def test_damage_is_read_or_refused(target: fuzz.Target, examples: int, tmp_path: Path) -> None:
     refused_in_words(target, tmp_path, examples)
 
 

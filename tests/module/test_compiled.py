@@ -26,7 +26,7 @@ def compiled_gradients_agree(backend: str, *kinds: str) -> None:
         torch.testing.assert_close(other, eager, rtol=1e-6, atol=1e-9, equal_nan=True)
 
 
-def test_a_module_of_all_terms_compiles_whole_and_its_gradients_agree() -> None:
+def test_a_module_of_all_terms_compiles_whole_and_gradients_agree() -> None:
     compiled_gradients_agree("eager", *KINDS)
 
 
@@ -34,9 +34,7 @@ def test_a_module_of_all_terms_compiles_whole_and_its_gradients_agree() -> None:
 @pytest.mark.filterwarnings("ignore")  # The compiler's own dependencies warn of each other.
 @pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_module_of_one_term_compiles_whole_and_its_gradients_agree(
-    kind: str, backend: str
-) -> None:
+def test_a_module_of_one_term_compiles_whole_and_gradients_agree(kind: str, backend: str) -> None:
     compiled_gradients_agree(backend, kind)
 
 

@@ -80,9 +80,7 @@ def test_a_run_whose_configuration_was_cut_short_is_never_another_run(
         DepthCorrection.load(tmp_path / "run")
 
 
-def test_a_fitted_module_exports_the_noise_that_a_training_writes(
-    wall: Recording, tmp_path: Path
-) -> None:
+def test_a_fitted_module_exports_the_noise_of_a_training(wall: Recording, tmp_path: Path) -> None:
     """The noise of a fitted module was unknown to its exports; that of a run was not."""
     module = DepthCorrection(wall.camera, terms="e0")
     module.fit(wall)
@@ -122,9 +120,7 @@ def test_a_fit_leaves_the_options_for_the_next_one(wall: Recording) -> None:
     torch.testing.assert_close(module(*some(wall)), first, rtol=0, atol=1e-9)
 
 
-def test_a_network_that_was_dropped_adds_nothing_and_exports(
-    wall: Recording, tmp_path: Path
-) -> None:
+def test_a_dropped_network_adds_nothing_and_exports(wall: Recording, tmp_path: Path) -> None:
     changes = ["residual.iterations=2", "residual.pixels=300", "residual.folds=2"]
     options = resolve_options(TrainingOptions, "ea_residual", changes)
     module = DepthCorrection(wall.camera, terms=options)

@@ -77,7 +77,7 @@ def test_conditions_agree_with_the_runtime_frame_by_frame(kind: str) -> None:
 
 
 @pytest.mark.parametrize("leading", [(), (1,), (2, 3)], ids=str)
-def test_leading_dimensions_do_not_change_a_frame(
+def test_leading_dimensions_change_no_frame(
     module: DepthCorrection, leading: tuple[int, ...]
 ) -> None:
     depth, amplitude = frames(leading)

@@ -17,9 +17,7 @@ from tofcorr.module.depth_correction import DepthCorrection
 
 @pytest.mark.parametrize("depth_kind", ["radial", "z"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_are_exact_in_depth_amplitude_and_every_parameter(
-    kind: str, depth_kind: str
-) -> None:
+def test_gradients_are_exact_in_depth_amplitude_and_parameters(kind: str, depth_kind: str) -> None:
     module = module_of(kind, depth_kind=depth_kind)
     names = [name for name, _ in module.named_parameters()]
     depth, amplitude = (frame[..., :, :] for frame in frames(()))
@@ -87,9 +85,7 @@ def test_missing_returns_have_no_gradient_and_spoil_no_other(module: DepthCorrec
     assert not gradient[..., 0, :5].any()
 
 
-def test_copies_and_pickles_are_identical_and_independent(
-    module: DepthCorrection, tmp_path: Path
-) -> None:
+def test_copies_and_pickles_are_equal_and_apart(module: DepthCorrection, tmp_path: Path) -> None:
     depth, amplitude = frames()
     expected = module(depth, amplitude).detach()
     torch.save(module, tmp_path / "module")

@@ -44,9 +44,7 @@ def test_a_module_of_other_ranges_camera_and_depth_kind_becomes_identical(kind: 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_saved_module_is_identical_when_loaded(
-    kind: str, dtype: torch.dtype, tmp_path: Path
-) -> None:
+def test_a_saved_module_is_loaded_as_it_was(kind: str, dtype: torch.dtype, tmp_path: Path) -> None:
     module = module_of(kind, depth_kind="z", saturation_amplitude=700.0, dtype=dtype)
     module.save(tmp_path / "module.pt")
     assert_same(DepthCorrection.load(tmp_path / "module.pt"), module)

@@ -187,9 +187,7 @@ def hidden(place: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", COMMANDS)
-def test_a_command_that_is_killed_leaves_nothing_or_all(
-    words: str, ready: Path, tmp_path: Path
-) -> None:
+def test_a_killed_command_leaves_nothing_or_all(words: str, ready: Path, tmp_path: Path) -> None:
     check, draw = COMMANDS[words], random.Random(words)
     written = words.split(" --ply " if "--ply" in words else " --out ")[1].split(maxsplit=1)[0]
     code, told = run(words, ready, tmp_path / "whole", "", 10**9)

@@ -148,9 +148,7 @@ def test_every_form_comes_once_in_a_round() -> None:
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_recordings_of_every_tier_are_valid_repeatable_and_do_not_tell_it(
-    tier: str, tmp_path: Path
-) -> None:
+def test_recordings_of_every_tier_are_valid_and_repeatable(tier: str, tmp_path: Path) -> None:
     entries = list(write_tier(3, tier, 3, tmp_path / "a"))
     assert entries == list(write_tier(3, tier, 3, tmp_path / "b"))
     assert entries != list(write_tier(4, tier, 3, tmp_path / "c"))

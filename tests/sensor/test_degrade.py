@@ -46,9 +46,7 @@ def ideal(tmp_path: Path) -> Recording:
     return Recording.open(folder)
 
 
-def test_all_but_the_images_stays_and_the_ideal_depth_is_kept(
-    ideal: Recording, tmp_path: Path
-) -> None:
+def test_all_but_images_stays_and_ideal_depth_is_kept(ideal: Recording, tmp_path: Path) -> None:
     done = degrade(sensor(depth_kind="radial"), ideal, tmp_path / "real", seed=4)
     found = done.recording
     csv = [(each.path / "frames.csv").read_bytes() for each in (ideal, found)]
@@ -94,9 +92,7 @@ def test_the_command_writes_a_recording_and_names_what_it_left_out(
     assert "Warning: Left out: multipath: it belongs to the target and the room" in told
 
 
-def test_another_camera_is_refused_and_another_lens_is_said(
-    ideal: Recording, tmp_path: Path
-) -> None:
+def test_another_camera_is_refused_and_a_lens_warned_of(ideal: Recording, tmp_path: Path) -> None:
     with pytest.raises(CalibrationDataError, match="frames are 7x5 pixels, the sensor has 512x424"):
         degrade("kinect_v2", ideal, tmp_path / "real")
     camera = sensor().camera.to_mapping() | {"distortion": []}

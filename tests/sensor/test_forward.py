@@ -208,9 +208,7 @@ def test_a_term_of_a_condition_is_added_frame_by_frame() -> None:
 
 
 @pytest.mark.parametrize("kind", ["radial", "z"])
-def test_the_ranges_covered_are_those_along_the_ray_in_which_the_sensor_was_measured(
-    kind: str,
-) -> None:
+def test_the_ranges_covered_are_those_of_the_measurement_along_the_ray(kind: str) -> None:
     error = ERROR | {"reads": "measured_distance"}
     model = sensor(torch.float32, depth_kind=kind, error=error)
     slant = ray_directions(CAMERA)[..., 2]

@@ -7,6 +7,7 @@ import pytest
 import torch
 from cameras import camera
 from seen_wall import seen_wall
+from torch import Generator
 
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.simulation.hooks import FrameState
@@ -18,7 +19,7 @@ CAMERA = camera((40, 30), (60.0, 60.0), (19.5, 14.5))
 def measure(
     distance: float,
     tilt: float = 0.0,
-    generator: torch.Generator | None = None,
+    generator: Generator | None = None,
     integration_time: float = math.nan,
     **sensor: Any,
 ) -> FrameState:
@@ -49,9 +50,7 @@ def test_integration_time_scales_light() -> None:
 
 
 @pytest.mark.parametrize("ambient", [0.0, 2000.0])
-def test_distance_scatters_as_the_four_tap_formula_says(
-    ambient: float, generator: torch.Generator
-) -> None:
+def test_distance_scatters_by_the_four_tap_formula(ambient: float, generator: Generator) -> None:
     frequency, amplitude, read_noise = 20.0e6, 8000.0, 150.0
     background = 20_000.0 + ambient
     quarters = torch.arange(4, dtype=torch.float64)[:, None, None] * (math.pi / 2)
@@ -69,7 +68,7 @@ def test_distance_scatters_as_the_four_tap_formula_says(
     assert metres.mean().item() == pytest.approx(0.0, abs=5 * expected / 200)
 
 
-def test_converter_counts_whole_numbers_within_its_scale(generator: torch.Generator) -> None:
+def test_converter_counts_whole_numbers_within_its_scale(generator: Generator) -> None:
     taps = torch.linspace(0.0, 5e6, 4000, dtype=torch.float64).reshape(4, 10, 100)
     counts = read_out(taps, ReadoutOptions(converter_bits=12), generator)
     assert torch.equal(counts, counts.round())
@@ -77,7 +76,7 @@ def test_converter_counts_whole_numbers_within_its_scale(generator: torch.Genera
     assert counts.max() == 4095
 
 
-def test_full_and_dim_pixels_have_no_distance(generator: torch.Generator) -> None:
+def test_full_and_dim_pixels_have_no_distance(generator: Generator) -> None:
     state = measure(0.3, generator=generator, readout={"converter_bits": 14})
     full = (state.raw >= 2**14 - 1).any(0)
     assert full.any()

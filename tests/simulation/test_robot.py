@@ -6,6 +6,7 @@ import pytest
 import torch
 from optional import present
 from simulation.small import expected_frames, planned, small
+from torch import Generator
 
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
@@ -75,7 +76,7 @@ def test_sweep_goes_away_from_the_wall() -> None:
     assert nearest == sorted(nearest)
 
 
-def test_guess_is_as_far_from_the_truth_as_asked(generator: torch.Generator) -> None:
+def test_guess_is_as_far_from_the_truth_as_asked(generator: Generator) -> None:
     asked = MountGuessOptions(translation_mm=30.0, rotation_deg=5.0)
     truth = CameraMountOptions().tool_from_camera()
     guess = hand_eye_guess(CameraMountOptions(guess=asked), generator)

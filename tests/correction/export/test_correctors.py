@@ -15,7 +15,7 @@ import pytest
 import torch
 from correction.export.c_code.models import STATES, hard_frames
 from correction.export.states import TRANSFORMS, calibration, write
-from torch import Tensor
+from torch import Generator, Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
@@ -29,7 +29,7 @@ WITHOUT_ONNX = any(
 
 
 @pytest.fixture
-def frames(generator: torch.Generator) -> Frames:
+def frames(generator: Generator) -> Frames:
     """Frames in and around the calibrated ranges, two pixels without a return."""
     depth = 0.4 + 2.8 * torch.rand(3, 5, 7, generator=generator)
     depth[0, 0, :2] = torch.tensor([torch.nan, 0.0])
@@ -154,9 +154,7 @@ def test_metadata_names_camera_model_and_range() -> None:
     assert metadata["needs_amplitude"] is True
 
 
-def test_corrector_loads_and_runs_where_there_is_torch_alone(
-    frames: Frames, tmp_path: Path
-) -> None:
+def test_a_corrector_loads_and_runs_where_torch_is_alone(frames: Frames, tmp_path: Path) -> None:
     state = calibration(np.eye(4))
     write("torchscript", state, tmp_path / "corrector.ts")
     for name, frame in zip(("depth", "amplitude"), frames, strict=True):

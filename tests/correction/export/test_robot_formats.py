@@ -145,9 +145,7 @@ def test_a_reader_sees_axes_and_standard_errors(name: str, file: str, tmp_path: 
 
 
 @every_format
-def test_a_calibration_without_a_robot_is_refused_by_name(
-    name: str, file: str, tmp_path: Path
-) -> None:
+def test_a_calibration_without_a_robot_is_refused(name: str, file: str, tmp_path: Path) -> None:
     state = calibration(np.eye(4), hand_eye_estimated=False)
     with pytest.raises(ConfigError, match=rf"{name} needs an estimated.*EA has none"):
         write(name, state, tmp_path / file)

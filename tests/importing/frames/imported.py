@@ -35,6 +35,12 @@ class Imported(NamedTuple):
         assert self.recording is not None, self.text
         return self.recording
 
+    @property
+    def refusal(self) -> str:
+        """What an import said that was refused."""
+        assert self.exit_code == 2, self.text
+        return self.text
+
     def reasons(self) -> dict[str, str]:
         """Return why each view was left out; of several reasons the last."""
         return {one["view"]: one["reason"] for one in self.report["refused"]}

@@ -56,9 +56,7 @@ def test_every_format_holds_the_pose(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["poses.txt", "poses.csv"])
 @pytest.mark.parametrize("unit", [1e-3, 1e-6, 1e-9])
-def test_stamps_since_1970_may_count_finer_units_than_seconds(
-    name: str, unit: float, tmp_path: Path
-) -> None:
+def test_stamps_since_1970_may_count_finer_units(name: str, unit: float, tmp_path: Path) -> None:
     """TUM's lines and a column `timestamp` in nanoseconds were read as seconds."""
     row = f"{round(1_700_000_000.5 / unit)} 0.1 -0.2 0.3 {X} {Y} {Z} {W}\n"
     header = "timestamp,x,y,z,qx,qy,qz,qw\n"

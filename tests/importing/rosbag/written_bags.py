@@ -45,14 +45,14 @@ class Bag:
         stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
-    def write(self, topic: str, kind: str, message: Any, received: float) -> None:
-        """Write a message."""
+    def write(self, topic: str, kind: str, received: float, **fields: Any) -> None:
+        """Make a message, and write it."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, kind, typestore=self._store
             )
         serialize = self._store.serialize_ros1 if self.one else self._store.serialize_cdr
-        content = serialize(message, kind)
+        content = serialize(self.make(kind, **fields), kind)
         self._writer.write(self._connections[topic], round(received * 1e9), content)
 
     def image(
@@ -61,27 +61,24 @@ class Bag:
         """Write a sensor_msgs/Image."""
         order = ">" if big_endian else "<"
         content = pixels.astype(pixels.dtype.newbyteorder(order)).tobytes()
-        message = self.make(
+        height, width = pixels.shape[:2]
+        size = {"height": height, "width": width, "step": width * pixels.dtype.itemsize}
+        self.write(
+            topic,
             "sensor_msgs/msg/Image",
+            time + 0.02,
             header=self.header(time),
-            height=pixels.shape[0],
-            width=pixels.shape[1],
+            **size,
             encoding=encoding,
             is_bigendian=int(big_endian),
-            step=pixels.shape[1] * pixels.dtype.itemsize,
             data=np.frombuffer(content, np.uint8),
         )
-        self.write(topic, "sensor_msgs/msg/Image", message, time + 0.02)
 
     def compressed(self, topic: str, time: float, content: bytes, coding: str) -> None:
         """Write a sensor_msgs/CompressedImage."""
-        message = self.make(
-            "sensor_msgs/msg/CompressedImage",
-            header=self.header(time),
-            format=coding,
-            data=np.frombuffer(content, np.uint8),
-        )
-        self.write(topic, "sensor_msgs/msg/CompressedImage", message, time + 0.02)
+        fields = {"format": coding, "data": np.frombuffer(content, np.uint8)}
+        kind = "sensor_msgs/msg/CompressedImage"
+        self.write(topic, kind, time + 0.02, header=self.header(time), **fields)
 
     def camera_info(
         self,
@@ -101,13 +98,12 @@ class Bag:
         values["d"] = np.array(recorded.distortion)
         if self.one:
             values = {name.upper(): value for name, value in values.items()}
-        message = self.make(
-            "sensor_msgs/msg/CameraInfo",
-            header=self.header(recorded.image_times[0]),
+        first = recorded.image_times[0]
+        self.write(
+            topic, "sensor_msgs/msg/CameraInfo", first, header=self.header(first),
             height=height, width=width, distortion_model=model, binning_x=0, binning_y=0, roi=roi,
             **values,
         )  # fmt: skip
-        self.write(topic, "sensor_msgs/msg/CameraInfo", message, recorded.image_times[0])
 
     def transform(self, topic: str, time: float, parent: str, child: str, pose: np.ndarray) -> None:
         """Write a tf2_msgs/TFMessage of one transform."""
@@ -120,8 +116,7 @@ class Bag:
             child_frame_id=child,
             transform=self.make("geometry_msgs/msg/Transform", translation=move, rotation=turn),
         )
-        message = self.make("tf2_msgs/msg/TFMessage", transforms=[one])
-        self.write(topic, "tf2_msgs/msg/TFMessage", message, time + 0.004)
+        self.write(topic, "tf2_msgs/msg/TFMessage", time + 0.004, transforms=[one])
 
 
 @contextmanager

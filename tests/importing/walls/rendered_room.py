@@ -38,23 +38,10 @@ CUPBOARD: Plane = ((-1.0, 0.0, 0.0), 1.7)
 """A plane parallel to FRONT and 300 mm nearer; seen where |y| < 0.6 m."""
 
 
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera without distortion."""
-
-    width: int = 64
-    height: int = 50
-    focal: float = 60.0
-
-    @property
-    def matrix(self) -> np.ndarray:
-        matrix = np.diag([self.focal, self.focal, 1.0])
-        matrix[:2, 2] = (self.width - 1) / 2, (self.height - 1) / 2
-        return matrix
-
-    @property
-    def rays(self) -> np.ndarray:
-        return unit_rays(self.matrix, self.width, self.height)
+def pinhole(width: int = 64, height: int = 50, focal: float = 60.0) -> CameraIntrinsics:
+    """Return a pinhole camera without distortion."""
+    centre = (width - 1) / 2, (height - 1) / 2
+    return cameras.camera((width, height), (focal, focal), centre)
 
 
 @dataclass(frozen=True)
@@ -87,12 +74,17 @@ class Room:
         clutter: Share of the pixels on boxes.
     """
 
-    camera: Camera = field(default_factory=Camera)
+    camera: CameraIntrinsics = field(default_factory=pinhole)
     planes: tuple[Plane, ...] = ROOM
     tool_from_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     noise: float = 0.003
     error: float = 1.0
     clutter: float = 0.0
+
+    @property
+    def rays(self) -> np.ndarray:
+        """Unit rays of the camera, shape (H, W, 3)."""
+        return unit_rays(np.array(self.camera.matrix), self.camera.width, self.camera.height)
 
     def views(self, world_from_camera: np.ndarray, generator: np.random.Generator) -> Views:
         """Render an image from each pose."""
@@ -104,7 +96,7 @@ class Room:
     def _image(
         self, pose: np.ndarray, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rays = self.camera.rays
+        rays = self.rays
 
         def shown(number: int, points: np.ndarray) -> np.ndarray | bool:
             return self.planes[number] != CUPBOARD or np.abs(points[..., 1]) < 0.6
@@ -198,8 +190,7 @@ def found_in(
     room: Room, views: Views, options: WallOptions | None = None, targets: np.ndarray | None = None
 ) -> FoundWalls:
     """Find the walls of views."""
-    camera = intrinsics(room.camera)
-    return found_in_images(views.depth, camera, views.world_from_tool, options, targets)
+    return found_in_images(views.depth, room.camera, views.world_from_tool, options, targets)
 
 
 def found_in_images(
@@ -223,9 +214,3 @@ def looking_straight(number: int, roll: float, generator: np.random.Generator) -
     straight = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     rolls = Rotation.from_rotvec(roll * generator.uniform(-1, 1, (number, 1)) * [0, 0, 1])
     return cameras.rigid(straight * rolls, places)
-
-
-def intrinsics(camera: Camera) -> CameraIntrinsics:
-    """Return the camera as the package describes it."""
-    (focal, _, right), (_, _, down), _ = camera.matrix.tolist()
-    return cameras.camera((camera.width, camera.height), (focal, focal), (right, down))

@@ -5,10 +5,10 @@ import pytest
 import torch
 from importing.walls.rendered_room import (
     ROOM,
-    Camera,
     Room,
     Views,
     hand_eye_anywhere,
+    pinhole,
     poses_in_room,
 )
 
@@ -27,7 +27,7 @@ MOVED, TILTED = 0.06, np.radians(4.0)
 
 def planes_of(room: Room, depth: np.ndarray, seed: int = 0) -> list[ImagePlane]:
     distance = torch.from_numpy(depth)
-    rays = torch.from_numpy(room.camera.rays)
+    rays = torch.from_numpy(room.rays)
     return planes_of_image(distance, distance.isfinite(), rays, OPTIONS, seed=seed)
 
 
@@ -47,11 +47,8 @@ def rendered(room: Room, number: int, seed: int) -> tuple[np.ndarray, Views]:
     return poses, room.views(poses, generator)
 
 
-@pytest.mark.parametrize(("camera", "clutter"), [(Camera(), 0.0), (Camera(320, 240, 285.0), 0.2)])
-def test_every_large_plane_is_found_once_and_pixels_are_given_to_the_right_one(
-    camera: Camera, clutter: float
-) -> None:
-    room = Room(camera=camera, clutter=clutter)
+@pytest.mark.parametrize("room", [Room(), Room(pinhole(320, 240, 285.0), clutter=0.2)])
+def test_every_large_plane_is_found_once_and_pixels_are_given_to_the_right_one(room: Room) -> None:
     poses, views = rendered(room, 12, seed=3)
     for pose, depth, true in zip(poses, views.depth, views.plane, strict=True):
         planes = planes_of(room, depth)
@@ -61,7 +58,7 @@ def test_every_large_plane_is_found_once_and_pixels_are_given_to_the_right_one(
         assert {int(k) for k in np.flatnonzero(share > 2 * OPTIONS.least_share)} <= set(found)
         walls = [k for k in found if k is not None]
         assert len(walls) == len(set(walls))
-        distance, rays = torch.from_numpy(depth), torch.from_numpy(camera.rays)
+        distance, rays = torch.from_numpy(depth), torch.from_numpy(room.rays)
         gradients = torch.stack([-plane.normal / plane.offset for plane in planes])
         tolerance = OPTIONS.tolerance_mm * 1e-3
         masks = plane_masks(distance, distance.isfinite(), rays, gradients, tolerance).numpy()
@@ -98,7 +95,7 @@ def test_without_noise_the_plane_is_exact() -> None:
         normal = pose[:3, :3].T @ np.array(ROOM[1][0])
         true = -normal / (np.array(ROOM[1][0]) @ pose[:3, 3] + ROOM[1][1])
         np.testing.assert_allclose((-plane.normal / plane.offset).numpy(), true, atol=1e-9)
-        points = depth[..., None] * exact.camera.rays
+        points = depth[..., None] * exact.rays
         flat = points[np.isfinite(depth)]
         # Four points stand for all: they have the same mean and second moments.
         four = plane.points.numpy()

@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 import synthetic_scene
 from cameras import apart
-from importing.walls.rendered_room import (
-    Camera,
-    Room,
-    Views,
-    hand_eye_anywhere,
-    intrinsics,
-    poses_in_room,
-)
+from importing.walls.rendered_room import Room, Views, hand_eye_anywhere, pinhole, poses_in_room
 from importing.walls.rendered_room import imported as imported_room
 from optional import present
 
@@ -41,9 +34,9 @@ class Imported(NamedTuple):
 def import_room(out: Path, images: int, clutter: float) -> Imported:
     generator = np.random.default_rng(2)
     hand_eye = hand_eye_anywhere(generator)
-    room = Room(Camera(48, 40, 46.0), tool_from_camera=hand_eye, clutter=clutter)
+    room = Room(pinhole(48, 40, 46.0), tool_from_camera=hand_eye, clutter=clutter)
     views = room.views(poses_in_room(images, generator), generator)
-    given = intrinsics(room.camera), views.world_from_tool, views.depth, views.amplitude
+    given = room.camera, views.world_from_tool, views.depth, views.amplitude
     return Imported(room, views, *imported_room(out, *given))
 
 
@@ -104,9 +97,7 @@ def test_training_finds_the_hand_eye_without_being_told_anything(imported: Impor
     assert {wall["wall"] for wall in report["walls"]} == set(imported.recording.frames.target)
 
 
-def test_evaluating_judges_every_column_against_walls_of_its_own(
-    imported: Imported, tmp_path: Path
-) -> None:
+def test_every_column_is_judged_against_its_own_walls(imported: Imported, tmp_path: Path) -> None:
     bent = _with_planes_of_nonsense(imported.recording, tmp_path / "bent")
     options = {"models": [EA], "folds": 0}
     sets = (tofcorr.evaluate(one, options).sets[0] for one in (imported.recording, bent))

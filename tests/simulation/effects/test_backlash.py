@@ -8,9 +8,7 @@ from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.effects.robot_kinematics import BacklashEffect, sides_of_approach
 
 
-def test_an_arm_that_comes_from_the_other_side_stops_farther_by_the_play(
-    inputs: EffectInputs,
-) -> None:
+def test_an_arm_from_the_other_side_stops_farther_by_the_play(inputs: EffectInputs) -> None:
     play = torch.tensor([0.003, -0.002, 0.001], dtype=torch.float64)
     effect = BacklashEffect(BacklashEffect.shape_type(), play / 2)
     sides = [torch.full((4, 3), side, dtype=torch.float64) for side in (-1.0, 1.0)]

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from simulation.effects.scenes import Scene
+from torch import Generator
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry.se3 import by_frame
@@ -29,7 +30,7 @@ def scene(request: pytest.FixtureRequest, name: str) -> Scene:
     return request.getfixturevalue("moving" if VELOCITY in CATALOGUE[name].needs else "at_rest")
 
 
-def _drawn(effect: CatalogueEffect, inputs: EffectInputs, generator: torch.Generator) -> Any:
+def _drawn(effect: CatalogueEffect, inputs: EffectInputs, generator: Generator) -> Any:
     """Return the effect with random coefficients, of the size of the test, and its slope."""
     columns = effect.slope(inputs, torch.zeros_like(effect.coefficients))
     direction = torch.randn(columns.shape[1], generator=generator, dtype=torch.float64)
@@ -54,7 +55,7 @@ def test_a_linear_effect_is_its_columns_at_any_strength(name: str, scene: Scene)
     ("name", "inner"), [(n, inner) for n, e in CATALOGUE.items() for inner in e.contains]
 )
 def test_an_effect_describes_every_shift_of_those_it_contains(
-    name: str, inner: str, at_rest: Scene, generator: torch.Generator
+    name: str, inner: str, at_rest: Scene, generator: Generator
 ) -> None:
     outer = CATALOGUE[name].for_recording(at_rest.inputs)
     # At the finest resolution of a map: each pixel once.
@@ -80,7 +81,7 @@ def test_every_effect_says_what_it_is_where_from_and_what_to_record(name: str) -
 
 @pytest.mark.parametrize("name", sorted(CATALOGUE))
 def test_columns_predict_what_four_samples_measure(
-    name: str, scene: Scene, generator: torch.Generator
+    name: str, scene: Scene, generator: Generator
 ) -> None:
     effect = CATALOGUE[name].for_recording(scene.inputs)
     small, columns = _drawn(effect, scene.inputs, generator)
@@ -94,7 +95,7 @@ def test_columns_predict_what_four_samples_measure(
 @pytest.mark.parametrize("strength", [0, 20])
 @pytest.mark.parametrize("name", sorted(CATALOGUE))
 def test_the_slope_is_the_derivative_of_the_shift_at_any_strength(
-    name: str, strength: float, scene: Scene, generator: torch.Generator
+    name: str, strength: float, scene: Scene, generator: Generator
 ) -> None:
     effect = CATALOGUE[name].for_recording(scene.inputs)
     strong, step = (
@@ -106,7 +107,7 @@ def test_the_slope_is_the_derivative_of_the_shift_at_any_strength(
     torch.testing.assert_close((ahead - behind) / 2, slope, atol=1e-10, rtol=1e-5)
 
 
-def test_a_product_by_frame_takes_pixels_in_any_order(generator: torch.Generator) -> None:
+def test_a_product_by_frame_takes_pixels_in_any_order(generator: Generator) -> None:
     frame = torch.tensor([2, 0, 2, 2, 0])  # Frame 1 has no pixel.
     values, matrices = torch.randn(5, 3, generator=generator), torch.randn(3, 3, 4)
     expected = torch.einsum("mj,mjk->mk", values, matrices[frame])
@@ -121,7 +122,7 @@ def test_an_effect_without_strength_changes_nothing(name: str, scene: Scene) -> 
 
 
 @pytest.mark.parametrize("name", sorted(CATALOGUE))
-def test_an_effect_survives_its_yaml(name: str, scene: Scene, generator: torch.Generator) -> None:
+def test_an_effect_survives_its_yaml(name: str, scene: Scene, generator: Generator) -> None:
     effect = CATALOGUE[name].for_recording(scene.inputs)
     drawn, _ = _drawn(effect, scene.inputs, generator)
     entry = drawn.to_mapping()

@@ -6,7 +6,7 @@ import pytest
 import torch
 from optional import present
 from simulation.effects.scenes import Scene
-from torch import Tensor
+from torch import Generator, Tensor
 
 from tofcorr.simulation.effects.base import EffectInputs, blur
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect
@@ -32,7 +32,7 @@ def _lit(inputs: EffectInputs, images: Tensor, noise: float | None = None) -> Ef
     return replace(lit, amplitude_noise=None if noise is None else noise * own)
 
 
-def _explained(inputs: EffectInputs, generator: torch.Generator, noise: float | None) -> float:
+def _explained(inputs: EffectInputs, generator: Generator, noise: float | None) -> float:
     """Return the product of errors at edges and noise of the phase, in standard errors."""
     effect = MixedPixelsEffect.for_recording(inputs)
     phase = present(inputs.distance_images) / inputs.metres_per_radian
@@ -52,7 +52,7 @@ def _explained(inputs: EffectInputs, generator: torch.Generator, noise: float | 
 
 
 def test_filtered_noise_of_distances_is_not_explained_by_that_of_amplitudes(
-    shaded: EffectInputs, generator: torch.Generator
+    shaded: EffectInputs, generator: Generator
 ) -> None:
     """Mixed pixels were named for 8 % of filtering cameras with nothing missing."""
     assert abs(_explained(shaded, generator, None)) > 3

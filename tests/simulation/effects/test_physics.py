@@ -9,6 +9,7 @@ import torch
 from optional import present
 from scipy import signal
 from scipy.spatial.transform import Rotation
+from torch import Generator
 
 from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
 from tofcorr.simulation.effects.base import CatalogueEffect, EffectInputs, distance_to
@@ -28,7 +29,7 @@ from tofcorr.simulation.effects.temperature import (
 from tofcorr.simulation.effects.timestamp_offset import TimestampOffsetEffect
 
 
-def test_the_lens_bends_rays_as_opencv_distorts_points(generator: torch.Generator) -> None:
+def test_the_lens_bends_rays_as_opencv_distorts_points(generator: Generator) -> None:
     points = torch.rand(50, 2, generator=generator, dtype=torch.float64) - 0.5
     rays = torch.cat([points, torch.ones(50, 1, dtype=torch.float64)], dim=1)
     k1, k2, p1, p2, s1, s3 = 0.1, -0.05, 0.004, -0.003, 0.006, -0.005

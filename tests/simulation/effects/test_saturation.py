@@ -13,9 +13,7 @@ def bright(tmp_path_factory: pytest.TempPathFactory) -> EffectInputs:
     return plain_inputs(tmp_path_factory.mktemp("bright"), "white", 2)
 
 
-def test_a_pixel_whose_four_taps_all_clip_has_no_shift_that_rounding_decides(
-    bright: EffectInputs,
-) -> None:
+def test_a_pixel_whose_four_taps_clip_has_no_shift_of_rounding(bright: EffectInputs) -> None:
     # At a contrast of one half the darkest tap is the amplitude: far above every knee.
     full = 0.1 * float(bright.known_amplitude.min())
     effect = SaturationEffect(SaturationShape(full_counts=full, contrast=0.5))
@@ -34,9 +32,7 @@ def test_charge_spills_where_a_tap_is_full_and_nowhere_else(bright: EffectInputs
 
 
 @pytest.mark.parametrize("axis", [-2, -1])
-def test_what_runs_from_a_full_pixel_stays_on_its_line_and_is_no_more_than_it_had(
-    axis: int,
-) -> None:
+def test_what_runs_from_a_full_pixel_stays_on_its_line_and_is_what_it_had(axis: int) -> None:
     over = torch.zeros(9, 9, dtype=torch.float64)
     over[4, 4] = 100.0
     received = spilled(over, axis)

@@ -52,9 +52,7 @@ def test_a_frame_alone_and_in_a_batch_are_the_same(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc reports what it vectorises")
 @pytest.mark.parametrize("depth_kind", ["radial", "z"])
-def test_every_loop_over_pixels_is_vectorised_without_special_flags(
-    depth_kind: Any, tmp_path: Path
-) -> None:
+def test_every_loop_over_pixels_is_vectorised(depth_kind: Any, tmp_path: Path) -> None:
     small = calibration(TRANSFORMS["general"], depth_kind=depth_kind)
     camera = CameraIntrinsics(width=640, height=4, matrix=small.camera.matrix)
     domain = replace(small.domain, height=4, width=640)
