@@ -88,9 +88,11 @@ def recorded(
     return Recording.open(folder)
 
 
-def altered(recording: Recording, change: Callable[[np.ndarray], np.ndarray]) -> Recording:
-    """Change the depth of a recording, (N, H, W), metres; open it again."""
-    path = recording.path / "depth.npy"
+def altered(
+    recording: Recording, change: Callable[[np.ndarray], np.ndarray], name: str = "depth"
+) -> Recording:
+    """Change images of a recording, (N, H, W), and open it again."""
+    path = recording.path / f"{name}.npy"
     np.save(path, change(np.load(path)).astype(np.float32))
     return Recording.open(recording.path)
 

@@ -6,7 +6,7 @@ import torch
 from diagnosed_recordings import TIME, measured, recorded
 from diagnosis.resamples import resamples_of
 
-from tofcorr.diagnosis.findings.gap import Gap, measure_gap, resampled, squared_gaps, studentised
+from tofcorr.diagnosis.findings.gap import measure_gap, resampled, squared_gaps, studentised
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.structure import noise_floor
 from tofcorr.diagnosis.findings.where import interval_of
@@ -50,11 +50,6 @@ def test_a_noise_known_to_a_per_cent_or_two_does_not_change_the_gap(
             assert gap.after == pytest.approx(gaps[0].after, rel=1e-6)
 
 
-@pytest.fixture(scope="module")
-def time_gap(time_diagnosis: DiagnosisResult) -> Gap:
-    return time_diagnosis.gap
-
-
 def test_a_floor_is_no_larger_than_what_is_left_inside_images(
     time_study: Study, time_named: NamedEffects, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -66,14 +61,16 @@ def test_a_floor_is_no_larger_than_what_is_left_inside_images(
     assert 0.95 * whole < noise_floor(time_named).size <= whole
 
 
-def test_parts_of_the_gap_add_up_in_squares(time_gap: Gap) -> None:
-    parts = (time_gap.between_images, time_gap.fixed_pattern, time_gap.within_images)
-    assert sum(part**2 for part in parts) == pytest.approx(time_gap.before**2, rel=1e-6)
+def test_parts_of_the_gap_add_up_in_squares(time_diagnosis: DiagnosisResult) -> None:
+    gap = time_diagnosis.gap
+    parts = (gap.between_images, gap.fixed_pattern, gap.within_images)
+    assert sum(part**2 for part in parts) == pytest.approx(gap.before**2, rel=1e-6)
 
 
-def test_resamples_scatter_around_the_gap_of_all_poses(time_gap: Gap) -> None:
-    assert np.median(time_gap.before.draws) == pytest.approx(time_gap.before, rel=0.05)
-    assert np.median(time_gap.after.draws) == pytest.approx(time_gap.after, abs=3e-4)
+def test_resamples_scatter_around_the_gap_of_all_poses(time_diagnosis: DiagnosisResult) -> None:
+    gap = time_diagnosis.gap
+    assert np.median(gap.before.draws) == pytest.approx(gap.before, rel=0.05)
+    assert np.median(gap.after.draws) == pytest.approx(gap.after, abs=3e-4)
 
 
 def test_no_gap_is_larger_than_what_is_left_with_the_noise(

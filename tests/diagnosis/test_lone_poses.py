@@ -1,6 +1,5 @@
 """A pose that alone shows a range of distances makes the gap large, and the report says so."""
 
-import csv
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from diagnosed_recordings import recorded
 from optional import present
 
 from tofcorr.data.recording import Recording
+from tofcorr.data.writing import RecordingWriter
 from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.next.advice import make_candidates
@@ -37,22 +37,13 @@ def far(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def _with_one_more(far: Recording, near: Recording, folder: Path) -> Recording:
-    """Append a recording's frames to another's."""
-    folder.mkdir()
-    (folder / "recording.yaml").write_bytes((far.path / "recording.yaml").read_bytes())
-    for name in ("depth.npy", "amplitude.npy"):
-        np.save(folder / name, np.concatenate([np.load(r.path / name) for r in (far, near)]))
-    rows = [
-        row | {"timestamp_s": repr(float(row["timestamp_s"]) + later)}
-        for recording, later in ((far, 0.0), (near, 1e4))
-        for row in csv.DictReader((recording.path / "frames.csv").read_text().splitlines())
-    ]
-    for frame, row in enumerate(rows):
-        row |= {"frame": str(frame), "pose_id": str(frame)}
-    with (folder / "frames.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    """Append a recording's frames to another's, as if taken some hours later."""
+    with RecordingWriter.with_header_of(folder, far) as writer:
+        for recording, later in ((far, 0.0), (near, 1e4)):
+            for frame, row in enumerate(recording.frames.rows()):
+                own = {"timestamp": row.timestamp + later, "pose_id": f"{later} {frame}"}
+                images = {"amplitude": present(recording.amplitude)[frame]}
+                writer.append(recording.depth[frame], row=replace(row, **own), **images)
     return Recording.open(folder)
 
 

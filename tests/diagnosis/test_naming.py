@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from diagnosed_recordings import recorded
+from diagnosed_recordings import TIME, altered, recorded
 from diagnosis.resamples import resamples_of
 
 from tofcorr.data.recording import Recording
@@ -74,9 +74,8 @@ def test_a_strong_effect_is_named_or_is_in_the_cause_set(name: str, tmp_path: Pa
 
 
 def test_two_effects_are_both_named(tmp_path: Path) -> None:
-    pair = [{"name": "integration_time", "log_1": 0.006}, {"name": "wiggling", "sin_8": 0.006}]
-    recording = recorded(tmp_path / "pair", 41, pair)
-    _, named = _selected(recording)
+    pair = [TIME, {"name": "wiggling", "sin_8": 0.006}]
+    _, named = _selected(recorded(tmp_path / "pair", 41, pair))
     covered = {name for members in named.cause_sets for name in members}
     assert {"integration_time", "wiggling"} <= covered
     assert len(named.names) == 2
@@ -89,12 +88,10 @@ def test_nothing_is_named_where_nothing_is_missing(
     assert not _judged(nothing_study, nothing_named).unknown
 
 
-def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
-    study = prepare(time_missing, DiagnosisOptions(), None).study
-    options = study.options.model_copy(
-        update={"tests": study.options.tests.model_copy(update={"least_images": 60})}
-    )
-    named = name_effects(replace(study, options=options))
+def test_few_poses_are_ranked_but_not_tested(time_study: Study) -> None:
+    tests = time_study.options.tests.model_copy(update={"least_images": 60})
+    options = time_study.options.model_copy(update={"tests": tests})
+    named = name_effects(replace(time_study, options=options))
     assert not named.tested
     assert named.names == ()
     assert named.ranking[0] == "integration_time"
@@ -109,15 +106,13 @@ def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
 )
 def test_what_no_effect_explains_is_unknown_in_words(kind: str, trace: str, tmp_path: Path) -> None:
     recording = recorded(tmp_path / "odd", 42)
-    depth = np.load(recording.path / "depth.npy")
-    random = np.random.default_rng(42)
+    frame = np.arange(recording.num_frames)[:, None, None]
     if kind == "third frame":
-        depth[::3] += 0.006
+        off = frame % 3 == 0
     else:
-        phase = random.uniform(0, 2 * np.pi, (len(depth), 1, 1))
-        depth += 0.006 * np.sin(np.arange(24)[None, :, None] * 0.9 + phase).astype(np.float32)
-    np.save(recording.path / "depth.npy", depth)
-    study, named = _selected(Recording.open(recording.path))
+        phase = np.random.default_rng(42).uniform(0, 2 * np.pi, frame.shape)
+        off = np.sin(np.arange(24)[:, None] * 0.9 + phase)
+    study, named = _selected(altered(recording, lambda depth: depth + 0.006 * off))
     remains = _judged(study, named)
     assert named.names == ()
     assert remains.unknown

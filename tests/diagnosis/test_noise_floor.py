@@ -44,8 +44,7 @@ def _noise(study: Study, seed: int, width: float = 0.0) -> Tensor:
     camera, observations = study.inputs.camera, study.observations
     rng = np.random.default_rng(seed)
     images = rng.standard_normal((observations.num_frames, camera.height, camera.width))
-    if width:
-        images = gaussian_filter(images, (0, width, width), mode="wrap")
+    images = gaussian_filter(images, (0, width, width), mode="wrap")
     flat = torch.from_numpy(images).flatten(1)
     return flat[observations.frame, observations.pixel] * study.fit.sigma
 
@@ -84,15 +83,6 @@ def test_neither_the_noise_nor_the_poses_offsets_matter(nothing_study: Study) ->
     assert again.square == pytest.approx(9 * first.square, rel=1e-2)
 
 
-def _filtered(study: Study) -> Tensor:
-    """Noise that neighbours share within a frame, shape (M,)."""
-    camera, observations = study.inputs.camera, study.observations
-    random = np.random.default_rng(5)
-    white = random.standard_normal((observations.num_frames, camera.height, camera.width))
-    images = 3 * SIGMA * torch.from_numpy(np.stack([uniform_filter(one, 3) for one in white]))
-    return images.reshape(len(images), -1)[observations.frame, observations.pixel]
-
-
 def _bumps(study: Study) -> Tensor:
     across = study.inputs.target_xy @ torch.tensor([20.0, 9.0], dtype=torch.float64)
     return SIZE * 2**0.5 * torch.sin(across)
@@ -106,7 +96,8 @@ def _of_amplitude(study: Study) -> Tensor:
 def test_what_poses_share_is_measured_beneath_noise_that_neighbours_share(
     nothing_study: Study, error: Callable[[Study], Tensor]
 ) -> None:
-    found = shared_by_poses(nothing_study, _filtered(nothing_study) + error(nothing_study))
+    noise = _noise(nothing_study, 5, 1.2)
+    found = shared_by_poses(nothing_study, noise + error(nothing_study))
     share = nothing_study.fit.share
     true = float((share * error(nothing_study) ** 2).sum() / share.sum())
     assert found.square == pytest.approx(true, rel=0.15)
@@ -114,7 +105,7 @@ def test_what_poses_share_is_measured_beneath_noise_that_neighbours_share(
 
 
 def test_noise_alone_is_shared_by_no_poses(nothing_study: Study) -> None:
-    assert shared_by_poses(nothing_study, _filtered(nothing_study)).square == 0
+    assert shared_by_poses(nothing_study, _noise(nothing_study, 5, 1.2)).square == 0
 
 
 def test_a_bent_target_is_no_filter_of_the_noise_once_it_is_known(tmp_path: Path) -> None:

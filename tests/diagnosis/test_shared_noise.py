@@ -9,7 +9,7 @@ from diagnosed_recordings import STILL, altered, recorded
 from optional import present
 from scipy.ndimage import uniform_filter
 
-from tofcorr.data.recording import Recording, repeats_of
+from tofcorr.data.recording import repeats_of
 from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.findings.structure import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -25,12 +25,14 @@ REPEATED: dict[str, Any] = STILL | {"robot": STILL["robot"] | REPEATS}
 both_ways = pytest.mark.parametrize("changes", [STILL, REPEATED], ids=["single", "repeats"])
 
 
-def _filtered(folder: Path, changes: dict[str, Any], width: int) -> Study:
+def _filtered(
+    folder: Path, changes: dict[str, Any], width: int, options: DiagnosisOptions = OPTIONS
+) -> Study:
     """A recording whose noise, of one standard deviation, is a moving average of that width."""
     recording = recorded(folder, 48, [], changes, noise=False)
     noise = np.random.default_rng(48).normal(size=(recording.num_frames, 40, 48))
-    noise = width * SIGMA * np.stack([uniform_filter(own, width) for own in noise])[:, 8:32, 8:40]
-    return prepare(altered(recording, lambda z: z + noise), OPTIONS).study
+    noise = width * SIGMA * uniform_filter(noise, width, axes=(1, 2))[:, 8:32, 8:40]
+    return prepare(altered(recording, lambda z: z + noise), options).study
 
 
 def _shared_in_squares() -> float:
@@ -82,9 +84,8 @@ def test_a_wide_filter_does_not_hide_the_noise_of_single_frames(tmp_path: Path) 
 
 def test_a_filter_is_seen_where_few_pixels_of_each_image_are_chosen(tmp_path: Path) -> None:
     """Chosen pixels are far apart; their floor was that of differences between neighbours."""
-    recording = _filtered(tmp_path / "wide", STILL, 5).observations.recording
-    options = DiagnosisOptions(catalogue=("wiggling",), most_pixels=2000)
-    study = prepare(Recording.open(recording.path), options).study
+    few = OPTIONS.model_copy(update={"most_pixels": 2000})
+    study = _filtered(tmp_path / "wide", STILL, 5, few)
     assert study.observations.is_sample
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
@@ -108,11 +109,8 @@ def test_stripes_that_move_from_frame_to_frame_are_no_filtered_noise(
 
 def test_repeats_show_a_filter_where_a_recording_is_thinned_out(tmp_path: Path) -> None:
     """Frames of a pose once kept different pixels; without a common one all noise was single."""
-    options = DiagnosisOptions(catalogue=("wiggling",), most_pixels=7000)
-    recording = Recording.open(
-        _filtered(tmp_path / "thin", REPEATED, 3).observations.recording.path
-    )
-    study = prepare(recording, options).study
+    few = OPTIONS.model_copy(update={"most_pixels": 7000})
+    study = _filtered(tmp_path / "thin", REPEATED, 3, few)
     assert study.fit.shared.from_repeats
     assert study.fit.shared.share["squares"] > 0.1
     left = coherence(study, study.residual_of(()))

@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
-from diagnosed_recordings import recorded, simulator
+from diagnosed_recordings import altered, recorded, simulator
 from optional import present
 
 from tofcorr.data.recording import Recording
@@ -22,19 +22,22 @@ STRAY_SHARES = {"share_0.05": 0.02, "share_0.12": 0.05, "share_0.3": 0.02, "ghos
 STRAY = {"name": "stray_light", **STRAY_SHARES}
 
 
+def masked(recording: Recording) -> Recording:
+    """Leave the left edge of every image to something beside the target."""
+    inside = np.broadcast_to(np.arange(recording.camera.width) >= WIDTH, recording.depth.shape)
+    np.save(recording.path / "mask.npy", inside.astype(np.uint8))
+    return Recording.open(recording.path)
+
+
 @pytest.fixture(scope="module")
 def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The target's left edge hidden by something near, and nothing at all above that."""
-    folder = tmp_path_factory.mktemp("cluttered") / "recording"
-    recorded(folder, 44, noise=False)
-    depth = np.load(folder / "depth.npy")
-    mask = np.ones(depth.shape, dtype=np.uint8)
-    mask[:, :, :WIDTH] = 0
-    depth[:, :, :WIDTH] = NEAR
-    depth[:, :5, :WIDTH] = np.nan
-    np.save(folder / "depth.npy", depth)
-    np.save(folder / "mask.npy", mask)
-    return Recording.open(folder)
+    recording = masked(recorded(tmp_path_factory.mktemp("cluttered") / "r", 44, noise=False))
+    beside = np.full((recording.camera.height, WIDTH), NEAR)
+    beside[:5] = np.nan
+    return altered(
+        recording, lambda z: np.concatenate([0 * z[..., :WIDTH] + beside, z[..., WIDTH:]], axis=2)
+    )
 
 
 def test_the_twin_keeps_what_stands_beside_the_target(cluttered: Recording) -> None:
@@ -50,15 +53,11 @@ def test_the_twin_keeps_what_stands_beside_the_target(cluttered: Recording) -> N
 
 def test_pixels_of_the_plane_beside_the_mask_have_no_noise(tmp_path: Path) -> None:
     """Where a camera filters, measured neighbours would explain the noise of pixels at the edge."""
-    folder = tmp_path / "recording"
-    recorded(folder, 44, [], {"shots": [{"target": "white", "poses": 4}]})
-    depth = np.load(folder / "depth.npy")
-    mask = np.ones(depth.shape, dtype=np.uint8)
-    mask[:, :, :WIDTH] = 0
-    np.save(folder / "mask.npy", mask)
-    depth[:, :, : WIDTH // 2] = NEAR
-    np.save(folder / "depth.npy", depth)
-    observations = observe(Recording.open(folder), 100_000)
+    four = {"shots": [{"target": "white", "poses": 4}]}
+    recording = masked(recorded(tmp_path / "recording", 44, [], four))
+    beside = np.arange(recording.camera.width) < WIDTH // 2
+    recording = altered(recording, lambda z: np.where(beside, NEAR, z))
+    observations = observe(recording, 100_000)
     pose = default_hand_eye(simulator(44), observations.recording)
     inputs = effect_inputs(observations, pose)
     fit = SimpleNamespace(

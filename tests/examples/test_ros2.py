@@ -86,9 +86,7 @@ def padded(message: Image, padding: int) -> Image:
     return message
 
 
-def test_depth_and_points_are_as_by_the_corrector(
-    start: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_it_publishes_what_the_corrector_gives(start: Callable[..., Any], tmp_path: Path) -> None:
     node = start()
     node.publishers_by_topic["points_corrected"].subscribers = 1
     depth, amplitude = frame()
