@@ -1,10 +1,12 @@
 """Whatever bytes a file holds: it opens, or it is refused in words."""
 
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fuzzed import MANY, is_refused, read_or_refused
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_recordings import write_small_recording
@@ -12,7 +14,6 @@ from small_recordings import write_small_recording
 from benchmarks import fuzz
 
 FILES = ["recording.yaml", "frames.csv", "depth.npy", "amplitude.npy", "mask.npy", "raw.npy"]
-FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=list[Any](HealthCheck))
 
 
 @pytest.fixture(scope="module")
@@ -23,41 +24,28 @@ def targets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fuzz.Target]:
     return {one.name: one for one in reversed(fuzz.recordings(folder))}
 
 
-def outcome(target: fuzz.Target, folder: pytest.TempPathFactory, content: bytes) -> str:
-    said, where = fuzz.outcome(target, folder.getbasetemp() / "inputs", content)
-    assert said in ("refused", "accepted"), where
-    return said
-
-
 @pytest.mark.filterwarnings("ignore")  # What is drawn to be odd: numbers of other types.
+@pytest.mark.parametrize("examples", [60, MANY])
 @pytest.mark.parametrize("name", FILES)
-@FUZZ
-@given(data=st.data())
 def test_a_changed_file_opens_or_is_refused_in_words(
-    targets: dict[str, fuzz.Target],
-    name: str,
-    data: st.DataObject,
-    tmp_path_factory: pytest.TempPathFactory,
+    targets: dict[str, fuzz.Target], name: str, examples: int, tmp_path: Path
 ) -> None:
-    outcome(targets[name], tmp_path_factory, data.draw(fuzz.mutated(targets[name])))
+    read_or_refused(targets[name], tmp_path, examples)
 
 
-@FUZZ
+@settings(suppress_health_check=list[Any](HealthCheck))
 @given(
     name=st.sampled_from(FILES),
     content=st.binary(max_size=300) | st.text(max_size=300).map(str.encode),
 )
 def test_arbitrary_bytes_are_refused_in_words(
-    targets: dict[str, fuzz.Target],
-    name: str,
-    content: bytes,
-    tmp_path_factory: pytest.TempPathFactory,
+    targets: dict[str, fuzz.Target], name: str, content: bytes, tmp_path: Path
 ) -> None:
-    assert outcome(targets[name], tmp_path_factory, content) == "refused"
+    assert is_refused(targets[name], tmp_path, content)
 
 
 def test_what_once_ended_otherwise_is_refused_in_words(
-    targets: dict[str, fuzz.Target], tmp_path_factory: pytest.TempPathFactory
+    targets: dict[str, fuzz.Target], tmp_path: Path
 ) -> None:
     header, table, depth = (targets[name].content for name in FILES[:3])
     archive = io.BytesIO()
@@ -77,6 +65,6 @@ def test_what_once_ended_otherwise_is_refused_in_words(
     for name, contents in hostile.items():
         for content in contents:
             assert content != targets[name].content
-            assert outcome(targets[name], tmp_path_factory, content) == "refused", content[:60]
+            assert is_refused(targets[name], tmp_path, content), content[:60]
     # Headers written by Python 2 are read.
-    outcome(targets["depth.npy"], tmp_path_factory, depth.replace(b"(6, 5, 7)", b"(6L,5L,7)"))
+    is_refused(targets["depth.npy"], tmp_path, depth.replace(b"(6, 5, 7)", b"(6L,5L,7)"))

@@ -105,9 +105,8 @@ def test_joined_priors_weigh_as_both_alone(generator: Generator) -> None:
     first = replace(one, centre=point, factor=torch.eye(len(point.coefficients)).double())
     here = point.moved(0.3 * torch.ones(len(moments.symbols), dtype=torch.float64))
     both = first.joined(other).equations(here)
-    apart = [first.equations(here), other.equations(here)]
-    for joint, a, b in zip(both, *apart, strict=True):
-        torch.testing.assert_close(joint, a + b)
+    apart = zip(first.equations(here), other.equations(here), strict=True)
+    torch.testing.assert_close([*both], [a + b for a, b in apart])
 
 
 def test_condition_columns_are_what_a_pass_over_the_pixels_would_give(generator: Generator) -> None:

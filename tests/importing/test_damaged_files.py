@@ -3,13 +3,11 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from fuzzed import MANY, read_or_refused
 from importing.posed_scene import Drive
 from importing.rosbag import written_bags as bags
 
@@ -37,32 +35,16 @@ def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     return fuzz.Target(path.name, path.read_bytes(), read_bag)
 
 
-def refused_in_words(target: fuzz.Target, folder: Path, examples: int) -> None:
-    """Read a target as it is, and damaged; only an error meant for people may come."""
-    assert fuzz.outcome(target, folder, target.content) == ("accepted", "")
-
-    @settings(max_examples=examples, suppress_health_check=list[Any](HealthCheck))
-    @given(st.data())
-    def law(data: st.DataObject) -> None:
-        said, where = fuzz.outcome(target, folder, data.draw(fuzz.mutated(target)))
-        assert said in ("refused", "accepted"), where
-
-    law()
-
-
-MANY = pytest.param(1000, marks=pytest.mark.slow)
-
-
 @pytest.mark.filterwarnings("ignore")  # What is drawn to be odd: numbers of other types.
 @pytest.mark.parametrize("examples", [40, MANY])
 @pytest.mark.parametrize("target", fuzz.imports(), ids=lambda target: target.name)
 def test_damage_is_read_or_refused(target: fuzz.Target, examples: int, tmp_path: Path) -> None:
-    refused_in_words(target, tmp_path, examples)
+    read_or_refused(target, tmp_path, examples)
 
 
 @pytest.mark.parametrize("examples", [20, MANY])
 def test_a_damaged_bag_is_read_or_refused(bag: fuzz.Target, examples: int, tmp_path: Path) -> None:
-    refused_in_words(bag, tmp_path, examples)
+    read_or_refused(bag, tmp_path, examples)
 
 
 def test_an_image_of_too_many_pixels_is_refused(tmp_path: Path) -> None:

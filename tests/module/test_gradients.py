@@ -74,9 +74,9 @@ def test_missing_returns_have_no_gradient_and_spoil_no_other(module: DepthCorrec
         assert all(bool(grad.isfinite().all()) for grad in grads[-1])
         if strength.grad is not None:
             assert bool(strength.grad.isfinite().all())
-    for clean, spoilt in zip(*grads, strict=True):
-        torch.testing.assert_close(spoilt, clean)
-    assert not grads[1][0][..., 0, :5].any()
+    clean, spoilt = grads
+    torch.testing.assert_close(spoilt, clean)
+    assert not spoilt[0][..., 0, :5].any()
     # Also where the result itself, NaN included, is summed.
     given = with_missing(depth).requires_grad_()
     (gradient,) = torch.autograd.grad(module(given, amplitude).nansum(), given)
@@ -112,8 +112,8 @@ def test_vmap_over_frames_and_over_parameters_agrees_with_a_loop(module: DepthCo
         return functional_call(module, (parameters, buffers), (depth, amplitude))
 
     both = vmap(call)(parameters, buffers)
-    for one, expected in zip(both, (module, other), strict=True):
-        torch.testing.assert_close(one, expected(depth, amplitude), rtol=0, atol=1e-13)
+    expected = torch.stack([one(depth, amplitude) for one in (module, other)])
+    torch.testing.assert_close(both, expected, rtol=0, atol=1e-13)
 
 
 def test_vmap_over_hand_eyes_agrees_with_a_loop() -> None:
@@ -125,9 +125,7 @@ def test_vmap_over_hand_eyes_agrees_with_a_loop() -> None:
         given = {"module.hand_eye.twist": twist}
         return functional_call(_Points(module), given, (depth, depth, {}))
 
-    found = vmap(points)(twists)
-    for one, twist in zip(found, twists, strict=True):
-        torch.testing.assert_close(one, points(twist))
+    torch.testing.assert_close(vmap(points)(twists), torch.stack([*map(points, twists)]))
 
 
 def test_the_loss_is_the_mean_squared_distance_to_the_planes(module: DepthCorrection) -> None:
