@@ -27,6 +27,14 @@ from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 ROUNDING = 1e-14
 
 
+def copied(recording: Recording, path: Path) -> Recording:
+    """Write a recording like another, of the same depth."""
+    with RecordingWriter.like(path, recording) as writer:
+        for depth in recording.depth:
+            writer.append(depth, truth={"distance": 2.0 * depth})
+    return Recording.open(path)
+
+
 def test_every_part_survives_writing_and_opening(folder: Path) -> None:
     generator = np.random.default_rng(0)
     rows, tool_from_camera = frame_rows(generator), drawn_transform(generator)
@@ -53,10 +61,7 @@ def test_where_planes_come_from_and_the_names_of_frames_survive(tmp_path: Path) 
     path = write_small_recording(tmp_path / "first", planes="estimated", frame_names=names)
     first = Recording.open(path)
     assert (first.planes, first.frame_names) == ("estimated", names)
-    with RecordingWriter.like(tmp_path / "copy", first) as writer:
-        for depth in first.depth:
-            writer.append(depth)
-    copy = Recording.open(tmp_path / "copy")
+    copy = copied(first, tmp_path / "copy")
     assert (copy.planes, copy.frame_names) == ("estimated", names)
 
 
@@ -89,12 +94,9 @@ def test_truth_is_written_apart_whole_or_frame_by_frame(tmp_path: Path, folder: 
     )
     np.testing.assert_array_equal(np.load(path / "truth" / "distance.npy"), [0.0, 1.0, 2.0])
     assert yaml.safe_load((path / "truth" / "sensor.yaml").read_text()) == {"gain": 2.0}
-    recording = Recording.open(folder)
-    with RecordingWriter.like(tmp_path / "copy", recording) as writer:
-        for depth in recording.depth:
-            writer.append(depth, truth={"distance": 2.0 * depth})
-    truth = np.load(tmp_path / "copy" / "truth" / "distance.npy")
-    np.testing.assert_array_equal(truth, 2.0 * recording.depth)
+    copy = copied(Recording.open(folder), tmp_path / "copy")
+    truth = np.load(copy.path / "truth" / "distance.npy")
+    np.testing.assert_array_equal(truth, 2.0 * copy.depth)
 
 
 def test_a_recording_like_another_has_its_very_rows(tmp_path: Path, folder: Path) -> None:
@@ -102,11 +104,8 @@ def test_a_recording_like_another_has_its_very_rows(tmp_path: Path, folder: Path
     extended = [f"{line},{'serial' if i == 0 else 'A7'}" for i, line in enumerate(table)]
     (folder / "frames.csv").write_text("\r\n".join(extended))
     recording = Recording.open(folder)
-    with RecordingWriter.like(tmp_path / "copy", recording) as writer:
-        for depth in recording.depth:
-            writer.append(depth)
+    copy = copied(recording, tmp_path / "copy")
     assert filecmp.cmp(folder / "frames.csv", tmp_path / "copy" / "frames.csv", shallow=False)
-    copy = Recording.open(tmp_path / "copy")
     np.testing.assert_array_equal(copy.tool_from_camera, recording.tool_from_camera)
     assert copy.camera == recording.camera
 

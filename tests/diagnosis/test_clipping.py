@@ -38,14 +38,12 @@ def _names_saturation(recording: Recording) -> bool:
     return any("saturation" in members for members in name_effects(study).cause_sets)
 
 
-def test_clipping_that_three_images_of_fifty_hold_is_named(tmp_path: Path) -> None:
-    assert _names_saturation(_three_images_clipped(tmp_path, 50))
-
-
-@pytest.mark.slow
-def test_clipping_that_three_images_of_fifty_hold_is_mostly_named(tmp_path: Path) -> None:
-    seeds = range(50, 56)
-    assert sum(_names_saturation(_three_images_clipped(tmp_path, seed)) for seed in seeds) >= 5
+@pytest.mark.parametrize("last", [50, pytest.param(55, marks=pytest.mark.slow)])
+def test_clipping_that_three_images_of_fifty_hold_is_named(last: int, tmp_path: Path) -> None:
+    """All but one of six times at least."""
+    seeds = range(50, last + 1)
+    named = [_names_saturation(_three_images_clipped(tmp_path, seed)) for seed in seeds]
+    assert sum(named) >= 5 * len(named) / 6
 
 
 def test_nothing_is_called_saturation_where_nothing_clips(straight: Recording) -> None:

@@ -5,7 +5,7 @@ What it says of its own error, hand-eye transform and parameters counts.
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +45,8 @@ ROUNDING = 3e-7
 Render = Callable[..., Recording]
 
 
-@dataclass(frozen=True)
-class Frames:
-    """What another simulator renders at the poses of a recording."""
-
-    depth: np.ndarray
-    amplitude: np.ndarray
+Images = dict[str, np.ndarray]
+"""Depth and amplitude that another simulator renders at the poses of a recording."""
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +56,13 @@ def options() -> SimulatorOptions:
 
 
 @pytest.fixture(scope="module")
-def frames(nothing_missing: Recording, options: SimulatorOptions) -> Frames:
+def frames(nothing_missing: Recording, options: SimulatorOptions) -> Images:
     states = list(twin_frames(options, nothing_missing, reflectivity="from_recording"))
-    return Frames(
-        np.stack([state.measured_distance.numpy() for state in states]).astype(np.float32),
-        np.stack([state.measured_amplitude.numpy() for state in states]).astype(np.float32),
-    )
+    taken = {"depth": "measured_distance", "amplitude": "measured_amplitude"}
+    return {
+        name: torch.stack([getattr(state, own) for state in states]).float().numpy()
+        for name, own in taken.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -75,20 +72,16 @@ def observations(nothing_missing: Recording) -> Observations:
 
 @pytest.fixture
 def rendered(
-    nothing_missing: Recording, options: SimulatorOptions, frames: Frames, tmp_path: Path
+    nothing_missing: Recording, options: SimulatorOptions, frames: Images, tmp_path: Path
 ) -> Render:
     """Write frames with the rows of a recording; `order` says which row each frame has."""
     every, pose = np.arange(nothing_missing.num_frames), options.hand_eye.tool_from_camera().numpy()
 
-    def written(
-        own: Frames = frames, order: np.ndarray = every, name: str = "sim", **changes: Any
-    ) -> Recording:
-        parts: dict[str, Any] = {
+    def written(name: str = "sim", order: np.ndarray = every, **changes: Any) -> Recording:
+        parts: dict[str, Any] = frames | {
             "camera": nothing_missing.camera,
             "depth_kind": nothing_missing.depth_kind,
             "rows": nothing_missing.frames.select(order),
-            "depth": own.depth,
-            "amplitude": own.amplitude,
             "modulation_frequency": nothing_missing.modulation_frequency,
             "tool_from_camera": pose,
         }
@@ -109,22 +102,22 @@ def test_rendered_frames_of_the_built_in_simulator_are_the_simulator_itself(
 
 
 def test_order_and_number_of_renders_do_not_matter(
-    frames: Frames, observations: Observations, rendered: Render
+    frames: Images, observations: Observations, rendered: Render
 ) -> None:
-    mixed = torch.randperm(len(frames.depth), generator=torch.Generator().manual_seed(3)).numpy()
+    mixed = np.random.default_rng(3).permutation(len(frames["depth"]))
     order = np.concatenate([mixed, mixed[::-1]])
-    both = Frames(frames.depth[order], frames.amplitude[order])
+    both = {name: images[order] for name, images in frames.items()}
     plain = rendered_error(rendered(), observations, OPTIONS)
-    again = rendered_error(rendered(both, order, "twice"), observations, OPTIONS)
+    again = rendered_error(rendered("twice", order, **both), observations, OPTIONS)
     assert torch.allclose(plain.error, again.error, atol=ROUNDING, equal_nan=True)
     assert not plain.limits
 
 
 def test_a_function_gives_what_its_frames_give(
-    options: SimulatorOptions, frames: Frames, observations: Observations, rendered: Render
+    options: SimulatorOptions, frames: Images, observations: Observations, rendered: Render
 ) -> None:
     pose = options.hand_eye.tool_from_camera().numpy()
-    returned = {"depth": frames.depth, "tool_from_camera": pose}
+    returned = {"depth": frames["depth"], "tool_from_camera": pose}
     function = present(open_simulator(lambda _: returned, observations.recording))
     ours = simulated_error(function, observations, OPTIONS)
     theirs = rendered_error(rendered(), observations, OPTIONS)
@@ -132,27 +125,24 @@ def test_a_function_gives_what_its_frames_give(
 
 
 def test_the_mean_of_several_renders_has_less_noise(
-    frames: Frames, observations: Observations, rendered: Render
+    frames: Images, observations: Observations, rendered: Render
 ) -> None:
-    generator = np.random.default_rng(4)
     times, sd = 4, 2e-3
-    order = np.tile(np.arange(len(frames.depth)), times)
-    noise = generator.normal(0, sd, frames.depth[order].shape).astype(np.float32)
-    noisy = Frames(frames.depth[order] + noise, frames.amplitude[order])
-    simulated = rendered_error(rendered(noisy, order), observations, OPTIONS)
+    order = np.tile(np.arange(len(frames["depth"])), times)
+    again = {name: images[order] for name, images in frames.items()}
+    again["depth"] += np.random.default_rng(4).normal(0, sd, again["depth"].shape)
+    simulated = rendered_error(rendered(order=order, **again), observations, OPTIONS)
     sigma = float(simulated.sigma.square().mean().sqrt())
     assert sigma == pytest.approx(sd / times**0.5, rel=0.05)
 
 
 def test_the_noise_of_dark_pixels_of_camera_and_renders_is_that_of_their_difference(
-    nothing_missing: Recording, frames: Frames, rendered: Render
+    nothing_missing: Recording, frames: Images, rendered: Render
 ) -> None:
     """Renders of read noise, A^-2 below a brightness and constant above: no law goes on so."""
-    generator = np.random.default_rng(6)
-    bright = np.nanmedian(frames.amplitude)
-    sd = 3e-3 * np.clip(bright / np.maximum(frames.amplitude, 1.0), 1.0, 2.0)
-    drawn = generator.standard_normal(frames.depth.shape) * sd
-    noisy = rendered(Frames(frames.depth + drawn.astype(np.float32), frames.amplitude))
+    depth, light = frames["depth"], frames["amplitude"]
+    sd = 3e-3 * np.clip(np.nanmedian(light) / np.maximum(light, 1.0), 1.0, 2.0)
+    noisy = rendered(depth=depth + sd * np.random.default_rng(6).standard_normal(depth.shape))
     study = prepare(nothing_missing, OPTIONS, noisy).study
     fit, amplitude = study.fit, present(study.inputs.amplitude)
     darkest = amplitude < amplitude.quantile(0.05)
@@ -161,39 +151,37 @@ def test_the_noise_of_dark_pixels_of_camera_and_renders_is_that_of_their_differe
 
 
 def test_a_pixel_that_the_simulator_does_not_see_is_left_out(
-    nothing_missing: Recording, frames: Frames, rendered: Render
+    nothing_missing: Recording, frames: Images, rendered: Render
 ) -> None:
-    depth = frames.depth.copy()
+    depth = frames["depth"].copy()
     depth[:, :6] = np.nan
-    holes = rendered(replace(frames, depth=depth))
-    prepared = prepare(nothing_missing, OPTIONS, holes)
+    prepared = prepare(nothing_missing, OPTIONS, rendered(depth=depth))
     rows = prepared.study.observations.pixel // nothing_missing.camera.width
     assert int(rows.min()) == 6
     assert any("left out" in warning for warning in prepared.warnings)
 
 
 def test_other_cameras_and_depths_are_refused_in_a_sentence(
-    nothing_missing: Recording, frames: Frames, observations: Observations, rendered: Render
+    nothing_missing: Recording, frames: Images, observations: Observations, rendered: Render
 ) -> None:
-    camera, depth, bright = nothing_missing.camera, frames.depth, frames.amplitude
+    camera, depth, bright = nothing_missing.camera, frames["depth"], frames["amplitude"]
     matrix = np.array(camera.matrix)
     matrix[0, 0] += 1.0
     other = replace(camera, matrix=tuple(map(tuple, matrix.tolist())))
     smaller = replace(camera, height=camera.height - 1)
-    # Both were diagnosed: flipped frames as "0.0 mm, no more than the noise".
-    flipped = rendered(Frames(depth[:, ::-1], bright[:, ::-1]), name="flipped")
-    mounted = rendered(name="mount", tool_from_camera=MOUNT)
-    cases = {
-        "pixels look up to": rendered(name="lens", camera=other),
-        "32 x 23 pixels": rendered(Frames(depth[:, 1:], bright[:, 1:]), name="a", camera=smaller),
-        "write depth_kind: radial": rendered(name="kind", depth_kind="z"),
-        "depth or poses are in another unit": rendered(Frames(1e3 * depth, bright), name="unit"),
-        "if one mistake is undone": flipped,
-        "degrees from its tool_from_camera": mounted,
+    cut = {"depth": depth[:, 1:], "amplitude": bright[:, 1:]}
+    cases: dict[str, dict[str, Any]] = {
+        "pixels look up to": {"camera": other},
+        "32 x 23 pixels": {"camera": smaller, **cut},
+        "write depth_kind: radial": {"depth_kind": "z"},
+        "depth or poses are in another unit": {"depth": 1e3 * depth},
+        # Both were diagnosed: flipped frames as "0.0 mm, no more than the noise".
+        "if one mistake is undone": {"depth": depth[:, ::-1], "amplitude": bright[:, ::-1]},
+        "degrees from its tool_from_camera": {"tool_from_camera": MOUNT},
     }
-    for words, own in cases.items():
+    for words, changes in cases.items():
         with pytest.raises(CalibrationDataError, match=words) as refusal:
-            rendered_error(own, observations, OPTIONS)
+            rendered_error(rendered(words, **changes), observations, OPTIONS)
         assert str(refusal.value).count(". ") == 0
 
 

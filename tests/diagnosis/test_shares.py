@@ -22,13 +22,16 @@ from tofcorr.diagnosis.findings.shares import (
 from tofcorr.diagnosis.report.result import DiagnosisResult
 
 
+def _random(generator: Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
 def _toy(seed: int, causes: int = 4, size: int = 60) -> tuple[Tensor, Tensor]:
     """Return parts (size, causes) and a residual that is their sum and something else."""
     generator = Generator().manual_seed(seed)
-    parts = torch.randn(size, causes, generator=generator, dtype=torch.float64)
+    parts = _random(generator, size, causes)
     parts = parts + parts[:, :1]
-    rest = torch.randn(size, generator=generator, dtype=torch.float64)
-    return parts, parts.sum(1) + 0.3 * rest
+    return parts, parts.sum(1) + 0.3 * _random(generator, size)
 
 
 def _values(parts: Tensor, residual: Tensor) -> Tensor:
@@ -103,10 +106,6 @@ def _beside_base(
     none = torch.zeros(columns.shape[1], columns.shape[1], dtype=torch.float64)
     one = [part[None] for part in (columns, residual, *maps)]
     return _of_poses(causes, *one[:2], none, *one[2:]), residual
-
-
-def _random(generator: Generator, *shape: int) -> Tensor:
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
 def test_beside_the_base_a_value_is_the_mean_fall_by_fits_over_all_orders() -> None:
@@ -217,12 +216,10 @@ _CAUSES = (
 def _columns(seed: int) -> tuple[Tensor, Tensor]:
     """Return a constant, a shift along the axis, a slope and a drift, (U, M, 4), and noise."""
     generator = Generator().manual_seed(seed)
-    tilt = 0.15 * torch.rand(_POSES, _PIXELS, generator=generator, dtype=torch.float64)
-    distance = torch.rand(_POSES, _PIXELS, generator=generator, dtype=torch.float64)
+    tilt, distance = torch.rand(2, _POSES, _PIXELS, generator=generator, dtype=torch.float64)
     time = torch.linspace(0, 1, _POSES, dtype=torch.float64)[:, None].expand(_POSES, _PIXELS)
-    ones = torch.ones_like(tilt)
-    noise = torch.randn(_POSES, _PIXELS, generator=generator, dtype=torch.float64)
-    return torch.stack([ones, 1 - tilt, distance, 0.5 + time], dim=2), noise
+    columns = torch.stack([torch.ones_like(tilt), 1 - 0.15 * tilt, distance, 0.5 + time], dim=2)
+    return columns, _random(generator, _POSES, _PIXELS)
 
 
 def _parts(columns: Tensor, residual: Tensor, least: float) -> Parts:
@@ -234,8 +231,7 @@ def _parts(columns: Tensor, residual: Tensor, least: float) -> Parts:
 
 
 def _shares(parts: Parts, *, sparse: bool = True) -> dict[str, float]:
-    found = parts.refitted(torch.ones(_POSES).double(), sparse=sparse)
-    values = found.values
+    values = parts.refitted(torch.ones(_POSES).double(), sparse=sparse).values
     names = [cause.cause for cause in _CAUSES]
     return dict(zip(names, (values / values.sum()).tolist(), strict=True))
 
@@ -275,11 +271,11 @@ def test_a_hand_eye_transform_that_is_wrong_keeps_its_share(seed: int) -> None:
 @pytest.mark.parametrize("theta", [(0, 0, 0, 5), (8, 0, 20, 5), (-8, 40, 0, 5)])
 def test_a_constant_counts_as_distance_whichever_cause_has_it(theta: tuple[float, ...]) -> None:
     columns, noise = _columns(31)
-    true = _truth(columns, torch.tensor(theta, dtype=torch.float64))
-    response = columns @ (1e-3 * torch.tensor(theta, dtype=torch.float64))
-    parts = _parts(columns, response + 1e-4 * noise, least=(0.1e-3) ** 2)
+    millimetres = torch.tensor(theta, dtype=torch.float64)
+    parts = _parts(columns, 1e-3 * columns @ millimetres + 1e-4 * noise, least=(0.1e-3) ** 2)
     for sparse in (True, False):
-        assert _shares(parts, sparse=sparse) == pytest.approx(true, abs=0.02)
+        found = _shares(parts, sparse=sparse)
+        assert found == pytest.approx(_truth(columns, millimetres), abs=0.02)
 
 
 def test_moving_a_constant_from_one_cause_to_another_changes_no_share() -> None:

@@ -50,14 +50,14 @@ def fits(walls: dict[str, Dataset]) -> FitOf:
 @pytest.fixture(scope="module")
 def warned(walls: dict[str, Dataset], fits: FitOf) -> Callable[[str], str]:
     """What a training on a wall warns of."""
-    return lambda name: _warned(walls[name], fits(name))
 
+    def warnings(name: str) -> str:
+        wall, fit = walls[name], fits(name)
+        best = fit.solution.parameters.tool_from_camera
+        support = Support(wall, np.arange(wall.num_frames), best)
+        return "\n".join(judge(fit, NO_ERRORS, support, tofcorr.inspect(wall.first))[2])
 
-def _warned(dataset: Dataset, result: Fit) -> str:
-    best = result.solution.parameters.tool_from_camera
-    support = Support(dataset, np.arange(dataset.num_frames), best)
-    inspection = tofcorr.inspect(dataset.first)
-    return "\n".join(judge(result, NO_ERRORS, support, inspection)[2])
+    return warnings
 
 
 @pytest.mark.parametrize(
@@ -160,9 +160,7 @@ def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(fi
     best = result.solution.parameters
     variance = effective_variance(result.moments, best)
     precision = MomentObjective(result.moments).normal_equations(best).hessian / variance
-    spread = torch.linalg.inv(
-        precision + torch.eye(best.size, dtype=torch.float64) / PRIOR_SIGMA**2
-    )
+    spread = torch.linalg.inv(precision + torch.eye(best.size).double() / PRIOR_SIGMA**2)
     found = observability(result.moments, best, None, None)
     expected = torch.linalg.eigvalsh(spread).flip(0).sqrt()
     got = torch.tensor([direction.sigma for direction in found.directions], dtype=torch.float64)

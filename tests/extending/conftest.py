@@ -43,89 +43,18 @@ for name, code in json.load(sys.stdin).items():
 print(json.dumps(outcomes))
 """
 
-# An effect that the diagnosis can tell from all base errors, unlike that of the page.
-STRIPES = '''# tofcorr/simulation/effects/stripes.py
-"""A pattern of stripes over the image."""
+HERE = Path(__file__).parent
+PIECES = {path.stem: path.read_text(encoding="utf-8") for path in (HERE / "pieces").glob("*.py")}
+"""Programs that use what was added."""
 
-import torch
-from torch import Tensor
-
-from tofcorr.options import Options
-from tofcorr.simulation.effects.base import Coefficient, EffectInputs, LinearDelay
-
-
-class StripesEffect(LinearDelay):
-    """Stripes of six periods from the left to the right edge."""
-
-    name = "stripes"
-    summary = "stripes over the image"
-    remedy = "a white wall"
-
-    @classmethod
-    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        return (Coefficient("height_m", "m", 0.01),)
-
-    def columns(self, inputs: EffectInputs) -> Tensor:
-        return torch.cos(6 * torch.pi * inputs.columns)[:, None]
-'''
 EFFECT_LINE = '# tofcorr/simulation/effects/registry.py\n    "stripes:StripesEffect",'
-SIMULATOR = PLAIN | {"effects": [{"name": "stripes", "height_m": 0.006}]}
-DIAGNOSIS = {"catalogue": ["stripes", "incidence_angle"], "bootstraps": 19}
-DIAGNOSIS |= {"simulate_anew": False, "page": False}
-PIECES = {
-    "whose": "from pathlib import Path; import tofcorr; print(Path(tofcorr.__file__).parents[1])",
-    "import_help": (
-        "from tofcorr.cli.main import group; group(['import', '--help'], standalone_mode=False)"
-    ),
-    "ros_command": """
-from pathlib import Path
-
-import tofcorr
-from tofcorr.cli.main import group
-from tofcorr.correction.state import save_calibration
-
-camera = tofcorr.CameraIntrinsics(
-    width=7, height=5, matrix=((9.0, 0.0, 3.0), (0.0, 9.0, 2.0), (0.0, 0.0, 1.0))
-)
-module = tofcorr.DepthCorrection(camera, [{"kind": "distance_polynomial", "degree": 2}])
-module.export("ros_command", "module.sh")
-Path("run").mkdir()
-save_calibration("run/state.pt", module.to_state())
-words = "export --run run --format ros_command --out command.sh"
-group(words.split(), standalone_mode=False)
-group(["export", "--help"], standalone_mode=False)
-""",
-    "term": f"""
-import json, torch, tofcorr
-from tofcorr import DepthCorrection
-
-wall = tofcorr.simulate({simulated_walls.wall_options(1).model_dump(mode="json")!r}, "wall")
-terms = [{{"kind": "illumination_baseline"}}, {{"kind": "pixel_polynomial"}}]
-options = {{"name": "B", "model": {{"terms": terms}}, "advice": 0}}
-report = tofcorr.train(wall, options, out="run").report
-module = DepthCorrection.load("run")
-other = DepthCorrection(wall.camera, terms)
-other.load_state_dict(module.state_dict())
-depth = torch.tensor(wall.depth[:2])
-corrected, _ = torch.jit.load("run/corrector.ts")(depth, depth)
-print(json.dumps({{
-    "errors": report["error_mm"],
-    "symbols": module.error_model.symbols(),
-    "same": torch.equal(other(depth), module(depth)),
-    "apart": float((module(depth) - corrected).nan_to_num().abs().max()),
-}}))
-""",
-    "stripes": f"""
-from pathlib import Path
-from tofcorr.cli.main import group
-
-Path("sim.yaml").write_text({dump_yaml(SIMULATOR)!r}, encoding="utf-8")
-Path("diagnose.yaml").write_text({dump_yaml(DIAGNOSIS)!r}, encoding="utf-8")
-group(["simulate", "--config", "sim.yaml", "--out", "recording"], standalone_mode=False)
-group(["diagnose", "--recording", "recording", "--config", "diagnose.yaml", "--out", "report"],
-      standalone_mode=False)
-""",
+CONFIGURATIONS = {
+    "wall": simulated_walls.wall_options(1).to_mapping(),
+    "simulator": PLAIN | {"effects": [{"name": "stripes", "height_m": 0.006}]},
+    "diagnose": {"catalogue": ["stripes", "incidence_angle"], "bootstraps": 19}
+    | {"simulate_anew": False, "page": False},
 }
+"""What the programs read."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +102,9 @@ def extension(tmp_path_factory: pytest.TempPathFactory) -> Extension:
     # one, which has such a name until it is whole.
     unfinished = shutil.ignore_patterns("*.pyc.*")
     shutil.copytree(Path(tofcorr.__file__).parent, root / "tofcorr", ignore=unfinished)
-    add(root / "tofcorr", STRIPES, EFFECT_LINE)
+    add(root / "tofcorr", (HERE / "stripes.py").read_text(encoding="utf-8"), EFFECT_LINE)
+    for name, values in CONFIGURATIONS.items():
+        (root / f"{name}.yaml").write_text(dump_yaml(values), encoding="utf-8")
     for page in ADDING:
         shown = [block.text for block in blocks(page) if block.language == "python"]
         own = [text for text in shown if text.startswith("# tofcorr/")]

@@ -11,7 +11,6 @@ from hypothesis import example, given
 
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import (
-    lens_misses,
     phase_from_radial_distance,
     plane_in_frame,
     radial_distance_from_z_depth,
@@ -32,17 +31,6 @@ def test_rays_have_unit_length_and_that_of_the_principal_point_is_the_axis() -> 
     torch.testing.assert_close(norm, torch.ones_like(norm), rtol=0, atol=1e-14)
     small = camera((5, 3), (4.0, 4.0), (2.0, 1.0))
     assert ray_directions(small)[1, 2].tolist() == [0.0, 0.0, 1.0]
-
-
-def test_pixels_that_the_lens_model_does_not_reach_are_told() -> None:
-    assert float(lens_misses(CAMERA).max()) < 1e-9
-    assert not lens_misses(replace(CAMERA, distortion=())).any()
-    # r - 0.4 r^3 is largest at r = (3 * 0.4)^-1/2, where it is 2/3 of that: 0.6086 focal lengths.
-    folded = camera((201, 3), (100.0, 100.0), (100.0, 1.0), -0.4, 0.0, 0.0, 0.0)
-    missed = lens_misses(folded)[1] > 0.5
-    reached = (torch.arange(201) - 100).abs() <= 100 * 2 / 3 / math.sqrt(1.2)
-    near_the_turn = ((torch.arange(201) - 100).abs() - 61).abs() <= 2
-    assert bool((missed == ~reached)[~near_the_turn].all())
 
 
 def test_a_large_image_has_the_rays_of_a_small_one_at_the_same_pixels() -> None:

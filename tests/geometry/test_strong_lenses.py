@@ -19,6 +19,7 @@ def _camera(focal: float, *distortion: float) -> CameraIntrinsics:
         (25.0, (3.0, 0.0, 0.0, 0.0)),
         (60.0, (-0.3, 0.0, 0.0, 0.0)),
         (90.0, (-0.08, 0.02, 0.0005, -0.0004, 0.01)),
+        (90.0, ()),
     ],
 )
 def test_opencvs_equations_image_every_ray_on_its_pixel(
@@ -28,7 +29,7 @@ def test_opencvs_equations_image_every_ray_on_its_pixel(
     camera = _camera(focal, *distortion)
     x, y, z = ray_directions(camera).unbind(-1)
     x, y = x / z, y / z
-    k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
+    k1, k2, p1, p2, k3 = (*distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)

@@ -33,9 +33,9 @@ def small(**sections: Any) -> SimulatorOptions:
     values: dict[str, Any] = {
         "camera": CAMERA,
         "shots": [{"target": "white", "poses": 4}, {"target": "checkerboard", "poses": 3}],
-        "robot": {"farthest_pixel_m": None},
     }
-    return SimulatorOptions.from_mapping(values | sections, "test")
+    robot = {"farthest_pixel_m": None} | sections.pop("robot", {})
+    return SimulatorOptions.from_mapping(values | {"robot": robot} | sections, "test")
 
 
 def planned(options: SimulatorOptions) -> list[FrameState]:

@@ -25,8 +25,8 @@ def test_wall_fills_every_frame_within_the_limits() -> None:
 
 def test_distance_along_the_optical_axis_is_within_its_bounds() -> None:
     scene = {"plane": {"normal": [0.6, 0.0, 0.8], "offset_m": -2.0}}
-    robot = {"distance_m": [0.7, 0.9], "farthest_pixel_m": None}
-    options = small(shots=[{"target": "white", "poses": 25}], robot=robot, scene=scene)
+    shots = [{"target": "white", "poses": 25}]
+    options = small(shots=shots, robot={"distance_m": [0.7, 0.9]}, scene=scene)
     for frame in planned(options):
         camera = frame.facts.world_from_tool[-1] @ options.hand_eye.tool_from_camera()
         normal, offset = plane_in_frame(*options.scene.plane.tensors(), camera)
@@ -38,7 +38,7 @@ def test_distance_along_the_optical_axis_is_within_its_bounds() -> None:
     [("none", (False, False)), ("x", (False, True)), ("y", (True, False)), ("both", (True, True))],
 )
 def test_tilt_is_restricted_to_its_axes(axes: str, tilted: tuple[bool, bool]) -> None:
-    options = small(robot={"tilt_axes": axes, "farthest_pixel_m": None})
+    options = small(robot={"tilt_axes": axes})
     axis = planned(options)[-1].facts.world_from_tool
     optical = (axis @ options.hand_eye.tool_from_camera())[:, :3, 2]
     # The wall is z = 0: tilt about x moves the optical axis along y, and the other way round.
@@ -47,7 +47,7 @@ def test_tilt_is_restricted_to_its_axes(axes: str, tilted: tuple[bool, bool]) ->
 
 
 def test_robot_reaches_poses_within_its_repeatability() -> None:
-    robot = {"repeatability_mm": 0.4, "repeatability_mrad": 0.7, "farthest_pixel_m": None}
+    robot = {"repeatability_mm": 0.4, "repeatability_mrad": 0.7}
     options = small(shots=[{"target": "white", "poses": 300}], robot=robot)
     frames = planned(options)
     recorded = frames[-1].facts.world_from_tool
@@ -58,10 +58,9 @@ def test_robot_reaches_poses_within_its_repeatability() -> None:
 
 
 def test_repeated_frames_share_their_pose() -> None:
-    robot = {"repeat_poses": 2, "repeat_frames": 4, "farthest_pixel_m": None}
     conditions = {"integration_time_us": [250.0, 500.0, 1000.0], "ambient_counts": [10, 20]}
-    options = small(robot=robot, conditions=conditions)
-    frames = planned(options)
+    repeats = {"repeat_poses": 2, "repeat_frames": 4}
+    frames = planned(small(robot=repeats, conditions=conditions))
     assert [f.pose_id for f in frames] == [0] * 4 + [1] * 4 + [2, 3, 4, 5, 6]
     for frame in frames[1:4]:
         assert torch.equal(frame.world_from_tool, frames[0].world_from_tool)
@@ -70,9 +69,8 @@ def test_repeated_frames_share_their_pose() -> None:
 
 
 def test_sweep_goes_away_from_the_wall() -> None:
-    options = small(robot={"order": "by_distance", "tilt_axes": "none", "farthest_pixel_m": None})
-    frames = expected_frames(options)
-    nearest = [state.radial_distance.min().item() for state in frames]
+    options = small(robot={"order": "by_distance", "tilt_axes": "none"})
+    nearest = [state.radial_distance.min().item() for state in expected_frames(options)]
     assert nearest == sorted(nearest)
 
 
@@ -86,11 +84,10 @@ def test_guess_is_as_far_from_the_truth_as_asked(generator: Generator) -> None:
 
 
 def test_speed_on_a_path_agrees_with_the_poses_before_and_after() -> None:
-    robot = {"motion": "continuous", "roll_deg": 30.0, "tilt_deg": 20.0, "farthest_pixel_m": None}
+    robot = {"motion": "continuous", "roll_deg": 30.0, "tilt_deg": 20.0}
     robot |= {"repeatability_mm": 0.0, "repeatability_mrad": 0.0, "waypoint_every_frames": 20}
     shots, conditions = [{"target": "white", "poses": 40}], {"frame_interval_s": 0.1}
-    options = small(shots=shots, robot=robot, conditions=conditions)
-    frames = planned(options)
+    frames = planned(small(shots=shots, robot=robot, conditions=conditions))
     facts = frames[-1].facts
     truth = present(facts.tool_twist)
     error = (tool_twists(facts.timestamp, facts.world_from_tool) - truth).abs() / truth.abs().max()

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 from correction.export.states import ACCURACY, EYE_TO_HAND, TRANSFORMS, calibration, write
+from small_recordings import CAMERA
 
 from tofcorr.error_terms.base import Domain, Interval
+from tofcorr.geometry.camera import CameraIntrinsics
 
 
 @pytest.fixture
@@ -21,6 +23,13 @@ def opened(tmp_path: Path) -> Any:
         return storage
 
     return read
+
+
+def coefficients(storage: Any) -> dict[tuple[str, str], Any]:
+    """Return the nodes by group and symbol; they live as long as the storage."""
+    nodes = storage.getNode("coefficients")
+    read = [nodes.at(k) for k in range(nodes.size())]
+    return {(n.getNode("group").string(), n.getNode("symbol").string()): n for n in read}
 
 
 def test_opencv_reads_camera_and_pose_to_the_last_digit(opened: Any) -> None:
@@ -38,10 +47,8 @@ def test_opencv_reads_camera_and_pose_to_the_last_digit(opened: Any) -> None:
 
 
 def test_the_coefficients_read_are_those_of_the_papers_formula(opened: Any) -> None:
-    storage = opened()  # Its nodes live as long as it does.
-    nodes = storage.getNode("coefficients")
-    read = [nodes.at(k) for k in range(nodes.size())]
-    c = {(n.getNode("group").string(), n.getNode("symbol").string()): n for n in read}
+    storage = opened()
+    c = coefficients(storage)
     paper = calibration(np.eye(4)).model().error.paper_coefficients()
     expected = {(group, name): one for group, all_ in paper.items() for name, one in all_.items()}
     assert {key: node.getNode("value").real() for key, node in c.items()} == expected
@@ -62,28 +69,19 @@ def test_a_still_camera_is_said_to_be_one_and_one_without_a_robot_has_no_pose(op
 
 def test_a_vertex_that_is_nowhere_is_nan_and_quotes_survive(opened: Any) -> None:
     storage = opened(coefficients=torch.zeros(10, dtype=torch.float64), name='E"A\\')
-    nodes = storage.getNode("coefficients")
-    read = [nodes.at(k) for k in range(nodes.size())]
-    (vertex,) = [one for one in read if one.getNode("symbol").string() == "r0"]
-    assert np.isnan(vertex.getNode("value").real())
+    assert np.isnan(coefficients(storage)["pixel", "r0"].getNode("value").real())
     assert storage.getNode("model").string() == 'E"A\\'
 
 
-def test_the_map_of_a_whole_sensor_is_read_by_opencv(tmp_path: Path) -> None:
+def test_the_map_of_a_whole_sensor_is_read_by_opencv(opened: Any) -> None:
     height, width = 480, 640
     pattern = torch.randn(height, width, generator=torch.Generator().manual_seed(0)).double()
-    camera = calibration(np.eye(4)).camera
-    state = calibration(
-        TRANSFORMS["general"],
-        [{"kind": "fixed_pattern"}],
-        camera=type(camera)(width=width, height=height, matrix=camera.matrix),
+    storage = opened(
+        terms=[{"kind": "fixed_pattern"}],
+        camera=CameraIntrinsics(width=width, height=height, matrix=CAMERA.matrix),
         domain=Domain(height=height, width=width, radial_distance=Interval(0.5, 3.0)),
         fixed_pattern=pattern,
     )
-    write("opencv", state, tmp_path / "camera.yml")
-    storage = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_READ)
     np.testing.assert_array_equal(storage.getNode("fixed_pattern_m").mat(), pattern.numpy())
     # A lens without distortion is one of zero coefficients.
-    np.testing.assert_array_equal(
-        storage.getNode("distortion_coefficients").mat(), np.zeros((1, 5))
-    )
+    assert not storage.getNode("distortion_coefficients").mat().any()

@@ -29,6 +29,23 @@ from tofcorr.simulation.effects.temperature import (
 from tofcorr.simulation.effects.timestamp_offset import TimestampOffsetEffect
 
 
+def _shift(kind: type[CatalogueEffect], inputs: EffectInputs, **values: float) -> torch.Tensor:
+    """Return the shift of an effect that has these coefficients, and zero for all others."""
+    effect = kind.for_recording(inputs)
+    names = _names(effect)
+    assert set(values) <= set(names)
+    given = torch.tensor([values.get(name, 0.0) for name in names], dtype=torch.float64)
+    return effect.shift(inputs, given)
+
+
+def _names(effect: CatalogueEffect) -> list[str]:
+    return [term.name for term in effect.terms(effect.shape)]
+
+
+def _with_facts(inputs: EffectInputs, **facts: torch.Tensor) -> EffectInputs:
+    return replace(inputs, facts=replace(inputs.facts, **facts))
+
+
 def test_the_lens_bends_rays_as_opencv_distorts_points(generator: Generator) -> None:
     points = torch.rand(50, 2, generator=generator, dtype=torch.float64) - 0.5
     rays = torch.cat([points, torch.ones(50, 1, dtype=torch.float64)], dim=1)
@@ -79,12 +96,11 @@ def test_a_camera_that_runs_warms_exponentially_and_cools_in_a_pause() -> None:
 
 def test_a_camera_that_starts_warm_cools_exponentially(inputs: EffectInputs) -> None:
     times = torch.tensor([0.0, 50.0, 100.0, 1000.0], dtype=torch.float64)
-    facts = replace(inputs.facts, timestamp=times, room_temperature=torch.full((4,), 22.0).double())
-    still = replace(inputs, facts=facts)
-    effect = RoomTemperatureEffect.for_recording(still)
-    assert effect.shape.starts_s == (0.0, 1000.0)
+    degrees = torch.full((4,), 22.0, dtype=torch.float64)
+    still = _with_facts(inputs, timestamp=times, room_temperature=degrees)
+    assert RoomTemperatureEffect.for_recording(still).shape.starts_s == (0.0, 1000.0)
     starts = {"lagged_200s_per_degree": 0.01, "start_0": 2.0, "start_1": -1.0}
-    shift = effect.shift(still, _coefficients(effect, **starts))
+    shift = _shift(RoomTemperatureEffect, still, **starts)
     of_frame = [float(shift[still.frame == frame][0]) for frame in range(4)]
     decay = np.exp(-times.numpy() / 200.0)
     expected = 0.02 * decay - 0.01 * np.array([0, 0, 0, 1.0])
@@ -93,7 +109,7 @@ def test_a_camera_that_starts_warm_cools_exponentially(inputs: EffectInputs) -> 
 
 def test_background_returned_by_the_target_knows_no_reflectivity(inputs: EffectInputs) -> None:
     effect = AmbientLightEffect.for_recording(inputs)
-    names = [term.name for term in effect.terms(effect.shape)]
+    names = _names(effect)
     darker = replace(inputs, amplitude=present(inputs.amplitude) / 5)
     bright_columns, dark_columns = effect.columns(inputs), effect.columns(darker)
     returned, uniform = names.index("returned_sine"), names.index("false_sine")
@@ -119,9 +135,8 @@ def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
     )
     effect = MixedPixelsEffect(MixedPixelsShape())
     columns = effect.columns(flat).reshape(camera.height, camera.width, -1)
-    names = [term.name for term in effect.terms(effect.shape)]
     two = ("astride", "astride_at_one_metre")
-    astride, share = (columns[:, :, names.index(name)] for name in two)
+    astride, share = (columns[:, :, _names(effect).index(name)] for name in two)
     assert bool((astride[:, 16] > 0.9).all())
     assert bool((astride[:, [3, 10, 15, 17, 28]] < 1e-6).all())
     torch.testing.assert_close(share, astride / 2.0)
@@ -131,24 +146,15 @@ def test_a_room_temperature_of_other_recordings_knows_no_moments_of_this_one() -
     shape = RoomTemperatureShape(starts_s=(0.0, 700.0))
     count = len(RoomTemperatureEffect.terms(shape))
     effect = RoomTemperatureEffect(shape, torch.arange(1.0, count + 1, dtype=torch.float64))
-    found = effect.in_other_recordings().to_mapping()
-    kept = effect.to_mapping()
+    found, kept = effect.in_other_recordings().to_mapping(), effect.to_mapping()
     assert not any(key.startswith("start_") for key in found)
-    assert found["per_degree"] == kept["per_degree"]
-    assert found["square"] == kept["square"]
-
-
-def _coefficients(effect: CatalogueEffect, **values: float) -> torch.Tensor:
-    names = [term.name for term in effect.terms(effect.shape)]
-    assert set(values) <= set(names)
-    return torch.tensor([values.get(name, 0.0) for name in names], dtype=torch.float64)
+    assert (found["per_degree"], found["square"]) == (kept["per_degree"], kept["square"])
 
 
 def test_a_highlight_falls_with_the_square_of_the_angle(inputs: EffectInputs) -> None:
     angle = torch.deg2rad(torch.tensor([0.0, 4.0, 8.0, 40.0], dtype=torch.float64))
     four = replace(inputs, incidence_cosine=torch.cos(angle))
-    effect = GlossEffect.for_recording(four)
-    shift = effect.shift(four, _coefficients(effect, lobe_4deg=-0.01))
+    shift = _shift(GlossEffect, four, lobe_4deg=-0.01)
     expected = -0.01 * torch.exp(torch.tensor([0.0, -1.0, -4.0, -100.0], dtype=torch.float64))
     torch.testing.assert_close(shift, expected, atol=5e-6, rtol=0)
 
@@ -158,9 +164,8 @@ def test_a_robot_that_is_too_short_scales_distances_beside_a_plane_and_a_camera_
 ) -> None:
     """Lengths have no scale: distances, arm, plane and mounting, all longer, look the same."""
     longer = 1.01
-    effect = RobotKinematicsEffect.for_recording(inputs)
     facts, mounted = inputs.facts, inputs.tool_from_camera.clone()
-    error = effect.shift(inputs, _coefficients(effect, length=longer - 1))
+    error = _shift(RobotKinematicsEffect, inputs, length=longer - 1)
     true = facts.world_from_tool.clone()
     true[:, :3, 3] *= longer
     moved = distance_to(inputs, replace(facts, world_from_tool=true))
@@ -173,8 +178,7 @@ def test_a_robot_that_is_too_short_scales_distances_beside_a_plane_and_a_camera_
 
 def test_a_bracket_bends_about_the_torque_of_its_weight(inputs: EffectInputs) -> None:
     """The same by SciPy: a camera that is 2 mrad heavy along z of the tool bends downwards."""
-    effect = RobotKinematicsEffect.for_recording(inputs)
-    shift = effect.shift(inputs, _coefficients(effect, bracket_z=0.002))
+    shift = _shift(RobotKinematicsEffect, inputs, bracket_z=0.002)
     facts, turned = inputs.facts, torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
     down = facts.world_from_tool[:, :3, :3].mT @ torch.tensor([0.0, 0.0, -1.0]).double()
     torque = np.cross([0.0, 0.0, 0.002], down.numpy())
@@ -188,9 +192,8 @@ def test_a_bracket_bends_about_the_torque_of_its_weight(inputs: EffectInputs) ->
 
 def test_rows_read_in_turn_see_the_target_in_turn(inputs: EffectInputs) -> None:
     twist = torch.tensor([[0.1, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(4, 6)
-    moving = replace(inputs, facts=replace(inputs.facts, tool_twist=twist))
-    effect = MotionEffect.for_recording(moving)
-    shift = effect.shift(moving, _coefficients(effect, half_of_rows_s=0.01))
+    moving = _with_facts(inputs, tool_twist=twist)
+    shift = _shift(MotionEffect, moving, half_of_rows_s=0.01)
     torch.testing.assert_close(shift, 0.01 * moving.rows * radial_speed(moving))
 
 
@@ -198,12 +201,10 @@ def test_clocks_that_drift_are_late_at_the_end_as_an_offset_is(inputs: EffectInp
     times = torch.tensor([0.0, 1.0, 3.0, 4.0], dtype=torch.float64)
     twist = torch.tensor([[0.1, 0.0, 0.3, 0.0, 0.2, 0.0]], dtype=torch.float64).expand(4, 6)
     exposure = torch.tensor([1e-3, 2e-3, 1e-3, 4e-3], dtype=torch.float64)
-    facts = replace(inputs.facts, timestamp=times, tool_twist=twist, integration_time=exposure)
-    moving = replace(inputs, facts=facts)
-    effect = TimestampOffsetEffect.for_recording(moving)
+    moving = _with_facts(inputs, timestamp=times, tool_twist=twist, integration_time=exposure)
 
     def late(frame: int, **values: float) -> torch.Tensor:
-        return effect.shift(moving, _coefficients(effect, **values))[moving.frame == frame]
+        return _shift(TimestampOffsetEffect, moving, **values)[moving.frame == frame]
 
     torch.testing.assert_close(late(3, half_of_drift_s=0.02), late(3, offset_s=0.02))
     torch.testing.assert_close(late(1, half_of_drift_s=0.02), late(1, offset_s=-0.01))
@@ -214,16 +215,15 @@ def test_a_target_that_sinks_or_is_bumped_into_ends_where_an_error_of_its_place_
     inputs: EffectInputs,
 ) -> None:
     times = torch.tensor([0.0, 1.0, 2.5, 4.0], dtype=torch.float64)
-    still = replace(inputs, facts=replace(inputs.facts, timestamp=times))
-    effect = TargetRegistrationEffect.for_recording(still)
+    still = _with_facts(inputs, timestamp=times)
 
     def moved(frame: int, **values: float) -> torch.Tensor:
-        return effect.shift(still, _coefficients(effect, **values))[still.frame == frame]
+        return _shift(TargetRegistrationEffect, still, **values)[still.frame == frame]
 
     for name, shares in (("drift", (0.0, 0.25, 0.625, 1.0)), ("after_1of3", (0, 0, 1, 1))):
         for frame, share in enumerate(shares):
             found = moved(frame, **{f"offset_m_{name}": 0.01, f"lean_x_{name}": 0.005})
             expected = moved(frame, offset_m=0.01 * share, lean_x=0.005 * share)
             torch.testing.assert_close(found, expected)
-    alone = effect.in_other_recordings()
-    assert [term.name for term in alone.terms(alone.shape)] == ["offset_m", "lean_x", "lean_y"]
+    alone = TargetRegistrationEffect.for_recording(still).in_other_recordings()
+    assert _names(alone) == ["offset_m", "lean_x", "lean_y"]
