@@ -100,6 +100,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 SHEAR = IDENTITY + 0.01 * np.eye(4, k=1) * [[1], [1], [0], [0]]
 INFINITE = np.where(IDENTITY == 1, np.inf, 0)
 MISSPELT = (("saturation_amplitude", GONE), ("saturation_amplitde", 3))
+LARGE = (("camera.width", 100_000), ("camera.height", 100_000))
 MISSING: dict[str, Damage] = {
     r"recording\.yaml: there is no such file": removed("recording.yaml"),
     r"frames\.csv: there is no such file": removed("frames.csv"),
@@ -121,9 +122,7 @@ HEADERS: dict[str, Damage] = {
     r"'camera\.distortion': .* got 3": header(("camera.distortion", [0.1, 0.2, 0.3])),
     r"'camera\.distortion\.0': .*less than or equal": header(("camera.distortion.0", 1e300)),
     r"'camera\.width': .*greater than 0": header(("camera.width", 0)),
-    r"'camera': an image of 100000 x 100000 pixels is larger": header(
-        ("camera.width", 100_000), ("camera.height", 100_000)
-    ),
+    r"'camera': an image of 100000 x 100000 pixels is larger": header(*LARGE),
     r"recording\.yaml: 'camera\.width'": header(("camera.width", 7.5)),
     r"'camera\.height': .*not true or false": header(("camera.height", True)),
     r"'camera\.width'": header(("camera.width", 10**400)),
@@ -193,15 +192,9 @@ ARRAYS: dict[str, Damage] = {
     r"depth\.npy: not a readable": truncated("depth.npy"),
 }
 VALUES: dict[str, Damage] = {
-    r"depth.*frame 3, row 1, column 2: 3\.4e\+38; expected metres": value(
-        "depth", (3, 1, 2), 3.4e38
-    ),
-    r"amplitude.*frame 4, row 2, column 3: -0\.5; expected 0 to 1e\+12": value(
-        "amplitude", (4, 2, 3), -0.5
-    ),
-    r"amplitude.*frame 4, row 2, column 3: 3e\+38; expected 0 to": value(
-        "amplitude", (4, 2, 3), 3e38
-    ),
+    r"depth.*frame 3, row 1, column 2: 3\.4e\+38; .*metres": value("depth", (3, 1, 2), 3.4e38),
+    r"amplitude.*frame 4, row 2, column 3: -0\.5; .*1e\+12": value("amplitude", (4, 2, 3), -0.5),
+    r"amplitude.*frame 4, row 2, column 3: 3e\+38; expected": value("amplitude", (4, 2, 3), 3e38),
     r"raw.*frame 4, A1, row 2, column 3: -3e\+38; expected": value("raw", (4, 1, 2, 3), -3e38),
     r"mask\.npy: frame 1, row 0, column 6: 255; expected 0 or 1": value("mask", (1, 0, 6), 255),
 }

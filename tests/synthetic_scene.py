@@ -86,12 +86,10 @@ class Scene:
         moved, batch = origin.moved(step), self.batch
         names, values = zip(*self.model.named_parameters(), strict=True)
         parts = moved.coefficients.split([one.numel() for one in values])
-        columns = {
-            n: part.reshape(one.shape) for n, part, one in zip(names, parts, values, strict=True)
-        }
-        error = torch.func.functional_call(
-            self.model, columns, (batch.radial_distance, batch.amplitude)
-        )
+        shaped = (part.reshape(one.shape) for part, one in zip(parts, values, strict=True))
+        given = dict(zip(names, shaped, strict=True))
+        images = batch.radial_distance, batch.amplitude
+        error = torch.func.functional_call(self.model, given, images)
         points = self.rays * (batch.radial_distance - error)[..., None]
         points_tool = points @ moved.tool_from_camera[:3, :3].T + moved.tool_from_camera[:3, 3]
         along = torch.einsum("bhwk,bk->bhw", points_tool, batch.normal_tool)
@@ -127,17 +125,13 @@ def make_scene(
     cosine = -torch.einsum("hwk,bk->bhw", rays, normal_camera)
     amplitude = 1000.0 * reflectivity * cosine / true_distance.square()
     model = error_model(terms)
-    coefficients = error_size * torch.randn(
-        len(model.symbols()), generator=generator, dtype=torch.float64
-    )
+    coefficients = error_size * _normal(generator, len(model.symbols()))
     model.set_coefficient_vector(coefficients)
     measured = true_distance
     with torch.no_grad():
         for _ in range(60):  # The error is a function of what is measured: a fixed point.
             measured = true_distance + model(measured, amplitude)
-    measured = measured + noise * torch.randn(
-        measured.shape, generator=generator, dtype=torch.float64
-    )
+    measured = measured + noise * _normal(generator, *measured.shape)
     valid = _uniform(generator, *measured.shape) >= invalid
     world_from_tool = camera_poses @ se3.inverse(tool_from_camera)
     normal_tool, offset_tool = plane_in_frame(wall_normal, wall_offset, world_from_tool)
@@ -191,13 +185,12 @@ def without_invalid_pixels(scene: Scene) -> Scene:
 
 def nearby(truth: Parameters, generator: Generator, size: float = 0.01) -> Parameters:
     """Return parameters a random step away: `size` metres and radians."""
-    step = size * torch.randn(truth.size, generator=generator, dtype=torch.float64)
-    return truth.moved(step)
+    return truth.moved(size * _normal(generator, truth.size))
 
 
 def _hand_eye(generator: Generator) -> Tensor:
     twist = torch.tensor([0.05, -0.02, 0.12, 0.3, -0.2, 1.5], dtype=torch.float64)
-    return se3.exp(twist + 0.05 * torch.randn(6, generator=generator, dtype=torch.float64))
+    return se3.exp(twist + 0.05 * _normal(generator, 6))
 
 
 def _camera_pose(generator: Generator) -> Tensor:
@@ -212,3 +205,7 @@ def _camera_pose(generator: Generator) -> Tensor:
 
 def _uniform(generator: Generator, *shape: int) -> Tensor:
     return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+
+def _normal(generator: Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)

@@ -49,9 +49,7 @@ def test_the_residual_is_the_distance_of_a_point_to_the_plane(generator: Generat
     rays = ray_directions(CAMERA)
     distance = 0.5 + torch.rand(2, 5, 7, generator=generator, dtype=torch.float64)
     amplitude = 10 + 80 * torch.rand(2, 5, 7, generator=generator, dtype=torch.float64)
-    normal = torch.nn.functional.normalize(
-        torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1
-    )
+    normal = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator).double(), dim=-1)
     offset = torch.randn(2, generator=generator, dtype=torch.float64)
     residual = model.residual(distance, amplitude, rays, normal, offset)
     error = model.error(distance, amplitude)

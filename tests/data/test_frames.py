@@ -24,8 +24,7 @@ PIXELS = CAMERA.width * CAMERA.height
 
 @pytest.fixture(scope="module")
 def radial(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    path = tmp_path_factory.mktemp("radial") / "recording"
-    return Recording.open(write_small_recording(path))
+    return Recording.open(write_small_recording(tmp_path_factory.mktemp("radial") / "recording"))
 
 
 @pytest.fixture(scope="module")

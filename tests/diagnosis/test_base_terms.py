@@ -138,8 +138,7 @@ def test_amplitude_terms_are_left_out_of_a_recording_without_amplitudes(
 ) -> None:
     bare = copytree(nothing_missing.path, tmp_path / "bare")
     (bare / "amplitude.npy").unlink()
-    found = diagnose(
-        bare, config=_base("distance_polynomial", "tensor_spline") | {"catalogue": ["wiggling"]}
-    )
+    base = _base("distance_polynomial", "tensor_spline")
+    found = diagnose(bare, config=base | {"catalogue": ["wiggling"]})
     assert "amplitude.npy is missing" in found.warnings[0]
     assert "tensor_spline" in found.warnings[0]

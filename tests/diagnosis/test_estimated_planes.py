@@ -42,11 +42,9 @@ EFFECTS: dict[str, dict[str, Any]] = {
 def with_walls_found(recording: Recording) -> Recording:
     """Return the recording as an importer leaves it, its plane found in the depth."""
     out, table = recording.path.with_name(f"{recording.path.name}_walls"), recording.frames
-    options = PosedOptions(
-        depth_kind=recording.depth_kind, saturation_amplitude=recording.saturation_amplitude
-    )
+    same = {name: getattr(recording, name) for name in ("depth_kind", "saturation_amplitude")}
     images = (recording.camera, table.world_from_tool, recording.depth, recording.amplitude)
-    found, report = imported(out.with_suffix(".plain"), *images, options=options)
+    found, report = imported(out.with_suffix(".plain"), *images, options=PosedOptions(**same))
     image = np.array([int(view["view"]) for view in report["views"]])
     ids = image if table.pose_id is None else table.pose_id[image]
     # An importer knows no conditions of a frame: they are those of its image.
@@ -92,13 +90,10 @@ def test_columns_are_the_differences_of_the_predicted_distance(walls: Recording)
     for number in range(6):
         step = torch.zeros(6, dtype=torch.float64)
         step[number] = 1e-5
-        ends = [
-            predicted_distance(with_walls_moved(observations, sign * step), pose)
-            for sign in (1, -1)
-        ]
-        torch.testing.assert_close(
-            columns[:, number], (ends[0] - ends[1]) / 2e-5, rtol=1e-6, atol=1e-6
-        )
+        moved = (with_walls_moved(observations, sign * step) for sign in (1, -1))
+        ahead, behind = (predicted_distance(one, pose) for one in moved)
+        slope = (ahead - behind) / 2e-5
+        torch.testing.assert_close(columns[:, number], slope, rtol=1e-6, atol=1e-6)
 
 
 def test_the_same_effect_is_named_first_as_with_measured_planes(

@@ -50,9 +50,7 @@ def _noise(study: Study, seed: int, width: float = 0.0) -> Tensor:
 
 
 @pytest.mark.parametrize("width", [0.0, 1.2])
-def test_noise_filtered_or_not_has_one_energy_in_all_waves(
-    nothing_study: Study, width: float
-) -> None:
+def test_noise_filtered_or_not_is_alike_in_all_waves(nothing_study: Study, width: float) -> None:
     """P-values are uniform at most: Bonferroni's correction makes them larger."""
     found = [
         unlike_waves(_with_residual(nothing_study, _noise(nothing_study, seed, width)), ()).p_value

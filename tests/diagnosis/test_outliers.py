@@ -52,9 +52,7 @@ def test_the_share_and_size_of_deleted_pixels_are_those_that_were_put_in(
 
 
 @pytest.mark.parametrize("changes", [FEW, REPEATED], ids=["single frames", "repeats"])
-def test_gross_errors_of_single_pixels_are_no_noise(
-    changes: Mapping[str, Any], tmp_path: Path
-) -> None:
+def test_gross_errors_of_pixels_are_no_noise(changes: Mapping[str, Any], tmp_path: Path) -> None:
     """Three in a hundred pixels once tripled the noise, and hid how far the poses scatter."""
     frames = 30 if changes is FEW else 39
     odd = np.random.default_rng(3).uniform(size=(frames, 24, 32)) < 0.03
@@ -67,9 +65,7 @@ def test_gross_errors_of_single_pixels_are_no_noise(
     assert most[0] == pytest.approx(most[1], rel=0.05)
 
 
-def test_many_outliers_are_warned_of_with_their_place(
-    scattered: tuple[Prepared, np.ndarray],
-) -> None:
+def test_many_outliers_are_warned_of_by_their_place(scattered: tuple[Prepared, np.ndarray]) -> None:
     warning = scattered[0].warnings[-1]
     assert "mm RMS and are left out as outliers" in warning
     assert "They lie all over the images." in warning
@@ -119,8 +115,7 @@ def test_the_columns_for_an_unknown_amplitude_hold_that_of_a_uniform_target(tmp_
         "conditions": {"ambient_counts": [0.0, 0.0]},
     }
     recording = recorded(tmp_path / "white", 47, [], white, noise=False)
-    own = simulator(47, [], white)
-    inputs = true_inputs(recording, own)
+    inputs = true_inputs(recording, simulator(47, [], white))
     amplitude = inputs.known_amplitude
     blind = replace(inputs, amplitude=None, amplitude_images=None)
     columns = unknown_amplitude_columns(observe(recording, 10_000_000), blind)

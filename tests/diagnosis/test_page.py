@@ -153,9 +153,7 @@ def test_the_first_strip_is_what_the_text_beside_it_names(time_diagnosis: Diagno
     assert (covariate, ends) == ("integration time", f"from {low:.1f} to {high:.1f} mm")
 
 
-def test_the_verdict_comes_first_and_causes_next(
-    page: str, time_diagnosis: DiagnosisResult
-) -> None:
+def test_the_verdict_comes_before_the_causes(page: str, time_diagnosis: DiagnosisResult) -> None:
     places = [page.index('class="verdict'), page.index("<h2"), page.index("<svg")]
     assert places == sorted(places)
     assert html.unescape(page).index(time_diagnosis.causes[0]) < places[1]

@@ -93,9 +93,8 @@ def _posterior(models: Models) -> dict[Model, float]:
     generator = torch.Generator().manual_seed(3)
     weights = torch.empty(2000, POSES).exponential_(generator=generator).double()
     weights *= POSES / weights.sum(1, keepdim=True)
-    return dict(
-        zip(models.models, models.posterior(weights, generator).mean(1).tolist(), strict=True)
-    )
+    posterior = models.posterior(weights, generator).mean(1).tolist()
+    return dict(zip(models.models, posterior, strict=True))
 
 
 def test_without_evidence_the_prior_odds_remain() -> None:
@@ -156,9 +155,8 @@ def test_a_form_error_names_nothing_where_there_is_no_signal() -> None:
 def test_the_best_model_of_a_study_is_found_whatever_the_order(time_study: Study) -> None:
     models = Search(Evidence(time_study), 0.001, 2).models(())
     assert models.best()[0] == ("integration_time",)
-    assert models.gain_of("integration_time") == pytest.approx(
-        float(models.total[models.models.index(("integration_time",))])
-    )
+    total = float(models.total[models.models.index(("integration_time",))])
+    assert models.gain_of("integration_time") == pytest.approx(total)
 
 
 def test_what_is_said_of_one_recording_agrees(

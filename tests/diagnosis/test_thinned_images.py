@@ -42,9 +42,8 @@ def test_chosen_pixels_are_the_same_in_all_frames_and_spread_evenly(tmp_path: Pa
 def test_a_fixed_pattern_is_named_and_handed_on_in_all_pixels(tmp_path: Path) -> None:
     """A tenth of the pixels is diagnosed; the simulator has the pattern of each."""
     recording = recorded(tmp_path / "pattern", 4, [_PATTERN], _LARGER)
-    found = diagnose(
-        recording, config={"most_pixels": 24 * 300, "bootstraps": 19, "simulate_anew": False}
-    )
+    quick = {"most_pixels": 24 * 300, "bootstraps": 19, "simulate_anew": False}
+    found = diagnose(recording, config=quick)
     assert found.effects == ("fixed_pattern",)
     (entry,) = present(found.simulator).effects
     values = {key: value for key, value in entry.items() if key != "name"}

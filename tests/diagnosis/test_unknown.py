@@ -52,8 +52,7 @@ def test_poses_may_scatter_by_three_millimetres_and_milliradians(nothing_study: 
 
 def test_pose_columns_are_what_small_motions_of_the_target_do(nothing_missing: Recording) -> None:
     """Turned by a milliradian about any point and shifted, a plane's distance is in their span."""
-    own = simulator(31)
-    inputs = true_inputs(nothing_missing, own)
+    inputs = true_inputs(nothing_missing, simulator(31))
     here = inputs.frame == 3
     facts = inputs.facts
     moved = se3.exp(torch.tensor([1e-4, -2e-4, 3e-4, 1e-4, -2e-4, 1e-4], dtype=torch.float64))

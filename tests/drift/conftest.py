@@ -34,9 +34,8 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Walls:
 
     @cache
     def few(seed: int, shift_mm: float = 0.0) -> Dataset:
-        return simulated_wall(
-            tmp_path_factory.mktemp("few") / "few", seed, FEW, sensor=sensor(shift_mm)
-        )
+        folder = tmp_path_factory.mktemp("few") / "few"
+        return simulated_wall(folder, seed, FEW, sensor=sensor(shift_mm))
 
     return few
 

@@ -22,9 +22,8 @@ def test_coefficients_survive_the_papers_symbols(name: str, generator: Generator
     randomise(model, generator)
     again = built(*MODELS[name])
     again.set_paper_coefficients(model.paper_coefficients())
-    torch.testing.assert_close(
-        again.coefficient_vector(), model.coefficient_vector(), rtol=1e-9, atol=1e-9
-    )
+    found, expected = (one.coefficient_vector() for one in (again, model))
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_ea_in_the_papers_symbols_is_the_papers_formula(generator: Generator) -> None:

@@ -73,9 +73,7 @@ def test_gradient_and_hessian_are_those_of_autograd_over_all_pixels(
         torch.testing.assert_close(one, expected, rtol=RELATIVE, atol=atol)
 
 
-def test_the_sum_over_the_images_has_their_normal_equations(
-    scene: Scene, generator: Generator
-) -> None:
+def test_the_sum_of_the_images_has_their_equations(scene: Scene, generator: Generator) -> None:
     objective = MomentObjective(scene.moments())
     parameters = nearby(scene.truth, generator)
     each, found = objective.image_equations(parameters), objective.normal_equations(parameters)

@@ -110,9 +110,7 @@ def test_the_marginal_curvature_is_the_inverse_of_the_covariances_block(found: F
     marginal = marginal_hessian(found.moments, best, walls)
     scale = block.diagonal().sqrt()
     identity = (marginal @ block) * scale[None, :] / scale[:, None]
-    torch.testing.assert_close(
-        identity, torch.eye(best.size, dtype=torch.float64), atol=1e-4, rtol=0
-    )
+    torch.testing.assert_close(identity, torch.eye(best.size).double(), atol=1e-4, rtol=0)
 
 
 def test_walls_of_two_places_are_told_apart_by_name(wall: Dataset) -> None:

@@ -65,7 +65,5 @@ def test_the_inverse_does_not_mind_units() -> None:
     scale = torch.tensor([1e-6, 1.0, 1e8]).double()
     matrix = torch.tensor([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 3.0]]).double()
     scaled = matrix * scale[:, None] * scale[None, :]
-    identity = inverse(scaled) @ scaled
-    torch.testing.assert_close(
-        identity * scale[:, None] / scale[None, :], torch.eye(3).double(), rtol=0, atol=1e-6
-    )
+    identity = inverse(scaled) @ scaled * scale[:, None] / scale[None, :]
+    torch.testing.assert_close(identity, torch.eye(3).double(), rtol=0, atol=1e-6)

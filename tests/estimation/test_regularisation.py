@@ -95,9 +95,7 @@ def test_joined_priors_weigh_as_both_alone(generator: Generator) -> None:
     batch = frontal_frames(torch.zeros(1), generator, 0.01)
     model = spline_model(DOMAIN, 1e-3)
     moments = moments_of(model, batch)
-    point = zero(moments).moved(
-        torch.randn(len(moments.symbols), generator=generator, dtype=torch.float64)
-    )
+    point = zero(moments).moved(torch.randn(len(moments.symbols), generator=generator).double())
     one, other = (
         present(smoothness(penalties_of(model), weight, where))
         for weight, where in ((100.0, zero(moments)), (5.0, point))

@@ -37,9 +37,8 @@ def test_the_optimum_is_that_of_scipy_over_the_pixels_from_far_and_near(
         with torch.no_grad():
             return whole.residual_of_step(start, torch.from_numpy(step))[used].numpy()
 
-    theirs = least_squares(
-        residual, np.zeros(start.size), method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14
-    )
+    exact = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-14)
+    theirs = least_squares(residual, np.zeros(start.size), method="lm", **exact)
     true = start.moved(torch.from_numpy(theirs.x)).tool_from_camera
     for from_where in (start, nearby(scene.truth, generator, 0.1)):
         ours = minimise(MomentObjective(scene.moments()), from_where)

@@ -36,10 +36,9 @@ def test_rays_have_unit_length_and_that_of_the_principal_point_is_the_axis() -> 
 def test_a_large_image_has_the_rays_of_a_small_one_at_the_same_pixels() -> None:
     # Its lens is undone part by part.
     large = replace(CAMERA, width=200, height=200)
-    torch.testing.assert_close(
-        ray_directions(large)[:50, :64], ray_directions(CAMERA), rtol=0, atol=1e-15
-    )
-    u, v = ray_directions(large)[150, 120, :2] / ray_directions(large)[150, 120, 2]
+    rays = ray_directions(large)
+    torch.testing.assert_close(rays[:50, :64], ray_directions(CAMERA), rtol=0, atol=1e-15)
+    u, v = rays[150, 120, :2] / rays[150, 120, 2]
     x, y = ray_directions(replace(large, height=151))[150, 120, :2].tolist()
     assert float(u / v) == pytest.approx(x / y, rel=1e-14)
 

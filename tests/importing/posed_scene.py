@@ -76,10 +76,8 @@ class Recorded:
         What was `world` is then the robot's tool, and what was `tool` its base; the poses become
         base_from_tool.
         """
-        inverse = {
-            name: np.linalg.inv(getattr(self, name)) for name in ("world_from_tool", "exact")
-        }
-        return replace(self, **inverse)
+        poses, exact = np.linalg.inv(self.world_from_tool), np.linalg.inv(self.exact)
+        return replace(self, world_from_tool=poses, exact=exact)
 
     def stamped_late(self, seconds: float) -> "Recorded":
         """Return the same with the image clock late by this much."""
@@ -178,10 +176,9 @@ class Drive:
         met_at = place + depth[..., None] * world
         reflectivity = 0.7 + 0.3 * np.sign(np.sin(9 * met_at).prod(axis=-1) + 0.02)
         amplitude = 3000 * reflectivity * cosine / depth**2 * rays[..., 2] ** 2
-        measured = depth + self.error * systematic_error(
-            depth, amplitude, 0.02, (6e-3, -4e-3), -1.5e-6
-        )
-        measured = measured + self.noise * generator.normal(size=depth.shape)
+        error = systematic_error(depth, amplitude, 0.02, (6e-3, -4e-3), -1.5e-6)
+        noise = generator.normal(size=depth.shape)
+        measured = depth + self.error * error + self.noise * noise
         z_mm = np.round(1e3 * measured * rays[..., 2])
         depth, counts = (np.where(returned, one, 0) for one in (z_mm, np.round(amplitude)))
         return depth.astype(np.uint16), counts.astype(np.uint16)
@@ -210,9 +207,7 @@ def systematic_error(
     depth: np.ndarray, amplitude: np.ndarray, bowl: float, tilt: tuple[float, float], slope: float
 ) -> np.ndarray:
     """Return D + P + I: a quadratic in distance, a bowl and a tilt, a slope in amplitude."""
-    row, column = (
-        k / size - 0.5 for k, size in zip(np.indices(depth.shape), depth.shape, strict=True)
-    )
+    row, column = np.indices(depth.shape) / np.reshape(depth.shape, (2, 1, 1)) - 0.5
     apart = depth - 1.5
     of_distance = 0.006 + 0.005 * apart - 0.003 * apart**2
     of_pixel = bowl * (row**2 + column**2) + tilt[0] * row + tilt[1] * column

@@ -60,9 +60,8 @@ def test_a_module_survives_the_calibration_of_a_run(kind: str, tmp_path: Path) -
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_state_of_other_terms_is_refused_and_changes_nothing(kind: str) -> None:
-    module, other = module_of(kind), module_of("pixel_polynomial")
-    if kind == "pixel_polynomial":
-        other = module_of("lookup_table")
+    module = module_of(kind)
+    other = module_of("lookup_table" if kind == "pixel_polynomial" else "pixel_polynomial")
     before = everything(module)
     with pytest.raises(StateError, match="the state is of another model"):
         module.load_state_dict(other.state_dict())

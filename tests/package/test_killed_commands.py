@@ -201,9 +201,8 @@ def test_a_killed_command_leaves_nothing_or_all(words: str, ready: Path, tmp_pat
         assert code in {0, *SIGNALS[what]}, told
         assert "Traceback" not in told
         after, out = digests(place / "work"), place / "work" / written
-        assert {path: after.get(path) for path in before if path != written} == {
-            path: digest for path, digest in before.items() if path != written
-        }
+        others = {path: digest for path, digest in before.items() if path != written}
+        assert {path: after.get(path) for path in others} == others
         if os.path.lexists(out):
             check(out)
         else:

@@ -139,11 +139,8 @@ def outcome(sets: list[list[str]], shared: tuple[str, ...] = (), **more: Any) ->
     distance = {"cause": "distance", "share": 0.4, "ci": [0.3, 0.45], "kind": "parameter"}
     report = {"stages": stages, "attribution": [distance, named], "verdict": "Differ by 10.3 mm."}
     truth = {"as_given_mm": 10.0, "shares": {"distance": 0.42, "lens": 0.58}}
-    answer = {
-        "case": {"tier": "ideal", "shared": list(shared)},
-        "sizes_mm": {"lens": 5.0},
-        "truth": truth,
-    }
+    case = {"tier": "ideal", "shared": list(shared)}
+    answer = {"case": case, "sizes_mm": {"lens": 5.0}, "truth": truth}
     said = Said(tuple(effects), tuple(map(frozenset, sets)), report=report | more)
     return Outcome("r", answer, Oracle(5.0, 1.0, {"lens": 9.0}), said)
 
@@ -179,16 +176,16 @@ def test_a_report_without_stages_and_blocks_is_not_measured() -> None:
 
 
 # Gaps, an error of a square, noise and missing pixels of degraded frames, see `read_degraded`.
-FIGURES: tuple[str, ...] = (
-    "gap_mm",
-    "error_of_square",
-    "own_mm",
-    "oracle_mm",
-    "noise_mm",
-    "true_noise_mm",
-)
-NEAR: dict[str, float] = dict(zip(FIGURES, (1.05, 0.1, 1.0, 0.9, 4.2, 4.0), strict=True))
-NEAR |= {"missing": 0.01, "true_missing": 0.011}
+NEAR: dict[str, float] = {
+    "gap_mm": 1.05,
+    "error_of_square": 0.1,
+    "own_mm": 1.0,
+    "oracle_mm": 0.9,
+    "noise_mm": 4.2,
+    "true_noise_mm": 4.0,
+    "missing": 0.01,
+    "true_missing": 0.011,
+}
 
 
 def test_degraded_frames_are_held_against_the_last_stage() -> None:
@@ -203,10 +200,9 @@ def test_degraded_frames_are_held_against_the_last_stage() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [20, 21])
 def test_the_verdict_says_the_gap_of_the_simulator_as_given(seed: int, tmp_path: Path) -> None:
-    entry = write_pair(seed, "ideal", 0, tmp_path)
-    answer = json.loads((tmp_path / "answers" / entry["id"] / "answer.json").read_text())
+    answer, *_ = a_pair(tmp_path, "ideal", seed=seed)
     folder, options = tmp_path / "recordings", {"simulate_anew": False, "page": False}
-    found = tofcorr.diagnose(folder / entry["id"], folder / entry["sim"], options)
+    found = tofcorr.diagnose(folder / answer["id"], folder / answer["sim"], options)
     effects = dict.fromkeys(answer["sizes_mm"], 9.0)
     said = Said(report={"verdict": found.verdict})
     held = judge(Outcome("r", answer, Oracle(5.0, 1.0, effects), said))

@@ -129,18 +129,13 @@ def outcome(
 
 
 def test_figures_of_the_regression_set_by_hand(tmp_path: Path) -> None:
-    lens = {"lens": 5.0}
+    lens, unavailable = {"lens": 5.0}, [{"effect": "lens", "available": False}]
     cases = [
         outcome("A", lens, report(["lens"], [["lens"]])),
         outcome("A", lens, report(["warm_up", "lens"], [["warm_up"], ["lens", "target_shape"]])),
         outcome("C", {}, report(["warm_up"], [["warm_up"]])),
         outcome("D", {"parallax": 5.0}, report([], [], unknown=True)),
-        outcome(
-            "G",
-            lens,
-            report([], [], ranking=[{"effect": "lens", "available": False}]),
-            judged=False,
-        ),
+        outcome("G", lens, report([], [], ranking=unavailable), judged=False),
     ]
     scores, _ = withheld.score_all(cases, tmp_path)
     found = {(one.tier, one.what): one.value for one in scores}

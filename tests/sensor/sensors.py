@@ -43,9 +43,8 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "lens": {"focal_x": 0.01, "centre_y_px": 0.4, "radial_2": 0.02},
 }
 IN_SI = {"timestamp": 90.0, "integration_time": 800e-6, "room_temperature": 25.0, "ambient": 300.0}
-CONDITIONS: dict[str, float] = {
-    condition(name).column: condition(name).in_file(value) for name, value in IN_SI.items()
-}
+KNOWN = {condition(name): value for name, value in IN_SI.items()}
+CONDITIONS: dict[str, float] = {one.column: one.in_file(value) for one, value in KNOWN.items()}
 
 
 def entries(*names: str) -> list[dict[str, Any]]:

@@ -40,9 +40,8 @@ def test_draws_have_the_stated_spread_share_and_correlation() -> None:
 def test_a_generator_decides_every_draw_and_no_noise_draws_nothing() -> None:
     model = big(noise={"floor_m": 0.004}, dropouts={"base_share": 0.1})
     depth = torch.full((150, 200), 1.5, dtype=torch.float64)
-    first, second, other = (
-        model(depth, generator=torch.Generator().manual_seed(seed)).depth for seed in (1, 1, 2)
-    )
+    generators = (torch.Generator().manual_seed(seed) for seed in (1, 1, 2))
+    first, second, other = (model(depth, generator=one).depth for one in generators)
     assert torch.equal(first.nan_to_num(0.0), second.nan_to_num(0.0))
     assert not torch.equal(first.nan_to_num(0.0), other.nan_to_num(0.0))
     assert torch.equal(model(depth, noise=False).depth, depth)

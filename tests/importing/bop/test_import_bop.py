@@ -33,9 +33,7 @@ def test_a_bop_scene_gives_the_recording_of_the_same_images_and_poses_in_files(
     assert imported.report["paired_by"] == "name"
 
 
-def test_the_walls_speak_where_poses_are_not_those_of_the_camera(
-    scene: Recorded, tmp_path: Path
-) -> None:
+def test_the_walls_speak_where_poses_are_of_another_frame(scene: Recorded, tmp_path: Path) -> None:
     aside = rigid(Rotation.identity(), [0.12, -0.05, 0.03])
     shifted = replace(scene, exact=scene.exact @ aside)
     imported = run_import("bop", scene_files.write_bop(shifted, tmp_path / "s"), out=tmp_path / "o")

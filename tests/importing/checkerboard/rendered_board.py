@@ -70,11 +70,9 @@ def project(
     where: Placement, camera: CameraIntrinsics = CAMERA, points: np.ndarray | None = None
 ) -> np.ndarray:
     points = BOARD.corner_points() if points is None else points
-    vector = cv2.Rodrigues(where.rotation)[0]
-    pixels = cv2.projectPoints(
-        points, vector, where.translation, np.array(camera.matrix), np.array(camera.distortion)
-    )[0]
-    return pixels[:, 0]
+    pose = cv2.Rodrigues(where.rotation)[0], where.translation
+    lens = np.array(camera.matrix), np.array(camera.distortion)
+    return cv2.projectPoints(points, *pose, *lens)[0][:, 0]
 
 
 @lru_cache(maxsize=24)

@@ -94,9 +94,8 @@ def test_a_camera_that_stands_still_has_its_poses_inverted_and_its_frames_named(
     recording = imported.done
     names = {"world": "flange", "tool": "base_link", "camera": "tof", "eye_to_hand": True}
     assert recording.frame_names.to_mapping() == names
-    np.testing.assert_allclose(
-        recording.frames.world_from_tool, plain.done.frames.world_from_tool, atol=1e-6
-    )
+    poses = plain.done.frames.world_from_tool
+    np.testing.assert_allclose(recording.frames.world_from_tool, poses, atol=1e-6)
 
 
 def test_all_formats_of_files_give_one_recording(at_stops: Recorded, tmp_path: Path) -> None:

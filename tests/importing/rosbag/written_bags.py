@@ -48,9 +48,8 @@ class Bag:
     def write(self, topic: str, kind: str, received: float, **fields: Any) -> None:
         """Make a message, and write it."""
         if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self._store
-            )
+            connection = self._writer.add_connection(topic, kind, typestore=self._store)
+            self._connections[topic] = connection
         serialize = self._store.serialize_ros1 if self.one else self._store.serialize_cdr
         content = serialize(self.make(kind, **fields), kind)
         self._writer.write(self._connections[topic], round(received * 1e9), content)

@@ -13,9 +13,7 @@ from tofcorr.simulation.options import SimulatorOptions
 
 # The plain sensor has no delays here: an effect that moves edges would change those of amplitude.
 FEW = {
-    "sensor": {
-        "delays": {"constant_mm": 0.0, "clock_deviation": 0.0, "pixel": {}, "amplitude": {}}
-    },
+    "sensor": {"delays": {"constant_mm": 0, "clock_deviation": 0, "pixel": {}, "amplitude": {}}},
     "shots": [{"target": "checkerboard", "poses": 8}],
     "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
 }

@@ -15,9 +15,8 @@ def test_blurring_is_that_of_scipy(sigma: float) -> None:
         gaussian_filter(part, sigma, mode="nearest", radius=round(3 * sigma), axes=(1, 2))
         for part in (image.real.numpy(), image.imag.numpy())
     ]
-    torch.testing.assert_close(
-        blur(image, sigma), torch.complex(*map(torch.from_numpy, filtered)), atol=1e-12, rtol=0
-    )
+    expected = torch.complex(*map(torch.from_numpy, filtered))
+    torch.testing.assert_close(blur(image, sigma), expected, atol=1e-12, rtol=0)
 
 
 def test_blurring_widely_by_squares_is_blurring_widely() -> None:

@@ -28,7 +28,7 @@ def network(domain: Any = DOMAIN) -> ResidualState:
     return ResidualState(options=options, weights=moved)
 
 
-_DISTANCE = [{"kind": "distance_polynomial"}]
+_DISTANCE, _AMPLITUDE = [{"kind": "distance_polynomial"}], [{"kind": "amplitude_polynomial"}]
 _LOG = {"kind": "amplitude_polynomial", "variable": "log_amplitude", "degree": 5}
 _NORMALISED = {"kind": "amplitude_polynomial", "variable": "normalised_amplitude"}
 
@@ -38,9 +38,7 @@ STATES: dict[str, dict[str, Any]] = {
     "log amplitude": {"terms": [_LOG]},
     "normalised amplitude": {"terms": [*_DISTANCE, _NORMALISED]},
     "saturation": {"terms": _DISTANCE, "saturation_amplitude": 500.0},
-    "saturation in range": {
-        "terms": [{"kind": "amplitude_polynomial"}], "saturation_amplitude": 700.0
-    },
+    "saturation in range": {"terms": _AMPLITUDE, "saturation_amplitude": 700.0},
     "network": {"terms": _DISTANCE, "residual": network()},
     "network of distance": {
         "terms": _DISTANCE, "domain": _NO_AMPLITUDE, "residual": network(_NO_AMPLITUDE)

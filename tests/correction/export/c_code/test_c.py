@@ -140,9 +140,8 @@ def test_forty_two_frames_of_a_whole_sensor_are_corrected_as_by_the_model(
     camera = cameras.camera(size, (500.0, 500.0), (322.0, 239.5), *lens)
     domain = replace(base.domain, height=480, width=645)
     pattern = torch.randn(480, 645, generator=torch.Generator().manual_seed(1)).double()
-    state = base.model_copy(
-        update={"camera": camera, "domain": domain, "fixed_pattern": 0.01 * pattern}
-    )
+    whole = {"camera": camera, "domain": domain, "fixed_pattern": 0.01 * pattern}
+    state = base.model_copy(update=whole)
     write("c", state, tmp_path / "camera.c")
     _require_same(load_c(tmp_path / "camera.c", ["-O3"]), state, hard_frames(state, 42, seed=17))
 
