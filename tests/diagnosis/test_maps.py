@@ -31,8 +31,7 @@ def test_a_map_holds_a_smooth_pattern_whatever_its_size(nothing_study: Study, si
 def test_the_values_of_a_map_do_not_depend_on_what_neighbours_share(nothing_study: Study) -> None:
     study = _with_ring(nothing_study, 0.005)
     residual = study.residual_of((), gls=True)
-    sums = replace(study.sums, dispersion=40.0)
-    other = replace(study, sums=sums)
+    other = replace(study, sums=replace(study.sums, dispersion=40.0))
     effect = study.candidates.maps["fixed_pattern"]
     one, two = (FittedMap(each, effect, residual).values for each in (study, other))
     # The poses' offsets are a little less certain.

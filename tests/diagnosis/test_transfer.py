@@ -23,13 +23,12 @@ from tofcorr.observables.compare import Observables
 def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetre(
     nothing_study: Study, nothing_named: NamedEffects
 ) -> None:
-    named = nothing_named
     generator = Generator().manual_seed(1)
     resamples = resamples_of(nothing_study, 2)
-    found = Evidence(study=nothing_study, named=named)
+    found = Evidence(study=nothing_study, named=nothing_named)
     transfer = present(measure_transfer(found, generator, resamples))
     # Without an effect both simulators are one, and so are the corrections: also their noise.
-    assert named.names == ()
+    assert nothing_named.names == ()
     assert transfer.gain.interval == (0.0, 0.0)
     assert transfer.trained_on_sim_with_effects == transfer.trained_on_sim < 5e-4
     assert transfer.trained_on_real < 5e-4

@@ -31,9 +31,8 @@ def test_a_saved_model_measures_what_it_did(tmp_path: Path) -> None:
         title="A camera\nof tests.",
         measured_from=["Twelve images."],
     )
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.002 * torch.rand(parameter.shape, dtype=torch.float64))
+    for parameter in model.parameters():
+        parameter.data.add_(0.002 * torch.rand(parameter.shape, dtype=torch.float64))
     model.save(tmp_path / "sensor.yaml")
     again = SensorModel.load(tmp_path / "sensor.yaml", torch.float64)
     depth, amplitude, _ = plane_scene()

@@ -19,7 +19,7 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.geometry.camera import FrameNames
 
 NAMES = FrameNames(world="base_link", tool="tool0", camera="tof_optical_frame")
-EYE_TO_HAND = replace(NAMES, world="tool0", tool="base_link", eye_to_hand=True)
+EYE_TO_HAND = NAMES.model_copy(update={"world": "tool0", "tool": "base_link", "eye_to_hand": True})
 ACCURACY = HandEyeAccuracy(
     translation_se_mm=(0.12, 0.15, 0.34), rotation_se_deg=(0.011, 0.012, 0.023)
 )
