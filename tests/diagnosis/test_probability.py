@@ -84,8 +84,7 @@ def _models(gains: dict[Model, float], *, scatter: float = 0.0, odds: float = 0.
         models=tuple(gains),
         densities=torch.stack(densities),
         sizes=tuple({} for _ in gains),
-        price=-math.log(odds),
-        probes=frozenset({"any_time"}),
+        prices={name: -math.log(odds) for model in gains for name in model},
     )
 
 
