@@ -4,7 +4,6 @@
 each of its effects stands with all those that may be there in its place.
 """
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -74,7 +73,7 @@ class NamedEffects:
     @property
     def unknown(self) -> float:
         """The probability that something is missing that is in no catalogue."""
-        return self.probability_of_any(*self.models.probes)
+        return self.probability_of_any(*(self.probabilities.keys() - CATALOGUE.keys()))
 
     @property
     def ranking(self) -> list[str]:
@@ -123,13 +122,11 @@ def name_effects(study: Study) -> NamedEffects:
         study: The recording.
     """
     options, tests, evidence = study.options, study.options.tests, Evidence(study)
-    prices = _prices(study, tests.odds)
-    half = {name: price / 2 for name, price in prices.items()}
-    model = tuple(Search(evidence, half, tests.most_effects, width=1).best())
+    model = tuple(Search(evidence, tests.odds**0.5, tests.most_effects, width=1).best())
     if model:
         study = _beside(study, model, evidence)
         evidence = Evidence(study, [name for name in model if name in study.sums.layout.effects])
-    models = Search(evidence, prices, tests.most_effects).models()
+    models = Search(evidence, tests.odds, tests.most_effects).models()
     generator = torch.Generator().manual_seed(options.seed + 4)
     shape = options.bootstraps, study.sums.num_units
     weights = torch.empty(shape).exponential_(generator=generator).double()
@@ -141,7 +138,7 @@ def name_effects(study: Study) -> NamedEffects:
         sets={},
         models=models,
         probability=models.posterior(weights, generator).mean(1),
-        probes=tuple(name for name in models.best()[0] if name in models.probes),
+        probes=tuple(name for name in models.best()[0] if name not in CATALOGUE),
         closed={
             name: base - evidence.left_out_squares((name,))
             for name in (*study.candidates.effects, *evidence.maps)
@@ -150,17 +147,6 @@ def name_effects(study: Study) -> NamedEffects:
         tested=shape[1] >= tests.least_images,
     )
     return _with_names(found, evidence)
-
-
-def _prices(study: Study, odds: float) -> dict[str, float]:
-    """Return minus the logarithm of the prior odds of each effect, map and probe.
-
-    What is in no catalogue is as probable as all of the catalogue together: probes share its odds.
-    """
-    known = [*study.candidates.effects, *study.candidates.maps]
-    probes = [*study.candidates.probes]
-    of_probe = odds * len(known) / max(len(probes), 1)
-    return dict.fromkeys(known, -math.log(odds)) | dict.fromkeys(probes, -math.log(of_probe))
 
 
 def _with_names(found: NamedEffects, evidence: Evidence) -> NamedEffects:

@@ -23,11 +23,10 @@ Four things keep its sum from being trusted as it stands, and each is a term of 
   explain up to e^2 z^2 s_k g_k more of what there is: at most as much as the best model n does.
   The form of k explains only what resembles it: s_k is the share that k takes away of what an
   effect l adds, the least of those l that the best model of all poses has and m has not.
-- Few effects are there. Each has the prior odds o_k = o. What is in no catalogue is as probable
-  beforehand as all of the catalogue: its K effects lend the P probes the odds K o / P each.
+- Few effects are there. Each has the prior odds o.
 
-.. math:: p(m) = \Big\langle \operatorname{softmax}_m \Big[ \textstyle\sum_{k \in m} \log o_k
-    + \min\big(D_m + \tfrac1T \sum_k e_k^2 z_k^2 s_{mk} g_{mk},\; D_n\big) \Big]
+.. math:: p(m) = \Big\langle \operatorname{softmax}_m \Big[ |m| \log o
+    + \min\big(D_m + \tfrac1T \textstyle\sum_k e_k^2 z_k^2 s_{mk} g_{mk},\; D_n\big) \Big]
     \Big\rangle_{w, z}, \qquad D_m = \tfrac1T \textstyle\sum_u w_u \ell_{mu} .
 
 The prior standard deviation of an effect is a size a in metres, as a root mean square over all
@@ -274,23 +273,18 @@ class Models:
         densities: Log predictive densities over that of the base model, over the temperature,
             shape (N, U).
         sizes: The prior size of each effect of each model.
-        prices: Minus the logarithm of the prior odds of each effect, map and probe.
+        price: Minus the logarithm of the prior odds of an effect.
     """
 
     models: tuple[Model, ...]
     densities: Tensor
     sizes: tuple[Mapping[str, float], ...]
-    prices: Mapping[str, float]
-
-    @property
-    def probes(self) -> frozenset[str]:
-        """The names of what is in no catalogue."""
-        return frozenset(self.prices.keys() - CATALOGUE.keys())
+    price: float
 
     @property
     def effects(self) -> list[Model]:
-        """Each model without its probes."""
-        return [tuple(n for n in model if n not in self.probes) for model in self.models]
+        """Each model without its probes, which no catalogue has."""
+        return [tuple(name for name in model if name in CATALOGUE) for model in self.models]
 
     @property
     def total(self) -> Tensor:
@@ -299,7 +293,7 @@ class Models:
 
     @property
     def _prices(self) -> Tensor:
-        return torch.tensor([sum(map(self.prices.__getitem__, model)) for model in self.models])
+        return self.price * torch.tensor([len(model) for model in self.models])
 
     def best(self) -> tuple[Model, Mapping[str, float]]:
         """Return the model of the highest posterior, before poses and forms are drawn."""
@@ -352,15 +346,14 @@ class Search:
 
     Args:
         evidence: Of the recording.
-        prices: Minus the logarithm of the prior odds of each effect, map and probe.
+        odds: Prior odds of an effect.
         most: How many effects a model may have.
         width: How many of the best models of one size are enlarged.
     """
 
-    def __init__(
-        self, evidence: Evidence, prices: Mapping[str, float], most: int, width: int = 5
-    ) -> None:
-        self._evidence, self._prices, self._most, self._width = evidence, prices, most, width
+    def __init__(self, evidence: Evidence, odds: float, most: int, width: int = 5) -> None:
+        self._evidence, self._most, self._width = evidence, most, width
+        self._price = -math.log(odds)
         self._tried: dict[Model, tuple[float, dict[str, float], Tensor]] = {}
         self._enlarged: set[Model] = set()
         for of_map in ("", *evidence.maps):
@@ -387,13 +380,13 @@ class Search:
             models=tuple(self._tried),
             densities=(densities - self._base) / evidence.temperature(best),
             sizes=tuple(sizes for _, sizes, _ in self._tried.values()),
-            prices=self._prices,
+            price=self._price,
         )
 
     def _grow(self, start: dict[str, float]) -> None:
         """Add effects to a model of none, or of one map."""
         beam, top = [start], self._keep(start)
-        if top < -2 * max(self._prices.values()):  # A map that predicts worse than none.
+        if top < -2 * self._price:  # A map that predicts worse than none.
             return
         for count in range(1, self._most + 1):
             for sizes in beam:
@@ -429,7 +422,7 @@ class Search:
         if not sizes:
             self._base = density
         model = tuple(sorted(sizes))
-        level = float((density - self._base).sum()) - sum(map(self._prices.__getitem__, model))
+        level = float((density - self._base).sum()) - self._price * len(model)
         if model not in self._tried or level > self._tried[model][0]:
             self._tried[model] = level, sizes, density
         return self._tried[model][0]
