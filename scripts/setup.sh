@@ -2,7 +2,7 @@
 # Makes .venv with the pinned dependencies, once; later calls return at once. Sourced by the others.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-wanted=$(cat scripts/requirements.txt pyproject.toml | sha256sum | cut -d' ' -f1)
+wanted=$(cat scripts/requirements.txt scripts/requirements.in pyproject.toml | sha256sum | cut -d' ' -f1)
 if [ "$(cat .venv/.installed 2>/dev/null || true)" != "$wanted" ]; then
   python=$(command -v python3.11 || command -v python3)
   "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
@@ -14,10 +14,12 @@ if [ "$(cat .venv/.installed 2>/dev/null || true)" != "$wanted" ]; then
   export PIP_DISABLE_PIP_VERSION_CHECK=1
   # Most files are never imported; the others are compiled when they are. Half of the time is saved.
   install=(.venv/bin/python -m pip install --quiet --no-compile)
-  # torch first and alone: anything that asks for a bare torch would bring several GB of CUDA.
-  "${install[@]}" "$(grep '^torch==' scripts/requirements.txt)" --constraint scripts/requirements.txt
-  # Pinned to the last one (tests/package/test_metadata.py): there is nothing to resolve.
-  "${install[@]}" --no-deps -r scripts/requirements.txt
+  # Pinned to the last one (tests/package/test_metadata.py): there is nothing to resolve, and nothing
+  # asks for a bare torch, which would bring several GB of CUDA. Another content than that which was
+  # pinned is refused.
+  "${install[@]}" --no-deps --require-hashes -r scripts/requirements.txt
+  # Its build for the processor alone has another hash in every index.
+  "${install[@]}" "$(grep '^torch==' scripts/requirements.in)"
   "${install[@]}" --no-deps --no-build-isolation --editable .
   echo "$wanted" > .venv/.installed
 fi

@@ -17,6 +17,6 @@ def resamples_of(study: Study, seed: int = 1) -> torch.Tensor:
 def unnamed(study: Study) -> NamedEffects:
     """Return the model of a study in which nothing is missing."""
     nothing = torch.zeros(1, study.sums.num_units, dtype=torch.float64)
-    models = Models(models=((),), densities=nothing, sizes=({},), price=7.0, probes=frozenset())
+    models = Models(models=((),), densities=nothing, sizes=({},), price=7.0)
     sure = torch.ones(1, dtype=torch.float64)
     return NamedEffects(study=study, names=(), sets={}, models=models, probability=sure)

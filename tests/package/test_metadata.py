@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -74,11 +75,18 @@ BY_HAND = [*map(Requirement, (*EXTRAS["renewed"], *EXTRAS["fuzz"]))]
 
 def pinned() -> dict[str, str]:
     """Return the versions that the scripts install, by the packages' names."""
-    lines = (ROOT / "scripts" / "requirements.txt").read_text("utf-8").splitlines()
+    lines = (ROOT / "scripts" / "requirements.in").read_text("utf-8").splitlines()
     return {
         canonicalize_name(one.name): next(iter(one.specifier)).version
         for one in map(Requirement, (line for line in lines if line and line[0] != "#"))
     }
+
+
+def test_all_that_is_pinned_has_a_hash_but_torch() -> None:
+    text = (ROOT / "scripts" / "requirements.txt").read_text("utf-8")
+    entries = re.findall(r"^(\S+)==(\S+)((?:.*\\\n)+ +--hash=sha256:\w+)$", text, re.MULTILINE)
+    hashed = {canonicalize_name(name): version.rstrip(";") for name, version, _ in entries}
+    assert hashed == {name: version for name, version in pinned().items() if name != "torch"}
 
 
 @pytest.mark.parametrize(

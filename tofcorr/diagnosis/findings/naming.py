@@ -73,7 +73,7 @@ class NamedEffects:
     @property
     def unknown(self) -> float:
         """The probability that something is missing that is in no catalogue."""
-        return self.probability_of_any(*self.models.probes)
+        return self.probability_of_any(*(self.probabilities.keys() - CATALOGUE.keys()))
 
     @property
     def ranking(self) -> list[str]:
@@ -121,13 +121,12 @@ def name_effects(study: Study) -> NamedEffects:
     Args:
         study: The recording.
     """
-    options, tests, probes = study.options, study.options.tests, study.candidates.probes
-    evidence = Evidence(study)
+    options, tests, evidence = study.options, study.options.tests, Evidence(study)
     model = tuple(Search(evidence, tests.odds**0.5, tests.most_effects, width=1).best())
     if model:
         study = _beside(study, model, evidence)
         evidence = Evidence(study, [name for name in model if name in study.sums.layout.effects])
-    models = Search(evidence, tests.odds, tests.most_effects).models(probes)
+    models = Search(evidence, tests.odds, tests.most_effects).models()
     generator = torch.Generator().manual_seed(options.seed + 4)
     shape = options.bootstraps, study.sums.num_units
     weights = torch.empty(shape).exponential_(generator=generator).double()
@@ -139,7 +138,7 @@ def name_effects(study: Study) -> NamedEffects:
         sets={},
         models=models,
         probability=models.posterior(weights, generator).mean(1),
-        probes=tuple(name for name in models.best()[0] if name in probes),
+        probes=tuple(name for name in models.best()[0] if name not in CATALOGUE),
         closed={
             name: base - evidence.left_out_squares((name,))
             for name in (*study.candidates.effects, *evidence.maps)

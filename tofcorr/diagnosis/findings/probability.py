@@ -274,19 +274,17 @@ class Models:
             shape (N, U).
         sizes: The prior size of each effect of each model.
         price: Minus the logarithm of the prior odds of an effect.
-        probes: Names of what is in no catalogue.
     """
 
     models: tuple[Model, ...]
     densities: Tensor
     sizes: tuple[Mapping[str, float], ...]
     price: float
-    probes: frozenset[str]
 
     @property
     def effects(self) -> list[Model]:
-        """Each model without its probes."""
-        return [tuple(n for n in model if n not in self.probes) for model in self.models]
+        """Each model without its probes, which no catalogue has."""
+        return [tuple(name for name in model if name in CATALOGUE) for model in self.models]
 
     @property
     def total(self) -> Tensor:
@@ -365,14 +363,11 @@ class Search:
         """Return the sizes of the effects of the most probable model."""
         return max(self._tried.values(), key=lambda one: one[0])[1]
 
-    def models(self, probes: Iterable[str]) -> Models:
+    def models(self) -> Models:
         """Return all models tried, and their densities at the temperature of the best.
 
         Before, every effect of the best model is replaced by every other, so that each that may be
         there in its place is judged.
-
-        Args:
-            probes: Names of what is in no catalogue.
         """
         evidence, best = self._evidence, self.best()
         for name in best:
@@ -386,7 +381,6 @@ class Search:
             densities=(densities - self._base) / evidence.temperature(best),
             sizes=tuple(sizes for _, sizes, _ in self._tried.values()),
             price=self._price,
-            probes=frozenset(probes),
         )
 
     def _grow(self, start: dict[str, float]) -> None:
