@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, ValidationError
 
-from tofcorr.errors import ConfigError, TofcorrError
+from tofcorr.errors import ConfigError, Kind
 from tofcorr.files import open_regular
 
 LARGEST_NUMBER = 1e12
@@ -67,9 +67,7 @@ class Options(BaseModel):
     config_folder: ClassVar[str] = ""
 
     @classmethod
-    def from_mapping(
-        cls, values: Mapping[str, Any], where: str, kind: type[TofcorrError] = ConfigError
-    ) -> Self:
+    def from_mapping(cls, values: Mapping[str, Any], where: str, kind: Kind = ConfigError) -> Self:
         """Check `values` and build the options.
 
         Args:
@@ -108,9 +106,7 @@ def one_line(text: str, longest: int = _LONGEST) -> str:
 
 
 @contextmanager
-def refused_in_words(
-    cls: type[BaseModel], where: str, kind: type[TofcorrError] = ConfigError
-) -> Iterator[None]:
+def refused_in_words(cls: type[BaseModel], where: str, kind: Kind = ConfigError) -> Iterator[None]:
     """Refuse, in words, values that do not fit a class.
 
     Args:
@@ -186,7 +182,7 @@ _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _NOT_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
 
 
-def read_mapping(path: Path, kind: type[TofcorrError] = ConfigError) -> Mapping[str, Any]:
+def read_mapping(path: Path, kind: Kind = ConfigError) -> Mapping[str, Any]:
     """Read the keys and values of one YAML file.
 
     Raises:
@@ -198,9 +194,7 @@ def read_mapping(path: Path, kind: type[TofcorrError] = ConfigError) -> Mapping[
     return values
 
 
-def read_text(
-    path: Path, kind: type[TofcorrError] = ConfigError, most_bytes: int = _MOST_BYTES
-) -> str:
+def read_text(path: Path, kind: Kind = ConfigError, most_bytes: int = _MOST_BYTES) -> str:
     """Return the text of a file of bounded size.
 
     Raises:
@@ -217,7 +211,7 @@ def read_text(
         raise kind(f"{path}: cannot be read as text ({error}).") from None
 
 
-def parse_yaml(text: str, where: str, kind: type[TofcorrError] = ConfigError) -> Any:  # noqa: ANN401
+def parse_yaml(text: str, where: str, kind: Kind = ConfigError) -> Any:  # noqa: ANN401
     """Return the value of YAML text.
 
     Args:
