@@ -5,11 +5,17 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
 from tofcorr.geometry.camera import CameraIntrinsics
+
+Rays = Float[Tensor, "H W 3"]
+"""Unit viewing rays of all pixels of an image."""
+Images = Float[Tensor, "B H W"]
+Chosen = Bool[Tensor, "B H W"]
+"""Which pixels of images."""
 
 # Fixed-point iterations of the inverse distortion. Each reduces the error by a factor of about the
 # relative distortion at the image border: with most lenses the rounding of float64 is left.
@@ -182,7 +188,7 @@ def planes_through(
 
 
 def ray_plane_distance(
-    ray_directions: Float[Tensor, "H W 3"],
+    ray_directions: Rays,
     normal: Float[Tensor, "*batch 3"],
     offset: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch H W"]:

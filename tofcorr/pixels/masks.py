@@ -3,12 +3,12 @@
 import math
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.estimation.robust import deviation, fit_plane, largest_plane
-from tofcorr.geometry.rays import plane_in_frame, ray_plane_distance
+from tofcorr.geometry.rays import Chosen, Images, Rays, plane_in_frame, ray_plane_distance
 
 
 def some_pixels(used: Int[Tensor, "M"], most: int, seed: int) -> Int[Tensor, "S"]:
@@ -20,7 +20,7 @@ def some_pixels(used: Int[Tensor, "M"], most: int, seed: int) -> Int[Tensor, "S"
 
 
 def image_planes(
-    batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"], enough: int | None = 4096
+    batch: FrameBatch, ray_directions: Rays, enough: int | None = 4096
 ) -> Float[Tensor, "B 3"]:
     """Return g of the plane g . x = 1 of each image, fitted robustly in the camera frame.
 
@@ -40,9 +40,7 @@ def image_planes(
     return fit_plane(rays[some], batch.radial_distance.flatten(1)[:, seen][:, some], valid[:, some])
 
 
-def off_the_wall(
-    batch: FrameBatch, rays: Float[Tensor, "H W 3"], gross: float = 15.0, least: float = 0.05
-) -> Bool[Tensor, "B H W"]:
+def off_the_wall(batch: FrameBatch, rays: Rays, gross: float = 15.0, least: float = 0.05) -> Chosen:
     """Return which pixels are far off the plane of most of their image.
 
     Args:
@@ -58,9 +56,7 @@ def off_the_wall(
     return ~(off <= limit).view(batch.valid.shape)
 
 
-def off_largest_plane(
-    batch: FrameBatch, rays: Float[Tensor, "H W 3"], tolerance: float
-) -> Bool[Tensor, "B H W"]:
+def off_largest_plane(batch: FrameBatch, rays: Rays, tolerance: float) -> Chosen:
     """Return which pixels are off the largest plane of their image.
 
     The same image always gives the same result: the frame's number seeds the search.
@@ -82,7 +78,7 @@ def off_largest_plane(
     return off.view(batch.valid.shape)
 
 
-def edges(batch: FrameBatch, contrast: float) -> Bool[Tensor, "B H W"]:
+def edges(batch: FrameBatch, contrast: float) -> Chosen:
     """Return which pixels are next to an edge of reflectivity: they mix light of two surfaces.
 
     Args:
@@ -99,9 +95,7 @@ def edges(batch: FrameBatch, contrast: float) -> Bool[Tensor, "B H W"]:
     return brightest > contrast * darkest
 
 
-def grazing(
-    batch: FrameBatch, limit_deg: float, rays: Float[Tensor, "H W 3"]
-) -> Bool[Tensor, "B H W"]:
+def grazing(batch: FrameBatch, limit_deg: float, rays: Rays) -> Chosen:
     """Return which pixels see the wall too obliquely, where multipath is large.
 
     The wall's direction is fitted to the measured points; no hand-eye transform is needed.
@@ -116,9 +110,7 @@ def grazing(
     return cosine < math.cos(math.radians(limit_deg))
 
 
-def raw_errors(
-    batch: FrameBatch, rays: Float[Tensor, "H W 3"], tool_from_camera: Float[Tensor, "4 4"]
-) -> Float[Tensor, "B H W"]:
+def raw_errors(batch: FrameBatch, rays: Rays, tool_from_camera: Float[Tensor, "4 4"]) -> Images:
     """Return measured less true distances along the rays, metres; NaN where a ray meets no plane.
 
     Args:

@@ -16,6 +16,7 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
+from tofcorr.geometry.rays import Images, Rays
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset, Frames, recorded_hand_eye
 from tofcorr.pixels.masks import edges, grazing, off_largest_plane, off_the_wall, raw_errors
@@ -109,8 +110,8 @@ def draw_pixels(dataset: Dataset, frames: Frames, number: int, seed: int) -> Fra
 
 
 def distance_to_plane(
-    model: CalibrationModel, batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]
-) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+    model: CalibrationModel, batch: FrameBatch, ray_directions: Rays
+) -> tuple[Images, Images]:
     """Return the signed distance of every corrected point to its plane, and the cosine of its ray.
 
     Pixels that are not valid are read as 1 m and amplitude 1, so that no NaN reaches the model.
@@ -197,7 +198,7 @@ def thinned(values: np.ndarray, most: int) -> np.ndarray:
 
 def errors_along_ray(
     dataset: Dataset, model: CalibrationModel, batch: FrameBatch
-) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+) -> tuple[Images, Images]:
     """Return measured minus true distance in mm (B, H, W), NaN where not valid, and cosines."""
     rays = dataset.ray_directions().to(batch.radial_distance)
     residual, cosine = distance_to_plane(model, batch, rays)
