@@ -132,16 +132,6 @@ AGREEMENT = 1e-6
 1e-7 m at one metre."""
 
 
-def refuse_other_than_tensor(name: str, frame: object) -> None:
-    """Refuse a frame that is no tensor, by the name that its caller knows.
-
-    Raises:
-        FrameError: It is something else; the message says how to make a tensor of it.
-    """
-    if not isinstance(frame, Tensor):
-        raise FrameError(f"{name}: expected a torch tensor, got {type(frame).__name__}.")
-
-
 class CameraGeometry(nn.Module):
     """Image size, pinhole matrix, distortion and rays of a camera, and what its depth means.
 
@@ -156,6 +146,7 @@ class CameraGeometry(nn.Module):
         radial_of_depth: Radial distance over depth, shape (H, W): 1 for radial depth.
     """
 
+    advice = "Was the frame cropped, binned or transposed?"
     matrix: Tensor
     distortion: Tensor
     ray_directions: Tensor
@@ -185,24 +176,30 @@ class CameraGeometry(nn.Module):
         rays = self.ray_directions * self.radial_of_depth[..., None]
         return depth[..., None] * rays.to(depth.dtype)
 
-    def check(self, depth: Tensor, amplitude: Tensor | None) -> None:
-        """Refuse tensors that are not frames of the camera.
+    def check(self, **frames: Tensor | None) -> None:
+        """Refuse tensors that are not frames of the camera, by the names that their caller knows.
+
+        Args:
+            **frames: The depth, then images of its shape; None: there is none.
 
         Raises:
-            FrameError: Shape or dtype are not those of the camera's frames.
+            FrameError: It is no tensor, or shape or dtype are not those of the camera's frames.
         """
-        given = {"depth": depth} if amplitude is None else {"depth": depth, "amplitude": amplitude}
+        height, width = self.radial_of_depth.shape
+        given = {name: frame for name, frame in frames.items() if frame is not None}
+        (first, depth), *_ = given.items()
         for name, frame in given.items():
-            refuse_other_than_tensor(name, frame)
+            if not isinstance(frame, Tensor):
+                got = type(frame).__name__
+                raise FrameError(f"{name}: expected a torch tensor, got {got}.")
             if not frame.dtype.is_floating_point:
                 raise FrameError(f"{name}: expected floating-point metres, got {frame.dtype}.")
-        size = list(self.radial_of_depth.shape)
-        if depth.dim() < 2 or list(depth.shape[-2:]) != size:
-            got = f"got {list(depth.shape)}. Was the frame cropped, binned or transposed?"
-            raise FrameError(f"depth: expected shape (..., {size[0]}, {size[1]}); {got}")
-        if amplitude is not None and amplitude.shape != depth.shape:
-            shapes = f"expected depth's shape {[*depth.shape]}, got {[*amplitude.shape]}"
-            raise FrameError(f"amplitude: {shapes}.")
+            if frame.shape != depth.shape:
+                shapes = f"expected {first}'s shape {[*depth.shape]}, got {[*frame.shape]}"
+                raise FrameError(f"{name}: {shapes}.")
+        if depth.dim() < 2 or list(depth.shape[-2:]) != [height, width]:
+            got = f"got {[*depth.shape]}. {self.advice}"
+            raise FrameError(f"{first}: expected shape (..., {height}, {width}); {got}")
 
 
 class CalibratedRanges(nn.Module):
@@ -388,7 +385,7 @@ class FrameCorrection(DescribedModule):
             distance and amplitude as measured; both clamped to their calibrated ranges. Without
             need for amplitudes these are the radial distances.
         """
-        self.geometry.check(depth, amplitude)
+        self.geometry.check(depth=depth, amplitude=amplitude)
         ranges, dtype = self.ranges, self.error_model.constant.dtype
         depth = depth.to(dtype)
         seen = torch.isfinite(depth) & (depth > 0)

@@ -285,7 +285,7 @@ class SensorModel(DescribedModule):
         if values["noise"] is not None:
             for name in ("floor_m", "shot_m", "read_m"):
                 del values["noise"][name]
-        return {"dtype": str(self.eye.rays.dtype), **values}
+        return {"dtype": str(self.eye.ray_directions.dtype), **values}
 
     def forward(
         self,
@@ -319,7 +319,9 @@ class SensorModel(DescribedModule):
             FrameError: The frames are of another size or dtype, or an amplitude is needed and
                 nothing says it.
         """
-        known = conditions_of(conditions, true_depth.shape[:-2], self.eye.rays.device, self._ranges)
+        known = conditions_of(
+            conditions, true_depth.shape[:-2], self.eye.ray_directions.device, self._ranges
+        )
         parts = (self.base, self.effects, self.noise, self.dropouts)
         needed = any(part.needs_amplitude for part in parts if part is not None)
         frames = self.eye(true_depth, amplitude, reflectivity, known, needs_amplitude=needed)
@@ -366,8 +368,8 @@ class SensorModel(DescribedModule):
 
         For a recording in parts: frames of later parts depend on those before.
         """
-        known = conditions_of(conditions, (count,), self.eye.rays.device, self._ranges)
-        return self.effects.frame_shift(known, count, self.eye.rays)
+        known = conditions_of(conditions, (count,), self.eye.ray_directions.device, self._ranges)
+        return self.effects.frame_shift(known, count, self.eye.ray_directions)
 
     def _expected(self, frames: SceneFrames, of_frame: Tensor | None) -> Tensor:
         """Return the expected distance along the ray, shape (B, H, W), metres."""
@@ -379,7 +381,9 @@ class SensorModel(DescribedModule):
         conditions = with_means(known, self.base.mean_conditions)
         error = self.base(at.distance, frames.amplitude, conditions)
         if of_frame is None:
-            of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays)
+            of_frame = self.effects.frame_shift(
+                known, len(frames.distance), self.eye.ray_directions
+            )
         error = error + of_frame.to(error.dtype).reshape(-1, 1, 1)
         error = error + self.effects.shift(Group.DELAY, at)
         at = replace(at, distance=at.distance + error) if one_by_one else frames
