@@ -6,14 +6,22 @@ configuration: a shipped name, a file, a mapping or options that exist already.
 
 import os
 import reprlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PositiveInt,
+    ValidationError,
+)
 
 from tofcorr.errors import ConfigError, Kind
 from tofcorr.files import open_regular
@@ -27,6 +35,9 @@ of `LARGEST_NUMBER`: nothing that is divided by it overflows."""
 LARGEST_DEGREE = 30
 """Highest power of a polynomial (no unit). Chosen: scaled powers above it differ by less than
 noise, and a degree of a million fills the memory."""
+STRAY = 0.001
+"""Share of values that may lie beyond either end of their range (no unit). Chosen: gross errors are
+rarer, and a few pixels must not widen the range in which a correction is valid."""
 LARGEST_SIDE = 1_000_000
 """Largest width or height of an image, pixels. Set by hand: more than any image sensor has."""
 
@@ -37,6 +48,17 @@ def not_a_truth_value(value: object) -> object:
         # pydantic reports a ValueError; a TypeError would pass through it.
         raise ValueError("expected a number, not true or false")  # noqa: TRY004
     return value
+
+
+def among(names: Collection[str], what: str) -> AfterValidator:
+    """Return the check that a text is one of some names; `what` says what they are."""
+
+    def check(name: str) -> str:
+        if name not in names:
+            raise ValueError(f"'{name}' is no {what}; known: {', '.join(names)}")
+        return name
+
+    return AfterValidator(check)
 
 
 # Text is passed on to the number parser: YAML 1.1 reads 20.0e6 (no sign) as text.
@@ -84,6 +106,12 @@ class Options(BaseModel):
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, ready for YAML or JSON."""
         return self.model_dump(mode="json")
+
+
+class OpenOptions(Options):
+    """Base of what is read of a file to which other tools add keys: these are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
 
 
 OptionsT = TypeVar("OptionsT", bound=Options)

@@ -57,7 +57,7 @@ def with_walls_found(recording: Recording) -> Recording:
     ids = image if table.pose_id is None else table.pose_id[image]
     # An importer knows no conditions of a frame: they are those of its image.
     known = replace(found, modulation_frequency=recording.modulation_frequency)
-    with RecordingWriter.with_header_of(out, known) as writer:
+    with RecordingWriter.like(out, known, rows=False) as writer:
         for frame, number in enumerate(image):
             plane = found.frames.row(frame)
             seen = {"offset": plane.offset, "target": plane.target, "pose_id": str(ids[frame])}

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial, partialmethod
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -232,30 +232,12 @@ class DiagnosisResult:
 
         return all_figures(self)
 
-    def _draw(self, name: str) -> "Figure":
+    def plot(self, name: str) -> "Figure":
+        """Return one figure, by its name in `tofcorr.diagnosis.report.figures.FIGURES`."""
         # With it comes matplotlib, which takes half as long to import as torch.
         from tofcorr.diagnosis.report.figures import FIGURES
 
         return FIGURES[name](self)
-
-    plot_gap = partialmethod(_draw, "stages")
-    """Draw the gap at each stage, with intervals."""
-    plot_attribution = partialmethod(_draw, "attribution")
-    """Draw the share of each cause in the squared gap, with intervals."""
-    plot_where_as_given = partialmethod(_draw, "where_as_given")
-    """Draw the bias of the simulator as given; of the fitted one without a simulator."""
-    plot_where = partialmethod(_draw, "where")
-    """Draw the bias after recalibration, and with the effects, along covariates."""
-    plot_image = partialmethod(_draw, "map")
-    """Draw the mean residual over the image at each stage."""
-    plot_pose_series = partialmethod(_draw, "series")
-    """Draw the mean residual of each pose in the order of the recording."""
-    plot_effects = partialmethod(_draw, "which")
-    """Draw what each effect closes, with intervals, and its score."""
-    plot_absorption = partialmethod(_draw, "aliases")
-    """Draw the share of each effect that calibration and other effects absorb."""
-    plot_poses = partialmethod(_draw, "poses")
-    """Draw the held-out error of each pose before and after the effects."""
 
 
 def _ranked(study: Study, named: NamedEffects, name: str) -> dict[str, Any]:

@@ -553,9 +553,9 @@ def _parameters(
     for own in fit.coefficients + given + thetas[:, model.num_geometry : model.num_columns]:
         error.set_coefficient_vector(own)
         drawn.append(error.paper_coefficients())
-    for group, units in error.paper_units().items():
+    for group, units in error.paper_values().items():
         for name in drawn[0].get(group, ()):
-            yield group, "parameter", name, units[name], [one[group][name] for one in drawn]
+            yield group, "parameter", name, units[name][1], [one[group][name] for one in drawn]
     start = found.named.study.sums.layout.base
     for effect in found.effects:
         if isinstance(effect, MapEffect):

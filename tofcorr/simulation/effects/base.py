@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from tofcorr.conditions import condition
-from tofcorr.data.recording import CHUNK_PIXELS, OUTSIDE
+from tofcorr.data.recording import CHUNK_PIXELS
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import (
     phase_from_radial_distance,
@@ -27,7 +27,7 @@ from tofcorr.geometry.rays import (
     unambiguous_range,
 )
 from tofcorr.geometry.se3 import by_frame
-from tofcorr.options import FiniteNumber, Options
+from tofcorr.options import STRAY, FiniteNumber, Options
 from tofcorr.simulation.hooks import Effect, FrameFacts, FrameState
 
 # Long: every effect needs all of it, and its parts call one another.
@@ -613,7 +613,7 @@ def phase_difference(signal: Tensor, own: Tensor) -> Tensor:
     return torch.atan2(product.imag.contiguous(), product.real + (product == 0))
 
 
-def inner_range(values: Tensor, beyond: float = OUTSIDE) -> tuple[float, float]:
+def inner_range(values: Tensor, beyond: float = STRAY) -> tuple[float, float]:
     """Return the ends of what values (M,) lie between, but for a share of them at either end."""
     ordered, last = values.sort().values, len(values) - 1
     return float(ordered[int(beyond * last)]), float(ordered[int((1 - beyond) * last)])
