@@ -135,6 +135,17 @@ def writing_to(path: Path | str, kind: Kind = CalibrationDataError) -> Iterator[
         raise kind(f"{path}: cannot be written ({error.strerror or error}).") from None
 
 
+@contextmanager
+def reading(path: Path | str, kind: Kind = CalibrationDataError) -> Iterator[None]:
+    """Say in one sentence, as an error of kind `kind`, why `path` cannot be read."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise kind(f"{path}: there is no such file.") from None
+    except OSError as error:
+        raise kind(f"{path}: cannot be read ({error.strerror or error}).") from None
+
+
 def remove_begun() -> None:
     """Remove what an interruption kept from being removed.
 

@@ -24,7 +24,7 @@ from pydantic import (
 )
 
 from tofcorr.errors import ConfigError, Kind
-from tofcorr.files import open_regular
+from tofcorr.files import open_regular, reading
 
 LARGEST_NUMBER = 1e12
 """Largest number read from a file, in the file's own unit. Chosen: a hundred times the fastest
@@ -229,12 +229,8 @@ def read_text(path: Path, kind: Kind = ConfigError, most_bytes: int = _MOST_BYTE
         TofcorrError: Of kind `kind`: the file is missing, unreadable, too large or not UTF-8.
     """
     try:
-        with open_regular(path, most_bytes) as file:
+        with reading(path, kind), open_regular(path, most_bytes) as file:
             return file.read().decode("utf-8")
-    except FileNotFoundError:
-        raise kind(f"{path}: there is no such file.") from None
-    except OSError as error:
-        raise kind(f"{path}: cannot be read ({error.strerror or error}).") from None
     except UnicodeDecodeError as error:
         raise kind(f"{path}: cannot be read as text ({error}).") from None
 

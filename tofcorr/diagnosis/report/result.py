@@ -138,12 +138,8 @@ class DiagnosisResult:
             "version": 3,
             "simulator": self.simulator_kind,
             "stages": [
-                {
-                    "name": stage.name,
-                    "gap_mm": _mm(stage.gap),
-                    "ci": None if stage.gap is None else _mm(stage.gap.interval),
-                    "where": _regions(stage, 5),  # What fits beside a picture.
-                }
+                # As many places as fit beside a picture.
+                {"name": stage.name, **_sized(stage.gap), "where": _regions(stage, 5)}
                 for stage in self.stages
             ],
             "attribution": [
@@ -204,8 +200,7 @@ class DiagnosisResult:
             | {"frames": closure.frames},
             "degraded": degraded
             and {
-                "gap_mm": _mm(degraded.gap),
-                "ci": _mm(degraded.gap.interval),
+                **_sized(degraded.gap),
                 "poses": degraded.poses,
                 "left_out": list(degraded.left_out),
             },
@@ -281,6 +276,11 @@ def _mm(metres: float | tuple[float, float] | None) -> Any:  # noqa: ANN401 - as
     if isinstance(metres, tuple):
         return [_mm(end) for end in metres]
     return None if metres is None else round(metres * 1e3, 4)
+
+
+def _sized(gap: Estimated | None) -> dict[str, Any]:
+    """Return a gap and its interval, millimetres."""
+    return {"gap_mm": _mm(gap), "ci": None if gap is None else _mm(gap.interval)}
 
 
 def _rounded(shares: tuple[float, float] | list[float]) -> list[float | None]:
