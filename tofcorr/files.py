@@ -66,6 +66,12 @@ def staged_file(path: Path | str, kind: Kind = ExportError) -> Iterator[Path]:
         part.replace(target)
 
 
+def write_text(path: Path | str, text: str, kind: Kind = ExportError) -> None:
+    """Write a text, whole or not at all; an older file is replaced. It raises as `staged_file`."""
+    with staged_file(path, kind) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, values: Mapping[str, Any], kind: Kind = CalibrationDataError) -> None:
     """Write plain values as JSON, whole or not at all; an older file is replaced.
 

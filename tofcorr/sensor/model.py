@@ -16,7 +16,7 @@ from tofcorr.error_terms.condition_terms import Condition, with_means
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.noise import NoiseModel
-from tofcorr.files import staged_file
+from tofcorr.files import write_text
 from tofcorr.sensor.scene import Eye, Group, ImageEffects, SceneFrames, conditions_of
 from tofcorr.sensor.sensor_file import ErrorSection, SensorFile, read_sensor, sensor_text
 
@@ -264,8 +264,7 @@ class SensorModel(DescribedModule):
         Raises:
             ExportError: The file cannot be written.
         """
-        with staged_file(file) as part:
-            part.write_text(sensor_text(self.to_sensor_file()), encoding="utf-8")
+        write_text(file, sensor_text(self.to_sensor_file()))
 
     def to_sensor_file(self) -> SensorFile:
         """Return the content of `sensor.yaml` with the parameters of now."""

@@ -10,7 +10,7 @@ from jinja2 import Template
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.pose import Mount, decimals
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files import staged_file
+from tofcorr.files import write_text
 
 
 def export_urdf(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -44,8 +44,7 @@ def export_urdf(corrector: DepthCorrector, path: Path | str, reference: Calibrat
         xyz=" ".join(decimals(mount.translation)),
         rpy=" ".join(decimals(roll_pitch_yaw(mount.transform[:3, :3]))),
     )
-    with staged_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:
