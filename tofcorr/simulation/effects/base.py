@@ -574,7 +574,7 @@ class SignalEffect(CatalogueEffect):
         return inputs.metres_per_radian * (shares / light[:, None]).imag
 
 
-# What the equations of several effects share: derivatives, phases, ranges, polynomials, blur.
+# What the equations of several effects share: derivatives, phases, ranges, blur.
 
 
 def by_parameters(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
@@ -619,31 +619,9 @@ def inner_range(values: Tensor, beyond: float = STRAY) -> tuple[float, float]:
     return float(ordered[int(beyond * last)]), float(ordered[int((1 - beyond) * last)])
 
 
-# Legendre polynomials on [-1, 1], in one and two variables.
-
-
-def legendre(scaled: Tensor, degree: int) -> list[Tensor]:
-    """Return the Legendre polynomials P_0 ... P_degree of values (M,), each (M,)."""
-    found = [torch.ones_like(scaled), scaled]
-    for k in range(1, degree):
-        found.append(((2 * k + 1) * scaled * found[-1] - k * found[-2]) / (k + 1))
-    return found[: degree + 1]
-
-
-def products(x: Tensor, y: Tensor, low: int, high: int) -> list[Tensor]:
-    """Return P_i(x) P_j(y) for low <= i + j <= high, ordered as `exponents`, each (M,)."""
-    of_x, of_y = legendre(x, high), legendre(y, high)
-    return [of_x[i] * of_y[j] for i, j in exponents(low, high)]
-
-
 def side_by_side(columns: list[Tensor]) -> Tensor:
     """Return columns (M,) as a matrix (M, K), each of them in one piece of memory."""
     return torch.stack(columns).movedim(0, -1)
-
-
-def exponents(low: int, high: int) -> list[tuple[int, int]]:
-    """Return all (i, j) with low <= i + j <= high."""
-    return [(total - j, j) for total in range(low, high + 1) for j in range(total + 1)]
 
 
 # Half width of the kernel in standard deviations: 0.3 % of a Gaussian lies beyond 3. As many
