@@ -23,7 +23,6 @@ from tofcorr.data.recording import CHUNK_PIXELS
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import (
     phase_from_radial_distance,
-    plane_in_frame,
     unambiguous_range,
 )
 from tofcorr.geometry.se3 import by_frame
@@ -525,28 +524,22 @@ class GeometryEffect(CatalogueEffect):
         """
 
         def plane(at: Tensor) -> Tensor:
-            moved = self.moved(inputs.facts, at)
-            return torch.cat(plane_in_camera(inputs, moved), dim=1).flatten()
+            normal, height = self.moved(inputs.facts, at).planes_seen(inputs.tool_from_camera)
+            return torch.cat([normal, height[:, None]], dim=1).flatten()
 
         frame, rays = inputs.frame, inputs.rays
         by_plane = by_parameters(plane, coefficients).reshape(len(inputs.facts.offset), 4, -1)
-        normal, height = plane_in_camera(inputs, self.moved(inputs.facts, coefficients))
+        moved = self.moved(inputs.facts, coefficients)
+        normal, height = moved.planes_seen(inputs.tool_from_camera)
         along = (rays * normal[frame]).sum(-1, keepdim=True)
-        values = torch.cat([rays * (height[frame] / along**2), -1 / along], dim=1)
+        values = torch.cat([rays * (height[frame, None] / along**2), -1 / along], dim=1)
         return by_frame(values, by_plane, frame)
-
-
-def plane_in_camera(inputs: EffectInputs, facts: FrameFacts) -> tuple[Tensor, Tensor]:
-    """Return the target's normal (F, 3) and offset (F, 1) in the camera frame."""
-    pose = facts.world_from_tool @ inputs.tool_from_camera
-    normal, height = plane_in_frame(facts.normal_world, facts.offset, pose)
-    return normal, height[:, None]
 
 
 def distance_to(inputs: EffectInputs, facts: FrameFacts) -> Tensor:
     """Return how far along each ray the plane of its frame is, shape (M,), metres."""
-    normal, height = plane_in_camera(inputs, facts)
-    return -inputs.of_frame(height[:, 0]) / (inputs.rays * inputs.of_frame(normal)).sum(-1)
+    normal, height = facts.planes_seen(inputs.tool_from_camera)
+    return -inputs.of_frame(height) / (inputs.rays * inputs.of_frame(normal)).sum(-1)
 
 
 class SignalEffect(CatalogueEffect):
