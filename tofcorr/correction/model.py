@@ -21,6 +21,8 @@ from tofcorr.geometry.se3 import product, projected, transformed
 
 Transform = Tensor | np.ndarray | Sequence[Sequence[float]]
 """Four rows of four."""
+Amplitude = Tensor | None
+"""The camera's units, the shape of the depth; None where no term of the model needs it."""
 
 
 class HandEye(nn.Module):
@@ -288,7 +290,7 @@ class FrameCorrection(DescribedModule):
         self.ranges.set(domain, saturation_amplitude, error_model)
 
     def forward(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+        self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition
     ) -> Tensor:
         """Return corrected depth.
 
@@ -309,9 +311,7 @@ class FrameCorrection(DescribedModule):
         corrected = depth.to(error.dtype) - error
         return torch.where(seen, corrected, torch.nan).to(depth.dtype)
 
-    def error(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
-    ) -> Tensor:
+    def error(self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition) -> Tensor:
         """Return the predicted error, measured - true: depth - error is the corrected depth.
 
         Arguments, shape and dtype are those of `forward`.
@@ -319,9 +319,7 @@ class FrameCorrection(DescribedModule):
         error, seen = self._error(depth, amplitude, conditions)
         return torch.where(seen, error, torch.nan).to(depth.dtype)
 
-    def valid(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
-    ) -> Tensor:
+    def valid(self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition) -> Tensor:
         """Return where the correction is valid, bool, the shape of `depth`.
 
         Not valid is a pixel without a return, a saturated one, and one whose distance, amplitude
@@ -344,21 +342,19 @@ class FrameCorrection(DescribedModule):
             valid = valid & term.covers(known)[..., None, None]  # type: ignore[operator]
         return valid
 
-    def points(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
-    ) -> Tensor:
+    def points(self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition) -> Tensor:
         """Return corrected points in the camera frame, shape (..., H, W, 3), metres."""
         return self.geometry.points(self(depth, amplitude, **conditions))
 
     def points_tool(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+        self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition
     ) -> Tensor:
         """Return corrected points in the tool frame, shape (..., H, W, 3), metres."""
         points = self.points(depth, amplitude, **conditions)
         return transformed(self.hand_eye().to(points.dtype), points)
 
     def _error(
-        self, depth: Tensor, amplitude: Tensor | None, conditions: dict[str, Condition]
+        self, depth: Tensor, amplitude: Amplitude, conditions: dict[str, Condition]
     ) -> tuple[Tensor, Tensor]:
         """Return the error in the camera's kind of depth, in the module's dtype, and where seen."""
         model = self.error_model
@@ -373,7 +369,7 @@ class FrameCorrection(DescribedModule):
         return error / self.geometry.radial_of_depth, seen
 
     def _variables(
-        self, depth: Tensor, amplitude: Tensor | None
+        self, depth: Tensor, amplitude: Amplitude
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Turn frames into the variables of the error model, in the dtype of its parameters.
 
