@@ -1,7 +1,7 @@
 """The corrector as C99 source, for robots and controllers without any library.
 
-Its text stands in the templates of `c_code`. A term is written as cubic pieces over equal segments,
-which C evaluates without knowing the term.
+Its text stands in the templates beside this file. A term is written as cubic pieces over equal
+segments, which C evaluates without knowing the term.
 """
 
 import ctypes
@@ -136,7 +136,7 @@ def c_sources(state: CalibrationState, metadata: str, name: str) -> dict[str, st
         ConfigError: C cannot hold one of the terms.
     """
     environment = Environment(
-        loader=PackageLoader("tofcorr.correction.export.c_code", ""),
+        loader=PackageLoader("tofcorr.correction.export", ""),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
