@@ -119,10 +119,9 @@ def test_the_same_effect_is_named_first_as_with_measured_planes(
 
 
 def test_what_planes_absorb_needs_measured_planes_by_name(prepared: Prepared) -> None:
-    candidates = prepared.study.candidates
     for name in ("target_registration", "incidence_angle"):
-        assert candidates.missing[name] == ["measured planes"]
-        assert name not in candidates.effects
+        assert prepared.study.missing[name] == ["measured planes"]
+        assert name not in prepared.study.effects
         assert name not in prepared.study.sums.layout.effects
     (warning,) = prepared.warnings
     assert "plane of 1 wall is estimated together with the base model" in warning
@@ -163,7 +162,7 @@ def test_the_simulator_rerun_on_the_walls_found_closes_the_gap(walls: Recording)
     assert result.closure is not None
     assert result.closure.without_effects > 2e-3
     assert result.closure.with_effects < 0.6e-3
-    assert "target_registration" in result.evidence.study.candidates.missing
+    assert "target_registration" in result.evidence.study.missing
 
 
 @pytest.mark.slow

@@ -149,7 +149,7 @@ def test_an_effect_whose_column_is_missing_is_not_tested(tmp_path: Path) -> None
         tmp_path / "hidden", 44, [{"name": "room_temperature", "per_degree": 0.004}], hidden
     )
     study, named = _selected(recording, catalogue=("room_temperature", "warm_up", "ambient_light"))
-    assert study.candidates.missing["room_temperature"] == ["room_temperature_c"]
+    assert study.missing["room_temperature"] == ["room_temperature_c"]
     assert "room_temperature" not in {name for members in named.cause_sets for name in members}
 
 

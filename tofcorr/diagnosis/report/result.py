@@ -178,7 +178,7 @@ class DiagnosisResult:
             "ranking": [_ranked(self.evidence.study, named, name) for name in named.ranking]
             + [
                 {"effect": name, **untested, "available": False, "missing": missing}
-                for name, missing in self.evidence.study.candidates.missing.items()
+                for name, missing in self.evidence.study.missing.items()
             ],
             "where": _regions(self.stages[1], 60),  # More than anyone reads.
             "transfer_mm": transfer
@@ -240,7 +240,7 @@ def _ranked(study: Study, named: NamedEffects, name: str) -> dict[str, Any]:
     closes, fraction = named.closed_gap(name)
     members = next((own for own in named.cause_sets if name in own), ())
     absorbed = None
-    if name in study.candidates.effects:
+    if name in study.effects:
         absorbed = round(absorbed_share(study, name), 3)
     return {
         "effect": name,
