@@ -154,5 +154,5 @@ def test_an_effect_whose_column_is_missing_is_not_tested(tmp_path: Path) -> None
 
 
 def test_an_unknown_effect_is_refused(nothing_missing: Recording) -> None:
-    with pytest.raises(ConfigError, match="no effect 'wigling'"):
+    with pytest.raises(ConfigError, match="'wigling' is no effect"):
         prepare(nothing_missing, DiagnosisOptions(leave_out=("wigling",)), None)
