@@ -12,7 +12,7 @@ _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 _PUBLIC = {
     name: module for module, name in re.findall(r"^from (\S+) import (\w+)", _STUB, re.MULTILINE)
 }
-__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+__all__ = sorted(_PUBLIC)  # noqa: PLE0605  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> object:

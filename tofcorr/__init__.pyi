@@ -26,3 +26,5 @@ from tofcorr.simulation.simulator import simulate as simulate
 from tofcorr.training.run import TrainingResult as TrainingResult
 from tofcorr.training.run import train as train
 from tofcorr.version import __version__ as __version__
+
+__all__: list[str]

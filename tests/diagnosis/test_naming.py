@@ -153,6 +153,6 @@ def test_an_effect_whose_column_is_missing_is_not_tested(tmp_path: Path) -> None
     assert "room_temperature" not in {name for members in named.cause_sets for name in members}
 
 
-def test_an_unknown_effect_is_refused(nothing_missing: Recording) -> None:
+def test_an_unknown_effect_is_refused() -> None:
     with pytest.raises(ConfigError, match="'wigling' is no effect"):
-        prepare(nothing_missing, DiagnosisOptions(leave_out=("wigling",)), None)
+        DiagnosisOptions.from_mapping({"leave_out": ["wigling"]}, "diagnose.yaml")
