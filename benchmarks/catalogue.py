@@ -91,7 +91,7 @@ def _answer(folder: Path, seed: int, effect: str, size_mm: float) -> tuple[objec
     entry = drawn_effect(effect, size_mm, inputs, torch.Generator().manual_seed(seed))
     simulate(plain.model_copy(update={"effects": (entry,)}), folder / "recording")
     study, named, gap, left = diagnosed(folder / "recording", DiagnosisOptions())
-    known = effect in study.candidates.effects
+    known = effect in study.effects
     return (
         effect,
         named.names[:1] == (effect,),

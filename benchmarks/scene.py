@@ -32,7 +32,7 @@ def write_vga(path: Path, num_frames: int) -> None:
     with TemporaryDirectory() as folder:
         few = wall(Path(folder) / "few", 8, 480, 640)
         assert few.amplitude is not None
-        with RecordingWriter.with_header_of(path, few) as writer:
+        with RecordingWriter.like(path, few, rows=False) as writer:
             for k in range(num_frames):
                 row = replace(few.frames.row(k % 8), timestamp=float(k))
                 writer.append(few.depth[k % 8], row=row, amplitude=few.amplitude[k % 8])

@@ -32,7 +32,8 @@ def census(folder: Path) -> dict[str, int]:
     """Return the counts of all Python files of a folder."""
     sources = {path: path.read_text(encoding="utf-8") for path in sorted(folder.rglob("*.py"))}
     trees = {path: ast.parse(source) for path, source in sources.items()}
-    imported = Counter(name for tree in trees.values() for name in set(_imported(tree)))
+    stubs = [ast.parse(path.read_text(encoding="utf-8")) for path in folder.rglob("*.pyi")]
+    imported = Counter(name for tree in (*trees.values(), *stubs) for name in set(_imported(tree)))
     single = [
         path
         for path in trees

@@ -13,7 +13,7 @@ from torch import Tensor
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.pixels.masks import grazing
+from tofcorr.pixels.masks import some_pixels
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "tofcorr"
@@ -44,8 +44,8 @@ def test_a_wrong_shape_is_refused_in_a_test_run() -> None:
         posterior_covariance(torch.zeros(4, 5))
     with pytest.raises(TypeCheckError, match="tool_from_camera"):
         Parameters(torch.eye(3), torch.zeros(2))
-    with pytest.raises(TypeCheckError, match="rays"):
-        grazing(60.0, torch.zeros(4, 5, 2))
+    with pytest.raises(TypeCheckError, match="used"):
+        some_pixels(torch.zeros(3), 1, seed=0)
 
 
 def test_an_answer_is_refused_whose_arguments_were_seen_with_a_right_one() -> None:

@@ -15,6 +15,10 @@ class TofcorrError(Exception):
         super().__init__(printable(message))
 
 
+Kind = type[TofcorrError]
+"""Which error a function is to raise: a configuration's, a recording's, an export's."""
+
+
 def printable(text: str) -> str:
     r"""Return text in one line: newlines, tabs and other control characters as `\n`, `\t`, ..."""
     if text.isprintable():

@@ -28,7 +28,7 @@ from typing import Any, BinaryIO
 
 import click
 
-from tofcorr.errors import CalibrationDataError, ExportError, TofcorrError, is_control
+from tofcorr.errors import CalibrationDataError, ExportError, Kind, is_control
 
 try:
     import fcntl
@@ -44,7 +44,7 @@ _BEGUN: dict[Path, Callable[[Path], object]] = {}
 
 
 @contextmanager
-def staged_file(path: Path | str, kind: type[TofcorrError] = ExportError) -> Iterator[Path]:
+def staged_file(path: Path | str, kind: Kind = ExportError) -> Iterator[Path]:
     """Yield a temporary file beside `path`; it is renamed to `path` if the block succeeds.
 
     On any exception the temporary file is removed, and an older file at `path` is kept. A symbolic
@@ -66,9 +66,13 @@ def staged_file(path: Path | str, kind: type[TofcorrError] = ExportError) -> Ite
         part.replace(target)
 
 
-def write_json(
-    path: Path, values: Mapping[str, Any], kind: type[TofcorrError] = CalibrationDataError
-) -> None:
+def write_text(path: Path | str, text: str, kind: Kind = ExportError) -> None:
+    """Write a text, whole or not at all; an older file is replaced. It raises as `staged_file`."""
+    with staged_file(path, kind) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, values: Mapping[str, Any], kind: Kind = CalibrationDataError) -> None:
     """Write plain values as JSON, whole or not at all; an older file is replaced.
 
     A number that could not be measured (NaN, infinity) is null.
@@ -129,12 +133,23 @@ def staged_folder(path: Path | str) -> Iterator[Path]:
 
 
 @contextmanager
-def writing_to(path: Path | str, kind: type[TofcorrError] = CalibrationDataError) -> Iterator[None]:
+def writing_to(path: Path | str, kind: Kind = CalibrationDataError) -> Iterator[None]:
     """Say in one sentence, as an error of kind `kind`, why `path` cannot be written."""
     try:
         yield
     except OSError as error:
         raise kind(f"{path}: cannot be written ({error.strerror or error}).") from None
+
+
+@contextmanager
+def reading(path: Path | str, kind: Kind = CalibrationDataError) -> Iterator[None]:
+    """Say in one sentence, as an error of kind `kind`, why `path` cannot be read."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise kind(f"{path}: there is no such file.") from None
+    except OSError as error:
+        raise kind(f"{path}: cannot be read ({error.strerror or error}).") from None
 
 
 def remove_begun() -> None:
@@ -189,7 +204,7 @@ def refuse_existing(path: Path) -> None:
         )
 
 
-def file_to_replace(path: Path, kind: type[TofcorrError]) -> Path:
+def file_to_replace(path: Path, kind: Kind) -> Path:
     """Return the file that a name means: a symbolic link stands for what it points to.
 
     Args:
@@ -214,7 +229,7 @@ def file_to_replace(path: Path, kind: type[TofcorrError]) -> Path:
     return target
 
 
-def _refuse_name(path: Path, kind: type[TofcorrError]) -> None:
+def _refuse_name(path: Path, kind: Kind) -> None:
     """Refuse the name of an output that messages, logs and YAML cannot show."""
     if any(map(is_control, str(path))):
         raise kind(

@@ -6,17 +6,25 @@ configuration: a shipped name, a file, a mapping or options that exist already.
 
 import os
 import reprlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PositiveInt,
+    ValidationError,
+)
 
-from tofcorr.errors import ConfigError, TofcorrError
-from tofcorr.files import open_regular
+from tofcorr.errors import ConfigError, Kind
+from tofcorr.files import open_regular, reading
 
 LARGEST_NUMBER = 1e12
 """Largest number read from a file, in the file's own unit. Chosen: a hundred times the fastest
@@ -27,6 +35,9 @@ of `LARGEST_NUMBER`: nothing that is divided by it overflows."""
 LARGEST_DEGREE = 30
 """Highest power of a polynomial (no unit). Chosen: scaled powers above it differ by less than
 noise, and a degree of a million fills the memory."""
+STRAY = 0.001
+"""Share of values that may lie beyond either end of their range (no unit). Chosen: gross errors are
+rarer, and a few pixels must not widen the range in which a correction is valid."""
 LARGEST_SIDE = 1_000_000
 """Largest width or height of an image, pixels. Set by hand: more than any image sensor has."""
 
@@ -37,6 +48,17 @@ def not_a_truth_value(value: object) -> object:
         # pydantic reports a ValueError; a TypeError would pass through it.
         raise ValueError("expected a number, not true or false")  # noqa: TRY004
     return value
+
+
+def among(names: Collection[str], what: str) -> AfterValidator:
+    """Return the check that a text is one of some names; `what` says what they are."""
+
+    def check(name: str) -> str:
+        if name not in names:
+            raise ValueError(f"'{name}' is no {what}; known: {', '.join(names)}")
+        return name
+
+    return AfterValidator(check)
 
 
 # Text is passed on to the number parser: YAML 1.1 reads 20.0e6 (no sign) as text.
@@ -67,9 +89,7 @@ class Options(BaseModel):
     config_folder: ClassVar[str] = ""
 
     @classmethod
-    def from_mapping(
-        cls, values: Mapping[str, Any], where: str, kind: type[TofcorrError] = ConfigError
-    ) -> Self:
+    def from_mapping(cls, values: Mapping[str, Any], where: str, kind: Kind = ConfigError) -> Self:
         """Check `values` and build the options.
 
         Args:
@@ -86,6 +106,12 @@ class Options(BaseModel):
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, ready for YAML or JSON."""
         return self.model_dump(mode="json")
+
+
+class OpenOptions(Options):
+    """Base of what is read of a file to which other tools add keys: these are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
 
 
 OptionsT = TypeVar("OptionsT", bound=Options)
@@ -108,9 +134,7 @@ def one_line(text: str, longest: int = _LONGEST) -> str:
 
 
 @contextmanager
-def refused_in_words(
-    cls: type[BaseModel], where: str, kind: type[TofcorrError] = ConfigError
-) -> Iterator[None]:
+def refused_in_words(cls: type[BaseModel], where: str, kind: Kind = ConfigError) -> Iterator[None]:
     """Refuse, in words, values that do not fit a class.
 
     Args:
@@ -186,7 +210,7 @@ _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _NOT_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
 
 
-def read_mapping(path: Path, kind: type[TofcorrError] = ConfigError) -> Mapping[str, Any]:
+def read_mapping(path: Path, kind: Kind = ConfigError) -> Mapping[str, Any]:
     """Read the keys and values of one YAML file.
 
     Raises:
@@ -198,26 +222,20 @@ def read_mapping(path: Path, kind: type[TofcorrError] = ConfigError) -> Mapping[
     return values
 
 
-def read_text(
-    path: Path, kind: type[TofcorrError] = ConfigError, most_bytes: int = _MOST_BYTES
-) -> str:
+def read_text(path: Path, kind: Kind = ConfigError, most_bytes: int = _MOST_BYTES) -> str:
     """Return the text of a file of bounded size.
 
     Raises:
         TofcorrError: Of kind `kind`: the file is missing, unreadable, too large or not UTF-8.
     """
     try:
-        with open_regular(path, most_bytes) as file:
+        with reading(path, kind), open_regular(path, most_bytes) as file:
             return file.read().decode("utf-8")
-    except FileNotFoundError:
-        raise kind(f"{path}: there is no such file.") from None
-    except OSError as error:
-        raise kind(f"{path}: cannot be read ({error.strerror or error}).") from None
     except UnicodeDecodeError as error:
         raise kind(f"{path}: cannot be read as text ({error}).") from None
 
 
-def parse_yaml(text: str, where: str, kind: type[TofcorrError] = ConfigError) -> Any:  # noqa: ANN401
+def parse_yaml(text: str, where: str, kind: Kind = ConfigError) -> Any:  # noqa: ANN401
     """Return the value of YAML text.
 
     Args:

@@ -42,7 +42,7 @@ def test_a_given_simulator_keeps_its_effects_and_errors_in_the_file(tmp_path: Pa
     diagnose(real, None, quick, out=tmp_path / "fitted")
     models = [SensorModel.load(tmp_path / name / "sensor.yaml") for name in ("given", "fitted")]
     assert [model.to_sensor_file().effects[0]["name"] for model in models] == ["wiggling"] * 2
-    depth = 1.3 * models[0].eye.rays[..., 2].reciprocal()
+    depth = 1.3 * models[0].eye.ray_directions[..., 2].reciprocal()
     amplitude = depth.new_full(depth.shape, 9000.0)
     given, fitted = (model(depth, amplitude, noise=False).depth.detach() for model in models)
     assert float((given - depth).mean()) > 0.01

@@ -49,7 +49,7 @@ def with_walls_found(recording: Recording) -> Recording:
     ids = image if table.pose_id is None else table.pose_id[image]
     # An importer knows no conditions of a frame: they are those of its image.
     known = replace(found, modulation_frequency=recording.modulation_frequency)
-    with RecordingWriter.with_header_of(out, known) as writer:
+    with RecordingWriter.like(out, known, rows=False) as writer:
         for frame, number in enumerate(image):
             plane = found.frames.row(frame)
             seen = {"offset": plane.offset, "target": plane.target, "pose_id": str(ids[frame])}
@@ -108,10 +108,9 @@ def test_the_same_effect_is_named_first_as_with_measured_planes(
 
 
 def test_what_planes_absorb_needs_measured_planes_by_name(prepared: Prepared) -> None:
-    candidates = prepared.study.candidates
     for name in ("target_registration", "incidence_angle"):
-        assert candidates.missing[name] == ["measured planes"]
-        assert name not in candidates.effects
+        assert prepared.study.missing[name] == ["measured planes"]
+        assert name not in prepared.study.effects
         assert name not in prepared.study.sums.layout.effects
     (warning,) = prepared.warnings
     assert "plane of 1 wall is estimated together with the base model" in warning
@@ -152,7 +151,7 @@ def test_the_simulator_rerun_on_the_walls_found_closes_the_gap(walls: Recording)
     closure = present(result.closure)
     assert closure.without_effects > 2e-3
     assert closure.with_effects < 0.6e-3
-    assert "target_registration" in result.evidence.study.candidates.missing
+    assert "target_registration" in result.evidence.study.missing
 
 
 @pytest.mark.slow

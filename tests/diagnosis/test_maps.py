@@ -21,7 +21,7 @@ def test_a_map_holds_a_smooth_pattern_whatever_its_size(nothing_study: Study, si
     """The larger it was, the more it once looked like noise that neighbours share."""
     study = with_poses_reestimated(_with_ring(nothing_study, size), ())
     residual = study.residual_of((), gls=True)
-    values = FittedMap(study, study.candidates.maps["fixed_pattern"], residual).values
+    values = FittedMap(study, study.maps["fixed_pattern"], residual).values
     assert float(residual @ values / (values @ values)) == pytest.approx(1, abs=0.1)
     noise = float(study.fit.sigma.square().mean())
     left = float((residual - values).square().mean())
@@ -32,7 +32,7 @@ def test_the_values_of_a_map_do_not_depend_on_what_neighbours_share(nothing_stud
     study = _with_ring(nothing_study, 0.005)
     residual = study.residual_of((), gls=True)
     other = replace(study, sums=replace(study.sums, dispersion=40.0))
-    effect = study.candidates.maps["fixed_pattern"]
+    effect = study.maps["fixed_pattern"]
     one, two = (FittedMap(each, effect, residual).values for each in (study, other))
     # The poses' offsets are a little less certain.
     assert float((one - two).norm() / one.norm()) < 0.05

@@ -132,10 +132,10 @@ def test_an_effect_whose_column_is_missing_is_not_tested(tmp_path: Path) -> None
     effect = {"name": "room_temperature"} | EFFECTS["room_temperature"]
     recording = recorded(tmp_path / "hidden", 44, [effect], hidden)
     study, named = _selected(recording, catalogue=("room_temperature", "warm_up", "ambient_light"))
-    assert study.candidates.missing["room_temperature"] == ["room_temperature_c"]
+    assert study.missing["room_temperature"] == ["room_temperature_c"]
     assert "room_temperature" not in {name for members in named.cause_sets for name in members}
 
 
-def test_an_unknown_effect_is_refused(nothing_missing: Recording) -> None:
-    with pytest.raises(ConfigError, match="no effect 'wigling'"):
-        prepare(nothing_missing, DiagnosisOptions(leave_out=("wigling",)), None)
+def test_an_unknown_effect_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'wigling' is no effect"):
+        DiagnosisOptions.from_mapping({"leave_out": ["wigling"]}, "diagnose.yaml")

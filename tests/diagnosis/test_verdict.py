@@ -12,7 +12,7 @@ from tofcorr.diagnosis.report.words import effect_line, moving_waves, table_of_s
 STUDY: Any = SimpleNamespace(
     fit=SimpleNamespace(model=SimpleNamespace(groups=set())),
     options=SimpleNamespace(target_gap_mm=1.0, tests=SimpleNamespace(named_from=0.5)),
-    candidates=SimpleNamespace(effects={}),
+    effects={},
 )
 
 

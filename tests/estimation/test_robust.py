@@ -109,7 +109,7 @@ def test_an_image_with_a_third_of_outliers_shows_its_plane() -> None:
     for enough in (None, int(batch.valid.sum()) // 5):
         plane = image_planes(batch, rays, enough)
         torch.testing.assert_close(-plane, batch.normal_tool / batch.offset_tool, atol=1e-4, rtol=0)
-    off = off_the_wall(rays)(batch)[0]
+    off = off_the_wall(batch, rays)[0]
     assert bool(off[:, ::3].all())
     assert not bool(off[:, 1::3].any())
 
@@ -117,7 +117,7 @@ def test_an_image_with_a_third_of_outliers_shows_its_plane() -> None:
 def test_grazing_pixels_are_those_beyond_the_angle() -> None:
     batch, rays = planar_batch([1.2, 0.0, -1.0], 1.0)
     angle = torch.rad2deg(torch.arccos(-(rays @ batch.normal_tool[0])))
-    found = grazing(55.0, rays)(batch)[0]
+    found = grazing(batch, 55.0, rays)[0]
     assert torch.equal(found, angle > 55.0)
     assert 0 < int(found.sum()) < found.numel()
 
@@ -125,7 +125,7 @@ def test_grazing_pixels_are_those_beyond_the_angle() -> None:
 def test_edges_are_the_pixels_next_to_a_step_of_brightness() -> None:
     batch, _ = planar_batch([0.0, 0.0, -1.0], 1.0)
     present(batch.amplitude)[:, :, 12:] = 400.0
-    found = edges(2.0)(batch)[0]
+    found = edges(batch, 2.0)[0]
     assert bool(found[:, 11:13].all())
     assert not bool(found[:, :11].any())
     assert not bool(found[:, 13:].any())

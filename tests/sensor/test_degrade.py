@@ -70,7 +70,7 @@ def test_each_frame_is_what_the_model_measures_of_it(ideal: Recording, tmp_path:
     found = degrade(quiet, ideal, tmp_path / "real").recording
     assert found.depth_kind == "z"
     model = SensorModel(quiet)
-    depth = torch.from_numpy(np.array(ideal.depth)) * model.eye.rays[..., 2]
+    depth = torch.from_numpy(np.array(ideal.depth)) * model.eye.ray_directions[..., 2]
     times = torch.from_numpy(ideal.frames.timestamp)
     with torch.no_grad():
         wanted = model(depth, timestamp_s=times).depth

@@ -172,7 +172,7 @@ def test_reflectivity_gives_the_amplitude_of_a_lambertian_surface() -> None:
     light = {"amplitude_at_1m": 1500.0, "vignetting_exponent": 2.0, "usual_reflectivity": 0.4}
     model = sensor(light=light)
     found = model(depth, reflectivity=torch.full_like(depth, 0.8), noise=False).amplitude
-    rays = model.eye.rays
+    rays = model.eye.ray_directions
     wanted = 1500.0 * 0.8 * -(rays @ normal) * rays[..., 2] ** 2 / depth**2
     torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0)
     usual = model(depth, noise=False).amplitude

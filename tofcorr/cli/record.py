@@ -53,7 +53,7 @@ def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None: 
     import numpy as np
 
     from tofcorr.errors import ConfigError
-    from tofcorr.files import staged_file
+    from tofcorr.files import write_text
     from tofcorr.training.advice import Workspace, plan_poses
 
     intrinsics = take_intrinsics(given)
@@ -64,8 +64,7 @@ def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None: 
     asked = {key: given.pop(key) for key in ("number", "start_distance")}
     space = Workspace(nearest=nearest, farthest=farthest, **given)
     plan = plan_poses(camera, options.model, space, tool_from_camera=hand_eye, **asked)
-    with staged_file(out) as part:
-        part.write_text(_table(plan, np.eye(4) if start is None else start), encoding="utf-8")
+    write_text(out, _table(plan, np.eye(4) if start is None else start))
     click.echo(repr(plan))
     relative = " relative to the start pose" if start is None else ""
     click.echo(f"{len(plan.expected)} poses{relative} written to {out}")

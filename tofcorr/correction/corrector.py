@@ -218,7 +218,9 @@ class DepthCorrector(nn.Module):
         if self.error.has_amplitude:
             self.error.amplitude.add_to(error, strength)
         self.error.add_others(error, distance, strength)
-        self.error.add_network(error, radial, amplitude, rows)
+        if self.error.network is not None:  # Its inputs are not clamped.
+            found = self.error.network(radial, amplitude, rows, self.error.columns)
+            error.add_(found, alpha=self.error.factor)
         if self.error.has_normalised:
             normalised = (strength * distance).mul_(distance)
             held = torch.clamp(normalised, self.normalised_range[0], self.normalised_range[1])
@@ -337,14 +339,6 @@ class RuntimeErrorModel(nn.Module):
         """Add the terms that are not polynomials to `total`."""
         for term in self.others:
             total.add_(term(radial_distance, amplitude), alpha=self.factor)
-
-    def add_network(
-        self, total: Tensor, radial_distance: Tensor, amplitude: Tensor, rows: Tensor
-    ) -> None:
-        """Add the residual network to `total`; its inputs are not clamped."""
-        if self.network is not None:
-            found = self.network(radial_distance, amplitude, rows, self.columns)
-            total.add_(found, alpha=self.factor)
 
     def set_conditions(self, conditions: Tensor) -> bool:
         """Add the condition terms of a frame (C,) to the image; return whether it is in range."""

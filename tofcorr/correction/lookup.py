@@ -11,7 +11,7 @@ import numpy as np
 
 from tofcorr.correction.metadata import LutMetadata
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import UNREADABLE, open_regular, refuse_bomb
+from tofcorr.files import UNREADABLE, open_regular, reading, refuse_bomb
 
 FORMAT = "tofcorr-lut"
 
@@ -76,17 +76,15 @@ def read_lut(path: Path | str) -> LookupTable:
     Raises:
         CalibrationDataError: There is no such file, or it is not such a table.
     """
-    try:
-        with open_regular(path) as archive, np.load(archive, allow_pickle=False) as file:
+    with reading(path), open_regular(path) as archive:
+        try:
+            file = np.load(archive, allow_pickle=False)
             refuse_bomb(file.zip)
             metadata = json.loads(str(file["metadata"]))
             arrays = {n: np.asarray(file[n]) for n in ("offset", "table", "radial_of_z")}
-    except FileNotFoundError:
-        raise CalibrationDataError(f"{path}: there is no such file.") from None
-    except OSError as error:
-        raise CalibrationDataError(f"{path}: cannot be read ({error.strerror}).") from None
-    except UNREADABLE:
-        raise CalibrationDataError(f"{path}: is not a look-up table of tofcorr export.") from None
+        except UNREADABLE:
+            said = f"{path}: is not a look-up table of tofcorr export."
+            raise CalibrationDataError(said) from None
     known = LutMetadata.from_mapping(metadata, f"{path}, metadata", CalibrationDataError)
     _refuse_other_arrays(arrays, known, path)
     return LookupTable(**arrays, metadata=metadata)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import BeforeValidator, ConfigDict
+from pydantic import BeforeValidator
 from torch import nn
 
 from tofcorr.correction.corrector import DepthCorrector
@@ -15,7 +15,14 @@ from tofcorr.correction.state import STATE_FILE, load_calibration
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import DepthKind, Distortion, PinholeMatrix
-from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size, not_a_truth_value
+from tofcorr.options import (
+    FiniteNumber,
+    OpenOptions,
+    Options,
+    PositiveNumber,
+    Size,
+    not_a_truth_value,
+)
 
 _WHAT = "the corrector.ts of a run"
 EMBEDDED = "calibration.pt"
@@ -23,10 +30,8 @@ EMBEDDED = "calibration.pt"
 _Range = tuple[FiniteNumber, FiniteNumber]
 
 
-class ValidityMetadata(Options):
+class ValidityMetadata(OpenOptions):
     """The calibrated ranges; a program may add keys."""
-
-    model_config = ConfigDict(extra="ignore")
 
     radial_distance_m: _Range
     amplitude: _Range | None = None
@@ -48,10 +53,8 @@ class LutMark(Options):
     sha256: str | None = None
 
 
-class CameraMetadata(Options):
+class CameraMetadata(OpenOptions):
     """The camera that a corrector was made for; what it does not say is not compared."""
-
-    model_config = ConfigDict(extra="ignore")
 
     width: Size | None = None
     height: Size | None = None
@@ -59,10 +62,8 @@ class CameraMetadata(Options):
     distortion: Distortion | None = None
 
 
-class CorrectorMetadata(Options):
+class CorrectorMetadata(OpenOptions):
     """What is read of a corrector's metadata; the rest is for people."""
-
-    model_config = ConfigDict(extra="ignore")
 
     needs_amplitude: bool = True
     depth_kind: DepthKind | None = None

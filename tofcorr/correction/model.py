@@ -21,6 +21,8 @@ from tofcorr.geometry.se3 import product, projected, transformed
 
 Transform = Tensor | np.ndarray | Sequence[Sequence[float]]
 """Four rows of four."""
+Amplitude = Tensor | None
+"""The camera's units, the shape of the depth; None where no term of the model needs it."""
 
 
 class HandEye(nn.Module):
@@ -132,16 +134,6 @@ AGREEMENT = 1e-6
 1e-7 m at one metre."""
 
 
-def refuse_other_than_tensor(name: str, frame: object) -> None:
-    """Refuse a frame that is no tensor, by the name that its caller knows.
-
-    Raises:
-        FrameError: It is something else; the message says how to make a tensor of it.
-    """
-    if not isinstance(frame, Tensor):
-        raise FrameError(f"{name}: expected a torch tensor, got {type(frame).__name__}.")
-
-
 class CameraGeometry(nn.Module):
     """Image size, pinhole matrix, distortion and rays of a camera, and what its depth means.
 
@@ -156,6 +148,7 @@ class CameraGeometry(nn.Module):
         radial_of_depth: Radial distance over depth, shape (H, W): 1 for radial depth.
     """
 
+    advice = "Was the frame cropped, binned or transposed?"
     matrix: Tensor
     distortion: Tensor
     ray_directions: Tensor
@@ -185,24 +178,30 @@ class CameraGeometry(nn.Module):
         rays = self.ray_directions * self.radial_of_depth[..., None]
         return depth[..., None] * rays.to(depth.dtype)
 
-    def check(self, depth: Tensor, amplitude: Tensor | None) -> None:
-        """Refuse tensors that are not frames of the camera.
+    def check(self, **frames: Tensor | None) -> None:
+        """Refuse tensors that are not frames of the camera, by the names that their caller knows.
+
+        Args:
+            **frames: The depth, then images of its shape; None: there is none.
 
         Raises:
-            FrameError: Shape or dtype are not those of the camera's frames.
+            FrameError: It is no tensor, or shape or dtype are not those of the camera's frames.
         """
-        given = {"depth": depth} if amplitude is None else {"depth": depth, "amplitude": amplitude}
+        height, width = self.radial_of_depth.shape
+        given = {name: frame for name, frame in frames.items() if frame is not None}
+        (first, depth), *_ = given.items()
         for name, frame in given.items():
-            refuse_other_than_tensor(name, frame)
+            if not isinstance(frame, Tensor):
+                got = type(frame).__name__
+                raise FrameError(f"{name}: expected a torch tensor, got {got}.")
             if not frame.dtype.is_floating_point:
                 raise FrameError(f"{name}: expected floating-point metres, got {frame.dtype}.")
-        size = list(self.radial_of_depth.shape)
-        if depth.dim() < 2 or list(depth.shape[-2:]) != size:
-            got = f"got {list(depth.shape)}. Was the frame cropped, binned or transposed?"
-            raise FrameError(f"depth: expected shape (..., {size[0]}, {size[1]}); {got}")
-        if amplitude is not None and amplitude.shape != depth.shape:
-            shapes = f"expected depth's shape {[*depth.shape]}, got {[*amplitude.shape]}"
-            raise FrameError(f"amplitude: {shapes}.")
+            if frame.shape != depth.shape:
+                shapes = f"expected {first}'s shape {[*depth.shape]}, got {[*frame.shape]}"
+                raise FrameError(f"{name}: {shapes}.")
+        if depth.dim() < 2 or list(depth.shape[-2:]) != [height, width]:
+            got = f"got {[*depth.shape]}. {self.advice}"
+            raise FrameError(f"{first}: expected shape (..., {height}, {width}); {got}")
 
 
 class CalibratedRanges(nn.Module):
@@ -291,7 +290,7 @@ class FrameCorrection(DescribedModule):
         self.ranges.set(domain, saturation_amplitude, error_model)
 
     def forward(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+        self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition
     ) -> Tensor:
         """Return corrected depth.
 
@@ -312,9 +311,7 @@ class FrameCorrection(DescribedModule):
         corrected = depth.to(error.dtype) - error
         return torch.where(seen, corrected, torch.nan).to(depth.dtype)
 
-    def error(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
-    ) -> Tensor:
+    def error(self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition) -> Tensor:
         """Return the predicted error, measured - true: depth - error is the corrected depth.
 
         Arguments, shape and dtype are those of `forward`.
@@ -322,9 +319,7 @@ class FrameCorrection(DescribedModule):
         error, seen = self._error(depth, amplitude, conditions)
         return torch.where(seen, error, torch.nan).to(depth.dtype)
 
-    def valid(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
-    ) -> Tensor:
+    def valid(self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition) -> Tensor:
         """Return where the correction is valid, bool, the shape of `depth`.
 
         Not valid is a pixel without a return, a saturated one, and one whose distance, amplitude
@@ -347,21 +342,19 @@ class FrameCorrection(DescribedModule):
             valid = valid & term.covers(known)[..., None, None]  # type: ignore[operator]
         return valid
 
-    def points(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
-    ) -> Tensor:
+    def points(self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition) -> Tensor:
         """Return corrected points in the camera frame, shape (..., H, W, 3), metres."""
         return self.geometry.points(self(depth, amplitude, **conditions))
 
     def points_tool(
-        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+        self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition
     ) -> Tensor:
         """Return corrected points in the tool frame, shape (..., H, W, 3), metres."""
         points = self.points(depth, amplitude, **conditions)
         return transformed(self.hand_eye().to(points.dtype), points)
 
     def _error(
-        self, depth: Tensor, amplitude: Tensor | None, conditions: dict[str, Condition]
+        self, depth: Tensor, amplitude: Amplitude, conditions: dict[str, Condition]
     ) -> tuple[Tensor, Tensor]:
         """Return the error in the camera's kind of depth, in the module's dtype, and where seen."""
         model = self.error_model
@@ -376,7 +369,7 @@ class FrameCorrection(DescribedModule):
         return error / self.geometry.radial_of_depth, seen
 
     def _variables(
-        self, depth: Tensor, amplitude: Tensor | None
+        self, depth: Tensor, amplitude: Amplitude
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Turn frames into the variables of the error model, in the dtype of its parameters.
 
@@ -388,7 +381,7 @@ class FrameCorrection(DescribedModule):
             distance and amplitude as measured; both clamped to their calibrated ranges. Without
             need for amplitudes these are the radial distances.
         """
-        self.geometry.check(depth, amplitude)
+        self.geometry.check(depth=depth, amplitude=amplitude)
         ranges, dtype = self.ranges, self.error_model.constant.dtype
         depth = depth.to(dtype)
         seen = torch.isfinite(depth) & (depth > 0)

@@ -16,7 +16,7 @@ from tofcorr.correction.model import CalibrationModel, FrameCorrection, HandEye
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
-from tofcorr.errors import CalibrationDataError, TofcorrError
+from tofcorr.errors import CalibrationDataError, Kind
 from tofcorr.files import UNREADABLE, open_regular, refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
 from tofcorr.options import (
@@ -297,9 +297,7 @@ def calibration_bytes(state: CalibrationState) -> bytes:
     return values_of(_FORMAT, state.model_dump())
 
 
-def save_values(
-    path: Path | str, form: str, values: dict[str, Any], kind: type[TofcorrError]
-) -> None:
+def save_values(path: Path | str, form: str, values: dict[str, Any], kind: Kind) -> None:
     """Write plain values and tensors for `read_values`, whole or not at all.
 
     Raises:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files import UNREADABLE, open_regular
+from tofcorr.files import UNREADABLE, open_regular, reading
 from tofcorr.options import LARGEST_NUMBER
 
 LARGEST_DISTANCE = 1e6
@@ -103,16 +103,14 @@ def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
         CalibrationDataError: The file is missing, truncated, no `.npy` file, or of another
             type, order or shape.
     """
-    try:
-        with open_regular(path, inf) as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # NumPy warns of headers written by Python 2.
+    with reading(path), open_regular(path, inf) as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy warns of headers written by Python 2.
+        try:
             array = np.lib.format.open_memmap(path, mode="r")
-            longer = file.seek(0, io.SEEK_END) - array.offset - array.nbytes
-    except FileNotFoundError:
-        raise CalibrationDataError(f"{path}: there is no such file.") from None
-    except UNREADABLE as error:
-        reason = " ".join(str(error).split())[:200]
-        raise CalibrationDataError(f"{path}: not a readable .npy file ({reason}).") from None
+        except UNREADABLE as error:
+            reason = " ".join(str(error).split())[:200]
+            raise CalibrationDataError(f"{path}: not a readable .npy file ({reason}).") from None
+        longer = file.seek(0, io.SEEK_END) - array.offset - array.nbytes
     if longer:
         raise CalibrationDataError(f"{path}: {longer} bytes stand behind the array; write it anew.")
     if array.dtype != np.dtype(dtype):
@@ -146,14 +144,11 @@ def read_frames(array: np.ndarray, indices: np.ndarray) -> np.ndarray:
         return array[indices]
     frames = np.empty((len(indices), *array.shape[1:]), dtype=array.dtype)
     path = Path(str(array.filename))
-    try:
-        with path.open("rb") as file:
-            for frame, index in zip(frames, indices.tolist(), strict=True):
-                file.seek(array.offset + index * frame.nbytes)
-                if file.readinto(frame) < frame.nbytes:
-                    raise CalibrationDataError(f"{path}: cannot be read (it became shorter).")
-    except OSError as error:
-        raise CalibrationDataError(f"{path}: cannot be read ({error.strerror or error}).") from None
+    with reading(path), path.open("rb") as file:
+        for frame, index in zip(frames, indices.tolist(), strict=True):
+            file.seek(array.offset + index * frame.nbytes)
+            if file.readinto(frame) < frame.nbytes:
+                raise CalibrationDataError(f"{path}: cannot be read (it became shorter).")
     return frames
 
 

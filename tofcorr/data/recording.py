@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
-from pydantic import BeforeValidator, ConfigDict
+from pydantic import BeforeValidator
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
@@ -19,17 +19,15 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
 from tofcorr.geometry.rays import plane_in_frame, radial_distance_from_z_depth, ray_directions
 from tofcorr.geometry.se3 import RigidTransform
-from tofcorr.options import Options, PositiveNumber, not_a_truth_value, read_mapping
+from tofcorr.options import OpenOptions, PositiveNumber, not_a_truth_value, read_mapping
 
 HEADER_FILE = "recording.yaml"
 PlaneOrigin = Literal["recorded", "estimated"]
 """`recorded`: measured by other means; `estimated`: found in the depth itself, never truth."""
 
 
-class Header(Options):
+class Header(OpenOptions):
     """The content of `recording.yaml`; keys of other tools are ignored."""
-
-    model_config = ConfigDict(extra="ignore")
 
     format: Literal["tofcorr-recording"]
     version: Annotated[Literal[1], BeforeValidator(not_a_truth_value)]
@@ -324,9 +322,6 @@ class FrameBatch:
     offset_tool: Tensor
     conditions: Tensor | None = None
 
-
-OUTSIDE = 0.001
-"""Share of the pixels that may lie beyond either end of a range. Chosen: gross errors are rarer."""
 
 CHUNK_PIXELS = 131_072
 """Pixels that are read at once: a few megabytes. Set by timing on VGA recordings."""

@@ -15,7 +15,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from tofcorr.conditions import OPTIONAL_CONDITIONS, Condition, Conditions, Value, condition
 from tofcorr.data.arrays import LARGEST_DISTANCE
 from tofcorr.errors import CalibrationDataError, is_control
-from tofcorr.files import open_regular
+from tofcorr.files import open_regular, reading
 from tofcorr.geometry import se3
 from tofcorr.geometry.se3 import UNIT_LENGTH_TOLERANCE
 from tofcorr.options import LARGEST_NUMBER, SMALLEST_POSITIVE
@@ -201,12 +201,10 @@ def _cell(row: FrameRow, name: str) -> int | str | float | None:
 def _read_cells(path: Path) -> dict[str, list[str]]:
     """Read the file into columns of text; blank lines are skipped."""
     try:
-        with open_regular(path) as file:
+        with reading(path), open_regular(path) as file:
             text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
             lines = [line for line in csv.reader(text) if line]
-    except FileNotFoundError:
-        raise CalibrationDataError(f"{path}: there is no such file.") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (UnicodeDecodeError, csv.Error) as error:
         raise CalibrationDataError(f"{path}: cannot be read as CSV ({error}).") from None
     if not lines:
         raise CalibrationDataError(f"{path}: is empty; expected a header row.")

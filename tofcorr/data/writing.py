@@ -86,34 +86,29 @@ class RecordingWriter:
         self._folder = self._stack.enter_context(staged_folder(path))
 
     @classmethod
-    def with_header_of(
-        cls, path: Path | str, recording: Recording, *, corrected_by: str | None = None
+    def like(
+        cls,
+        path: Path | str,
+        recording: Recording,
+        *,
+        corrected_by: str | None = None,
+        rows: bool = True,
     ) -> Self:
-        """Begin a recording with the header of another one; its frames are appended.
+        """Begin a recording with the header and the rows of another one; its images are appended.
 
         Args:
             path: The folder to write.
             recording: The other one.
             corrected_by: What corrects the depth; None: as that of `recording`.
+            rows: Whether `frames.csv` is copied unchanged, with the columns of other tools.
+                `append` then takes no row, and as many frames must be appended as `recording` has.
         """
         names = ("camera", "depth_kind", "modulation_frequency", "saturation_amplitude")
         names += ("tool_from_camera", "planes", "frame_names")
         writer = cls(path, **{name: getattr(recording, name) for name in names})
         changed = {"corrected_by": corrected_by or recording.corrected_by}
         writer._header = writer._header.model_copy(update=changed)
-        return writer
-
-    @classmethod
-    def like(
-        cls, path: Path | str, recording: Recording, *, corrected_by: str | None = None
-    ) -> Self:
-        """Begin a recording with the header and the rows of another one; its images are appended.
-
-        `frames.csv` is copied unchanged, with the columns of other tools. `append` then takes no
-        row, and as many frames must be appended as `recording` has.
-        """
-        writer = cls.with_header_of(path, recording, corrected_by=corrected_by)
-        writer._rows_from = recording.path / TABLE_FILE
+        writer._rows_from = recording.path / TABLE_FILE if rows else None
         return writer
 
     def append(

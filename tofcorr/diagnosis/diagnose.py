@@ -65,7 +65,7 @@ from tofcorr.diagnosis.sums.study import (
     without_map,
 )
 from tofcorr.error_terms.pixel_terms import FixedPatternOptions
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import solvable
 from tofcorr.files import staged_folder
 from tofcorr.observables.compare import Observables
@@ -162,15 +162,10 @@ def prepare(
         simulator: The simulator under diagnosis; None: one is fitted to the recording.
 
     Raises:
-        ConfigError: An effect is unknown.
         CalibrationDataError: The recording lacks what a base term needs, has too few frames, or its
             planes are estimated and cannot be estimated anew; or the simulator's frames cannot be
             compared with it.
     """
-    for name in (*(options.catalogue or ()), *options.leave_out):
-        if name not in CATALOGUE:
-            known = ", ".join(sorted(CATALOGUE))
-            raise ConfigError(f"There is no effect '{name}' to consider. Known: {known}.")
     camera = recording.camera
     if min(camera.width, camera.height) < 2:
         raise CalibrationDataError(

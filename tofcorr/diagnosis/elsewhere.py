@@ -173,7 +173,7 @@ def _carried(study: Study, real: Observations, here: EffectInputs) -> tuple[Tens
     count, base = columns[0].shape[1], gls.layout.base
     carried = torch.cat([torch.arange(count), torch.arange(base, len(theta))])
     error = columns[0] @ (fit.coefficients + theta[:count])
-    effects = [study.candidates.effects[name] for name in names]
+    effects = [study.effects[name] for name in names]
     parts = theta[base:].split([len(effect.coefficients) for effect in effects])
     for effect, part in zip(effects, parts, strict=True):
         own = part * effect.prior_sd()
@@ -197,7 +197,7 @@ def _needed(study: Study) -> list[str]:
 
     An effect must lower chi-squared by the logarithm of the number of pixels a coefficient.
     """
-    effects, chosen = study.candidates.effects, list[str]()
+    effects, chosen = study.effects, list[str]()
     price = math.log(len(study.observations.measured))
 
     def explained(names: list[str]) -> float:

@@ -10,10 +10,12 @@ from tofcorr.error_terms.signal_terms import (
     AmplitudePolynomialOptions,
     DistancePolynomialOptions,
 )
-from tofcorr.options import Options
+from tofcorr.options import Options, among
+from tofcorr.simulation.effects import CATALOGUE
 
 Share = Annotated[float, Field(gt=0, lt=1)]
 Positive = Annotated[float, Field(gt=0)]
+EffectName = Annotated[str, among(CATALOGUE, "effect")]
 
 
 class TestOptions(Options):
@@ -91,8 +93,8 @@ class DiagnosisOptions(Options):
     base: ErrorModelOptions = ErrorModelOptions(
         terms=(DistancePolynomialOptions(), PixelPolynomialOptions(), AmplitudePolynomialOptions())
     )
-    catalogue: tuple[str, ...] | None = None
-    leave_out: tuple[str, ...] = ()
+    catalogue: tuple[EffectName, ...] | None = None
+    leave_out: tuple[EffectName, ...] = ()
     hand_eye: Literal["auto", "estimate", "fixed"] = "auto"
     most_pixels: Annotated[int, Field(ge=1000)] = 100_000
     tests: TestOptions = TestOptions()

@@ -83,14 +83,14 @@ class OffsetSums:
     def read(self) -> Iterator[int]:
         """Correct the images and add those with enough usable pixels; yield their numbers."""
         rays, error = self._dataset.ray_directions(), self._state.model().error
-        off_wall, domain, known = off_the_wall(rays), self._state.domain, self._reference
+        domain, known = self._state.domain, self._reference
         twist = self._state.hand_eye_estimated
         # Without a robot the recorded planes are in the camera's own coordinates.
         fixed = torch.eye(4, dtype=torch.float64)
         hand_eye = self._state.tool_from_camera if self._dataset.moves else fixed
         poses = self._dataset.column("world_from_tool")
         for batch in self._dataset.batches():
-            on_wall = batch.valid & ~off_wall(batch)
+            on_wall = batch.valid & ~off_the_wall(batch, rays)
             inside = on_wall & domain.holds(batch.radial_distance, batch.amplitude)
             self.on_wall += int(on_wall.sum())
             self.calibrated += int(inside.sum())

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.errors import CalibrationDataError, StateError
-from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size
+from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size, among
 
 Variable = Literal["distance", "amplitude", "normalised_amplitude", "log_amplitude"]
 """What a signal term is a function of; the normalised amplitude is N = I D^2."""
@@ -67,16 +67,9 @@ def _ordered(ends: Interval) -> Interval:
     return ends
 
 
-def _known(given: Mapping[str, tuple[float, float, float]]) -> Mapping:
-    for name in given:
-        if name not in CONDITIONS:
-            raise ValueError(f"'{name}' is no condition; known: {', '.join(CONDITIONS)}")
-    return given
-
-
 _Range = Annotated[Interval, AfterValidator(_ordered)]
 _Three = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
-_Conditions = Annotated[Mapping[str, _Three], AfterValidator(_known)]
+_Conditions = Mapping[Annotated[str, among(CONDITIONS, "condition")], _Three]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -249,15 +249,11 @@ class ErrorModel(DescribedModule):
         paper. Only the sum of the constants c0, p0 and i0 is identifiable: it is given as c0 of
         the distance.
         """
-        found = self._in_the_paper()
+        found = self.paper_values()
         return {g: {name: own for name, (own, _) in named.items()} for g, named in found.items()}
 
-    def paper_units(self) -> dict[str, dict[str, str]]:
-        """Return the units of the coefficients, in the groups of `paper_coefficients`."""
-        found = self._in_the_paper()
-        return {g: {name: unit for name, (_, unit) in named.items()} for g, named in found.items()}
-
-    def _in_the_paper(self) -> dict[str, dict[str, tuple[float, str]]]:
+    def paper_values(self) -> dict[str, dict[str, tuple[float, str]]]:
+        """Return the same, each coefficient with its unit."""
         constant = float(self.constant.detach())
         groups: dict[str, dict[str, tuple[float, str]]] = {"distance": {"c0": (0.0, "m")}}
         for term in self.terms():

@@ -128,13 +128,15 @@ class IncidentLightOptions(SplineOptions):
     letter: ClassVar[str] = "a"
 
 
+Nonzero = tuple[list[Tensor], list[Tensor]]
+"""The numbers of the functions that are not zero somewhere, and their values."""
+
+
 class SplineTerm(SignalTerm):
     """A sum of splines, or of their products, of which few are not zero at any place."""
 
     @abstractmethod
-    def nonzero(
-        self, radial_distance: Tensor, amplitude: Tensor
-    ) -> tuple[list[Tensor], list[Tensor]]:
+    def nonzero(self, radial_distance: Tensor, amplitude: Tensor) -> Nonzero:
         """Return the numbers of the functions that are not zero, and their values, each (...)."""
 
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
@@ -191,9 +193,7 @@ class SignalSpline(SplineTerm, CurveTerm):
         self.degree: int = options.degree
         self.segments: int = options.segments
 
-    def nonzero(
-        self, radial_distance: Tensor, amplitude: Tensor
-    ) -> tuple[list[Tensor], list[Tensor]]:
+    def nonzero(self, radial_distance: Tensor, amplitude: Tensor) -> Nonzero:
         """Return the B-splines that are not zero."""
         scaled = self.scaled(radial_distance, amplitude)
         first, weights = spline_weights(scaled, self.segments, self.degree)
@@ -266,9 +266,7 @@ class TensorSpline(SplineTerm):
             self.register_interval(prefix, domain.interval(variable))  # type: ignore[arg-type]
         self.register_number("floor", domain.amplitude_floor())
 
-    def nonzero(
-        self, radial_distance: Tensor, amplitude: Tensor
-    ) -> tuple[list[Tensor], list[Tensor]]:
+    def nonzero(self, radial_distance: Tensor, amplitude: Tensor) -> Nonzero:
         """Return the products that are not zero."""
         value = variable_of(self.variable, radial_distance, amplitude, self.floor)
         u = (radial_distance - self.centre) / self.half_width

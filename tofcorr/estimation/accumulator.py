@@ -27,6 +27,7 @@ from tofcorr.error_terms.base import Domain, SignalTerm
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.signal_terms import SignalPolynomial
 from tofcorr.estimation.moments import ImageMoments
+from tofcorr.geometry.rays import Rays
 
 # Random points at which products of functions are compared. Products whose randomly weighted sums
 # over them agree to ten digits count as one function. Splines, which are zero on most points, need
@@ -63,9 +64,7 @@ class Design:
         ray_directions: Unit viewing rays, shape (H, W, 3), float64.
     """
 
-    def __init__(
-        self, model: ErrorModel, domain: Domain, ray_directions: Float[Tensor, "H W 3"]
-    ) -> None:
+    def __init__(self, model: ErrorModel, domain: Domain, ray_directions: Rays) -> None:
         self.signal_terms: list[SignalTerm] = list(model.signal_terms)  # type: ignore[arg-type]
         self.symbols = model.image_symbols()
         self.ray_directions = ray_directions

@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tofcorr.options import STRAY
+
 LEVEL = 0.05
 """What every interval leaves out, and the level of every test of a fit; the usual one."""
 RobustLoss = Literal["none", "huber", "cauchy"]
@@ -21,9 +23,6 @@ SpreadT = TypeVar("SpreadT", float, np.floating, np.ndarray, Tensor)
 # 1977).
 _HUBER = 1.345
 _CAUCHY = 2.385
-# Share of the values at either end of a range that may be stray. Chosen: a few pixels must not
-# widen the range in which a correction is valid.
-_STRAY = 1 / 1000
 # 1 / Phi^-1(3/4): half of a normal distribution lies within 0.6745 standard deviations.
 _SIGMA_PER_MAD = 1.482602218505602
 
@@ -89,7 +88,7 @@ def sigma_from_mad(median_absolute_deviation: SpreadT) -> SpreadT:
 
 def without_strays(values: np.ndarray) -> tuple[float, float]:
     """Return the range of values without a thousandth at either end, which may be stray pixels."""
-    low, high = np.quantile(values, (_STRAY, 1 - _STRAY)).tolist()
+    low, high = np.quantile(values, (STRAY, 1 - STRAY)).tolist()
     return low, high
 
 

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import torch
-from numpy.polynomial.legendre import legvander
 from torch import Tensor
 
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, Pixels
+from tofcorr.geometry.polynomials import exponents, products
 from tofcorr.geometry.rays import tangents
 
 # The kinds of functions of the form: the variables that they are products of, and the highest order
@@ -93,26 +93,16 @@ def _cosines(scaled: Tensor, orders: int) -> Tensor:
 def _place(domain: Domain, pixels: Pixels, highest: int) -> Tensor:
     """Return polynomials of the place up to a total degree, shape (H, M)."""
     row, column = (
-        _legendre(2 * at / max(size - 1, 1) - 1, highest)
+        2 * at.double() / max(size - 1, 1) - 1
         for at, size in ((pixels.rows, domain.height), (pixels.columns, domain.width))
     )
-    return torch.stack([row[i] * column[j] for i, j in _degrees(highest)])
+    return torch.stack(products(column, row, 1, highest))
 
 
-def _legendre(scaled: Tensor, degree: int) -> Tensor:
-    """Return the Legendre polynomials up to a degree, shape (degree + 1, M)."""
-    return torch.from_numpy(legvander(scaled.double().numpy(), degree)).movedim(-1, 0)
-
-
-def _degrees(highest: int) -> list[tuple[int, int]]:
-    """Return the degrees in row and column of total degree 1 to `highest`."""
-    return [(i, total - i) for total in range(1, highest + 1) for i in range(total + 1)]
-
-
-# Degrees in row and column of what bends an image: all products up to degree 4, without plane and
-# tilts. Chosen: they hold three in four parts of an error that varies over a third of the image.
-_BENDS = _degrees(4)[2:]
-SHAPES = len(_BENDS)
+# Lowest and highest total degree of what bends an image, without plane and tilts. Chosen: they hold
+# three in four parts of an error that varies over a third of the image.
+_BENDS = (2, 4)
+SHAPES = len(exponents(*_BENDS))
 """How many smooth shapes may differ from image to image."""
 BOWS = 3
 """How many of the shapes, the first ones, are of degree 2: a bow across, along and diagonally."""
@@ -226,10 +216,9 @@ def shapes(rows: Tensor, columns: Tensor) -> Tensor:
         columns: Of the pixels, shape (M,).
     """
     across, along = (
-        _legendre(Interval(float(one.min()), float(one.max())).scale(one), _BENDS[-1][0])
-        for one in (rows, columns)
+        Interval(float(one.min()), float(one.max())).scale(one).double() for one in (rows, columns)
     )
-    return torch.stack([across[i] * along[j] for i, j in _BENDS])
+    return torch.stack(products(along, across, *_BENDS))
 
 
 # Sides of the blocks, pixels. Chosen: twice as large each, up to a tenth of an image; what is alike

@@ -11,6 +11,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -283,7 +284,7 @@ def estimate_reference(
         a fit that took every point to the camera leaves no noise.
     """
     rays = dataset.ray_directions()
-    dataset = dataset.without(off_the_wall(rays))
+    dataset = dataset.without(partial(off_the_wall, rays=rays))
     noise = noise if dataset.has_amplitude else None
     model, domain, twist = fit.model, fit.domain, fit.solution.parameters.hand_eye_is_free
     hand_eye, poses = model.hand_eye().detach(), dataset.column("world_from_tool")

@@ -7,7 +7,7 @@ import torch
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from torch import Tensor
 
-from tofcorr.options import Number, Options, Size
+from tofcorr.options import Number, OpenOptions, Options, Size
 
 DepthKind = Literal["radial", "z"]
 """What a camera's depth means: along the ray, or along the optical axis."""
@@ -90,10 +90,8 @@ Camera = Annotated[CameraIntrinsics, AfterValidator(_bounded)]
 """A camera in a file: of bounded size."""
 
 
-class CameraSection(Options):
+class CameraSection(OpenOptions):
     """The section `camera` of `recording.yaml`."""
-
-    model_config = ConfigDict(extra="ignore")
 
     width: Size
     height: Size

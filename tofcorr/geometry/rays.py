@@ -5,11 +5,20 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
 from tofcorr.geometry.camera import CameraIntrinsics
+
+Rays = Float[Tensor, "H W 3"]
+"""Unit viewing rays of all pixels of an image."""
+Images = Float[Tensor, "B H W"]
+Chosen = Bool[Tensor, "B H W"]
+"""Which pixels of images."""
+
+Places = Float[Tensor, "N 2"]
+"""Columns and rows in an image, pixels."""
 
 # Fixed-point iterations of the inverse distortion. Each reduces the error by a factor of about the
 # relative distortion at the image border: with most lenses the rounding of float64 is left.
@@ -45,7 +54,7 @@ def ray_directions(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {
     return unit.reshape(camera.height, camera.width, 3)
 
 
-def _pixels(camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
+def _pixels(camera: CameraIntrinsics) -> Places:
     """Return the coordinates of all pixels, row by row: to the right, then down."""
     rows, columns = torch.arange(camera.height), torch.arange(camera.width)
     return torch.cartesian_prod(rows, columns).flip(1).double()
@@ -92,22 +101,18 @@ def moved_rays(
     return (toward * normal).sum(-1) * distance
 
 
-def _distorted(points: Float[Tensor, "N 2"], camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
+def _distorted(points: Places, camera: CameraIntrinsics) -> Places:
     """Return where the lens images points that a lens without distortion would image here."""
     distortion = torch.tensor([camera.distortion], dtype=torch.float64)
     return distort_points(points[None], camera.matrix_tensor()[None], distortion)[0]
 
 
-def _misses(
-    found: Float[Tensor, "N 2"], wanted: Float[Tensor, "N 2"], camera: CameraIntrinsics
-) -> Float[Tensor, "N"]:
+def _misses(found: Places, wanted: Places, camera: CameraIntrinsics) -> Float[Tensor, "N"]:
     off = torch.linalg.vector_norm(_distorted(found, camera) - wanted, dim=-1)
     return off.nan_to_num(nan=torch.inf, posinf=torch.inf)
 
 
-def _improved(
-    found: Float[Tensor, "N 2"], wanted: Float[Tensor, "N 2"], camera: CameraIntrinsics
-) -> Float[Tensor, "N 2"]:
+def _improved(found: Places, wanted: Places, camera: CameraIntrinsics) -> Places:
     """Return the points with those that are missed by more than rounding found by Newton's steps.
 
     A point that these do not find either, or find where the lens turns the image over, stays.
@@ -182,7 +187,7 @@ def planes_through(
 
 
 def ray_plane_distance(
-    ray_directions: Float[Tensor, "H W 3"],
+    ray_directions: Rays,
     normal: Float[Tensor, "*batch 3"],
     offset: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch H W"]:

@@ -431,8 +431,8 @@ class DepthCorrection(FrameCorrection):
         network = error.residual
         if network is None and residual is not None:
             network = ResidualNetwork(residual.network, domain)
-        terms = {key: value for key, value in error.state_dict().items() if key != "_extra_state"}
-        terms = {k: value for k, value in terms.items() if not k.startswith("residual.")}
+        others = "residual.", "_extra_state"
+        terms = {k: v for k, v in error.state_dict().items() if not k.startswith(others)}
         own.load_state_dict(terms, strict=False)
         if network is not None and own.residual is not None:
             if network.description() == own.residual.description():

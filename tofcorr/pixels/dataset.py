@@ -13,7 +13,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from pydantic import Field, NonNegativeInt, field_validator
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -34,7 +34,7 @@ from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.robust import without_strays
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import Chosen, Rays, ray_directions
 from tofcorr.options import Options
 
 Frames = Sequence[int] | np.ndarray
@@ -54,7 +54,7 @@ class Dataset:
     """
 
     recordings: tuple[Recording, ...]
-    exclude: Callable[[FrameBatch], Bool[Tensor, "B H W"]] | None = None
+    exclude: Callable[[FrameBatch], Chosen] | None = None
 
     def __post_init__(self) -> None:
         """Refuse recordings that are not of one camera in one setting."""
@@ -94,11 +94,11 @@ class Dataset:
         """Whether every recording holds amplitudes."""
         return all(recording.amplitude is not None for recording in self.recordings)
 
-    def ray_directions(self) -> Float[Tensor, "H W 3"]:
+    def ray_directions(self) -> Rays:
         """Return the camera's unit rays, shape (H, W, 3), float64; shared, not to be written."""
         return ray_directions(self.first.camera)
 
-    def without(self, further: Callable[[FrameBatch], Bool[Tensor, "B H W"]]) -> "Dataset":
+    def without(self, further: Callable[[FrameBatch], Chosen]) -> "Dataset":
         """Return the data set without further pixels: those where a function is True."""
         first = self.exclude
         exclude = further if first is None else lambda batch: first(batch) | further(batch)

@@ -1,18 +1,14 @@
-"""Masks of single images: outliers, other surfaces, edges and grazing incidence."""
+"""Masks of single images, True where a valid pixel is not used: outliers, other surfaces, edges."""
 
 import math
-from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.estimation.robust import deviation, fit_plane, largest_plane
-from tofcorr.geometry.rays import plane_in_frame, ray_plane_distance
-
-Mask = Callable[[FrameBatch], Bool[Tensor, "B H W"]]
-"""Returns True where a valid pixel of a batch is not used."""
+from tofcorr.geometry.rays import Chosen, Images, Rays, plane_in_frame, ray_plane_distance
 
 
 def some_pixels(used: Int[Tensor, "M"], most: int, seed: int) -> Int[Tensor, "S"]:
@@ -24,7 +20,7 @@ def some_pixels(used: Int[Tensor, "M"], most: int, seed: int) -> Int[Tensor, "S"
 
 
 def image_planes(
-    batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"], enough: int | None = 4096
+    batch: FrameBatch, ray_directions: Rays, enough: int | None = 4096
 ) -> Float[Tensor, "B 3"]:
     """Return g of the plane g . x = 1 of each image, fitted robustly in the camera frame.
 
@@ -44,91 +40,77 @@ def image_planes(
     return fit_plane(rays[some], batch.radial_distance.flatten(1)[:, seen][:, some], valid[:, some])
 
 
-def off_the_wall(rays: Float[Tensor, "H W 3"], gross: float = 15.0, least: float = 0.05) -> Mask:
-    """Return the mask of pixels far off the plane of most of their image.
+def off_the_wall(batch: FrameBatch, rays: Rays, gross: float = 15.0, least: float = 0.05) -> Chosen:
+    """Return which pixels are far off the plane of most of their image.
 
     Args:
+        batch: The images.
         rays: Unit rays, shape (H, W, 3).
         gross: Largest deviation of a pixel on the wall, in times the image's median deviation.
         least: It is at least this, metres: a camera's own error varies by centimetres.
     """
-
-    def mask(batch: FrameBatch) -> Tensor:
-        distance = torch.where(batch.valid, batch.radial_distance, torch.nan).flatten(1)
-        off = deviation(rays.to(distance).flatten(0, 1), distance, image_planes(batch, rays)).abs()
-        known = torch.where(off.isfinite(), off, torch.nan)
-        limit = (gross * known.nanmedian(dim=1, keepdim=True).values).clamp(min=least)
-        return ~(off <= limit).view(batch.valid.shape)
-
-    return mask
+    distance = torch.where(batch.valid, batch.radial_distance, torch.nan).flatten(1)
+    off = deviation(rays.to(distance).flatten(0, 1), distance, image_planes(batch, rays)).abs()
+    known = torch.where(off.isfinite(), off, torch.nan)
+    limit = (gross * known.nanmedian(dim=1, keepdim=True).values).clamp(min=least)
+    return ~(off <= limit).view(batch.valid.shape)
 
 
-def off_largest_plane(rays: Float[Tensor, "H W 3"], tolerance: float) -> Mask:
-    """Return the mask of pixels off the largest plane of their image.
+def off_largest_plane(batch: FrameBatch, rays: Rays, tolerance: float) -> Chosen:
+    """Return which pixels are off the largest plane of their image.
 
     The same image always gives the same result: the frame's number seeds the search.
 
     Args:
+        batch: The images.
         rays: Unit rays, shape (H, W, 3).
         tolerance: How far a pixel's distance may be from the plane's, metres. It must leave room
             for the camera's error across the image, which is what is to be calibrated.
     """
-
-    def mask(batch: FrameBatch) -> Tensor:
-        off = torch.ones_like(batch.valid).flatten(1)
-        for k, frame in enumerate(batch.indices.tolist()):
-            usable = batch.valid[k].flatten().nonzero()[:, 0]
-            distance = batch.radial_distance[k].flatten()[usable]
-            own = rays.to(distance).flatten(0, 1)[usable]
-            plane = largest_plane(own, distance, tolerance, torch.Generator().manual_seed(frame))
-            if plane is not None:
-                off[k, usable] = deviation(own, distance, plane).abs() > tolerance
-        return off.view(batch.valid.shape)
-
-    return mask
+    off = torch.ones_like(batch.valid).flatten(1)
+    for k, frame in enumerate(batch.indices.tolist()):
+        usable = batch.valid[k].flatten().nonzero()[:, 0]
+        distance = batch.radial_distance[k].flatten()[usable]
+        own = rays.to(distance).flatten(0, 1)[usable]
+        plane = largest_plane(own, distance, tolerance, torch.Generator().manual_seed(frame))
+        if plane is not None:
+            off[k, usable] = deviation(own, distance, plane).abs() > tolerance
+    return off.view(batch.valid.shape)
 
 
-def edges(contrast: float) -> Mask:
-    """Return the mask of pixels next to an edge of reflectivity, which mix light of two surfaces.
+def edges(batch: FrameBatch, contrast: float) -> Chosen:
+    """Return which pixels are next to an edge of reflectivity: they mix light of two surfaces.
 
     Args:
+        batch: The images.
         contrast: Brightest over darkest pixel of a 3 x 3 neighbourhood from which it is an edge.
     """
-
-    def mask(batch: FrameBatch) -> Tensor:
-        if batch.amplitude is None:
-            return torch.zeros_like(batch.valid)
-        pool = torch.nn.functional.max_pool2d
-        high = torch.where(batch.valid, batch.amplitude, 0.0)
-        low = torch.where(batch.valid, batch.amplitude, torch.inf)
-        brightest = pool(high[:, None], 3, stride=1, padding=1)[:, 0]
-        darkest = -pool(-low[:, None], 3, stride=1, padding=1)[:, 0]
-        return brightest > contrast * darkest
-
-    return mask
+    if batch.amplitude is None:
+        return torch.zeros_like(batch.valid)
+    pool = torch.nn.functional.max_pool2d
+    high = torch.where(batch.valid, batch.amplitude, 0.0)
+    low = torch.where(batch.valid, batch.amplitude, torch.inf)
+    brightest = pool(high[:, None], 3, stride=1, padding=1)[:, 0]
+    darkest = -pool(-low[:, None], 3, stride=1, padding=1)[:, 0]
+    return brightest > contrast * darkest
 
 
-def grazing(limit_deg: float, rays: Float[Tensor, "H W 3"]) -> Mask:
-    """Return the mask of pixels that see the wall too obliquely, where multipath is large.
+def grazing(batch: FrameBatch, limit_deg: float, rays: Rays) -> Chosen:
+    """Return which pixels see the wall too obliquely, where multipath is large.
 
     The wall's direction is fitted to the measured points; no hand-eye transform is needed.
 
     Args:
+        batch: The images.
         limit_deg: Largest angle between the ray and the wall's normal, degrees.
         rays: Unit rays, shape (H, W, 3).
     """
-
-    def mask(batch: FrameBatch) -> Tensor:
-        normal = torch.nn.functional.normalize(image_planes(batch, rays), dim=1)
-        cosine = torch.einsum("hwa,ba->bhw", rays.to(normal), normal).abs()
-        return cosine < math.cos(math.radians(limit_deg))
-
-    return mask
+    normal = torch.nn.functional.normalize(image_planes(batch, rays), dim=1)
+    cosine = torch.einsum("hwa,ba->bhw", rays.to(normal), normal).abs()
+    return cosine < math.cos(math.radians(limit_deg))
 
 
-def raw_errors(
-    batch: FrameBatch, rays: Float[Tensor, "H W 3"], tool_from_camera: Float[Tensor, "4 4"]
-) -> Float[Tensor, "B H W"]:
+def raw_errors(batch: FrameBatch, rays: Rays, tool_from_camera: Float[Tensor, "4 4"]) -> Images:
     """Return measured less true distances along the rays, metres; NaN where a ray meets no plane.
 
     Args:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -15,9 +16,10 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
+from tofcorr.geometry.rays import Images, Rays
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset, Frames, recorded_hand_eye
-from tofcorr.pixels.masks import Mask, edges, grazing, off_largest_plane, off_the_wall, raw_errors
+from tofcorr.pixels.masks import edges, grazing, off_largest_plane, off_the_wall, raw_errors
 
 
 def pixels_of_image(batch: FrameBatch, k: int, chosen: Int[Tensor, "M"]) -> Pixels:
@@ -108,8 +110,8 @@ def draw_pixels(dataset: Dataset, frames: Frames, number: int, seed: int) -> Fra
 
 
 def distance_to_plane(
-    model: CalibrationModel, batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]
-) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+    model: CalibrationModel, batch: FrameBatch, ray_directions: Rays
+) -> tuple[Images, Images]:
     """Return the signed distance of every corrected point to its plane, and the cosine of its ray.
 
     Pixels that are not valid are read as 1 m and amplitude 1, so that no NaN reaches the model.
@@ -196,7 +198,7 @@ def thinned(values: np.ndarray, most: int) -> np.ndarray:
 
 def errors_along_ray(
     dataset: Dataset, model: CalibrationModel, batch: FrameBatch
-) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+) -> tuple[Images, Images]:
     """Return measured minus true distance in mm (B, H, W), NaN where not valid, and cosines."""
     rays = dataset.ray_directions().to(batch.radial_distance)
     residual, cosine = distance_to_plane(model, batch, rays)
@@ -261,8 +263,8 @@ def _repeat_differences(
     return differences, amplitudes
 
 
-def _outside_window(dataset: Dataset, half_width: float, frames: Frames | None) -> Mask:
-    """Return the mask of pixels whose raw error is off by more than a window, or unknown.
+def _within_window(dataset: Dataset, half_width: float, frames: Frames | None) -> Dataset:
+    """Return the data set without pixels whose raw error is off by more than a window, or unknown.
 
     Mixed pixels at edges, reflections and misplaced masks are off by decimetres; the errors to be
     calibrated are centimetres. In a squared loss a few such pixels would outweigh all others. The
@@ -292,7 +294,9 @@ def _outside_window(dataset: Dataset, half_width: float, frames: Frames | None) 
         raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
     centre = float(np.median(finite.numpy()))
     # A comparison with NaN is False: pixels without a plane count as outside.
-    return lambda batch: ~((raw_errors(batch, rays, transform) - centre).abs() <= half_width)
+    return dataset.without(
+        lambda batch: ~((raw_errors(batch, rays, transform) - centre).abs() <= half_width)
+    )
 
 
 class MaskOptions(Options):
@@ -340,13 +344,13 @@ def usable_pixels(
             said = "outlier_window_mm compares with the recorded planes, which are estimated"
             advice = "use weights.robust or mask: ransac instead"
             raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
-        window = options.outlier_window_mm / 1000
-        dataset = dataset.without(_outside_window(dataset, window, frames))
+        dataset = _within_window(dataset, options.outlier_window_mm / 1000, frames)
     if options.mask == "ransac":
-        dataset = dataset.without(off_largest_plane(rays, options.mask_tolerance_mm / 1000))
+        tolerance = options.mask_tolerance_mm / 1000
+        dataset = dataset.without(partial(off_largest_plane, rays=rays, tolerance=tolerance))
     if options.edge_contrast is not None:
         dataset.require("amplitude", "the mask of edges (edge_contrast)")
-        dataset = dataset.without(edges(options.edge_contrast))
+        dataset = dataset.without(partial(edges, contrast=options.edge_contrast))
     if options.grazing_deg is not None:
-        dataset = dataset.without(grazing(options.grazing_deg, rays))
-    return dataset.without(off_the_wall(rays)) if robust else dataset
+        dataset = dataset.without(partial(grazing, limit_deg=options.grazing_deg, rays=rays))
+    return dataset.without(partial(off_the_wall, rays=rays)) if robust else dataset

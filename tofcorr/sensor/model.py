@@ -16,7 +16,7 @@ from tofcorr.error_terms.condition_terms import Condition, with_means
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.noise import NoiseModel
-from tofcorr.files import staged_file
+from tofcorr.files import write_text
 from tofcorr.sensor.scene import Eye, Group, ImageEffects, SceneFrames, conditions_of
 from tofcorr.sensor.sensor_file import ErrorSection, SensorFile, read_sensor, sensor_text
 
@@ -264,8 +264,7 @@ class SensorModel(DescribedModule):
         Raises:
             ExportError: The file cannot be written.
         """
-        with staged_file(file) as part:
-            part.write_text(sensor_text(self.to_sensor_file()), encoding="utf-8")
+        write_text(file, sensor_text(self.to_sensor_file()))
 
     def to_sensor_file(self) -> SensorFile:
         """Return the content of `sensor.yaml` with the parameters of now."""
@@ -285,7 +284,7 @@ class SensorModel(DescribedModule):
         if values["noise"] is not None:
             for name in ("floor_m", "shot_m", "read_m"):
                 del values["noise"][name]
-        return {"dtype": str(self.eye.rays.dtype), **values}
+        return {"dtype": str(self.eye.ray_directions.dtype), **values}
 
     def forward(
         self,
@@ -319,7 +318,9 @@ class SensorModel(DescribedModule):
             FrameError: The frames are of another size or dtype, or an amplitude is needed and
                 nothing says it.
         """
-        known = conditions_of(conditions, true_depth.shape[:-2], self.eye.rays.device, self._ranges)
+        known = conditions_of(
+            conditions, true_depth.shape[:-2], self.eye.ray_directions.device, self._ranges
+        )
         parts = (self.base, self.effects, self.noise, self.dropouts)
         needed = any(part.needs_amplitude for part in parts if part is not None)
         frames = self.eye(true_depth, amplitude, reflectivity, known, needs_amplitude=needed)
@@ -366,8 +367,8 @@ class SensorModel(DescribedModule):
 
         For a recording in parts: frames of later parts depend on those before.
         """
-        known = conditions_of(conditions, (count,), self.eye.rays.device, self._ranges)
-        return self.effects.frame_shift(known, count, self.eye.rays)
+        known = conditions_of(conditions, (count,), self.eye.ray_directions.device, self._ranges)
+        return self.effects.frame_shift(known, count, self.eye.ray_directions)
 
     def _expected(self, frames: SceneFrames, of_frame: Tensor | None) -> Tensor:
         """Return the expected distance along the ray, shape (B, H, W), metres."""
@@ -379,7 +380,9 @@ class SensorModel(DescribedModule):
         conditions = with_means(known, self.base.mean_conditions)
         error = self.base(at.distance, frames.amplitude, conditions)
         if of_frame is None:
-            of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays)
+            of_frame = self.effects.frame_shift(
+                known, len(frames.distance), self.eye.ray_directions
+            )
         error = error + of_frame.to(error.dtype).reshape(-1, 1, 1)
         error = error + self.effects.shift(Group.DELAY, at)
         at = replace(at, distance=at.distance + error) if one_by_one else frames

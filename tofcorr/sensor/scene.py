@@ -11,11 +11,10 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from tofcorr.conditions import condition
-from tofcorr.correction.model import refuse_other_than_tensor
+from tofcorr.correction.model import CameraGeometry
 from tofcorr.error_terms.condition_terms import Condition, in_si_units
 from tofcorr.errors import ConfigError, FrameError
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.sensor_file import SensorFile
 from tofcorr.simulation.effects.base import (
     AMPLITUDE,
@@ -83,31 +82,21 @@ class SceneFrames:
         )
 
 
-class Eye(nn.Module):
-    """Rays and light of a sensor.
+class Eye(CameraGeometry):
+    """Geometry and light of a sensor.
 
     Args:
         sensor: The camera.
-
-    Attributes:
-        rays: Unit viewing rays, shape (H, W, 3).
-        radial_of_depth: Radial distance over depth, shape (H, W): 1 for radial depth.
     """
 
-    rays: Tensor
-    radial_of_depth: Tensor
+    advice = "Render with the sensor's camera."
 
     def __init__(self, sensor: SensorFile) -> None:
-        super().__init__()
         camera = sensor.intrinsics()
         if min(camera.width, camera.height) < 2:
             raise ConfigError("camera: a sensor compares neighbours, and needs 2 x 2 at least.")
+        super().__init__(camera, sensor.depth_kind)
         self.light = sensor.light
-        rays = ray_directions(camera)
-        self.register_buffer("rays", rays)
-        slant = rays[..., 2]
-        scale = 1.0 / slant if sensor.depth_kind == "z" else torch.ones_like(slant)
-        self.register_buffer("radial_of_depth", scale)
 
     def forward(
         self,
@@ -131,40 +120,28 @@ class Eye(nn.Module):
             FrameError: The frames are of another size or dtype, or an amplitude is needed and
                 nothing says it.
         """
-        given = {"true_depth": true_depth, "amplitude": amplitude, "reflectivity": reflectivity}
-        for name, image in given.items():
-            self._check(name, image, true_depth)
+        self.check(true_depth=true_depth, amplitude=amplitude, reflectivity=reflectivity)
         if amplitude is self.light is None and (needs_amplitude or reflectivity is not None):
             said = "amplitude: the measurement depends on it, and the sensor's file has no section"
             raise FrameError(f"{said} 'light'; pass amplitudes in the camera's units.")
-        depth, lit, shares = (
-            None if image is None else image.reshape(-1, *image.shape[-2:]).to(self.rays.dtype)
-            for image in given.values()
+        rays = self.ray_directions
+        depth = true_depth.reshape(-1, *true_depth.shape[-2:]).to(rays)
+        lit, shares = (
+            None if image is None else image.reshape(depth.shape).to(rays)
+            for image in (amplitude, reflectivity)
         )
-        assert depth is not None
         seen = torch.isfinite(depth) & (depth > 0)
         distance = torch.where(seen, depth * self.radial_of_depth, 1.0)
-        surface = cache(lambda: surfaces(distance, seen, self.rays))
+        surface = cache(lambda: surfaces(distance, seen, rays))
         if lit is None and self.light is not None:
             shares = self.light.usual_reflectivity if shares is None else shares
             # Lambertian surfaces lit from beside the camera.
             lit = self.light.amplitude_at_1m * surface()[0] * shares / distance.square()
-            lit = lit * self.rays[..., 2] ** self.light.vignetting_exponent
+            lit = lit * rays[..., 2] ** self.light.vignetting_exponent
         amplitude = torch.zeros_like(depth)
         if lit is not None:
             amplitude = torch.where(seen & torch.isfinite(lit), lit, 0.0)
-        return SceneFrames(self.rays, distance, amplitude, seen, conditions, surface)
-
-    def _check(self, name: str, image: Tensor | None, depth: Tensor) -> None:
-        if image is None:
-            return
-        refuse_other_than_tensor(name, image)
-        height, width = self.radial_of_depth.shape
-        if image.shape != depth.shape or list(image.shape[-2:]) != [height, width]:
-            said = f"expected shape (..., {height}, {width}) of all images of a scene, got"
-            raise FrameError(f"{name}: {said} {[*image.shape]}. Render with the sensor's camera.")
-        if not image.is_floating_point():
-            raise FrameError(f"{name}: expected floating point, got {image.dtype}.")
+        return SceneFrames(rays, distance, amplitude, seen, conditions, surface)
 
 
 def surfaces(distance: Tensor, seen: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, field_validator
+from pydantic import BeforeValidator, Field
 
 from tofcorr.conditions import condition
 from tofcorr.error_terms.base import Domain, Interval
@@ -22,6 +22,7 @@ from tofcorr.options import (
     Options,
     PositiveNumber,
     Range,
+    among,
     dump_yaml,
     resolve_options,
     shipped_names,
@@ -38,6 +39,9 @@ _HEADING = """\
 # effects: as in a simulator's YAML. noise, dropouts: of one pixel in one frame.
 # Lengths are metres; amplitudes are in the camera's own linear units.
 """
+
+
+_Column = Annotated[str, among(NAME_OF, "condition")]
 
 
 class ErrorSection(Options):
@@ -84,15 +88,7 @@ class ValiditySection(Options):
     radial_distance_m: Range
     amplitude: Range | None = None
     normalised_amplitude: Range | None = None
-    conditions: dict[str, ConditionRange] = Field(default_factory=dict)
-
-    @field_validator("conditions")
-    @classmethod
-    def _known(cls, given: dict[str, ConditionRange]) -> dict[str, ConditionRange]:
-        for column in given:
-            if column not in NAME_OF:
-                raise ValueError(f"'{column}' is no condition; known: {', '.join(NAME_OF)}")
-        return given
+    conditions: dict[_Column, ConditionRange] = Field(default_factory=dict)
 
 
 class LightSection(Options):

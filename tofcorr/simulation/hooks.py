@@ -26,7 +26,7 @@ from torch import Tensor
 
 from tofcorr.conditions import Conditions
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import phase_from_radial_distance
+from tofcorr.geometry.rays import phase_from_radial_distance, plane_in_frame
 
 STAGES = ("pose", "geometry", "light", "delay", "signal", "taps", "readout")
 """The stages in order; an effect may define `on_<stage>(state)` for any of them."""
@@ -60,6 +60,11 @@ class FrameFacts(Conditions[Tensor]):
         known = vars(self).items()
         chosen: dict[str, Any] = {k: None if v is None else v[frames] for k, v in known}
         return type(self)(**chosen)
+
+    def planes_seen(self, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
+        """Return normal (F, 3) and offset (F,) of each frame's plane in the camera's frame."""
+        pose = self.world_from_tool @ tool_from_camera
+        return plane_in_frame(self.normal_world, self.offset, pose)
 
 
 @dataclass(kw_only=True)

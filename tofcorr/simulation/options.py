@@ -3,7 +3,7 @@
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
-from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 from torch import Tensor
 
 from tofcorr.data.recording import CameraSection, DepthKind
@@ -17,6 +17,7 @@ from tofcorr.options import (
     PositiveNumber,
     Range,
     Vector3,
+    among,
 )
 from tofcorr.simulation.scene import SceneOptions
 from tofcorr.simulation.signal import DelayOptions, Harmonic, LightOptions, ReadoutOptions
@@ -82,12 +83,6 @@ class CameraMountOptions(Options):
         return se3.assemble(se3.exp(torch.deg2rad(twist))[:3, :3], translation)
 
 
-def _recordable(name: str) -> str:
-    if name not in COLUMN_OF:
-        raise ValueError(f"expected one of {', '.join(COLUMN_OF)}")
-    return name
-
-
 class ConditionOptions(Options):
     """How the conditions of the frames are drawn.
 
@@ -117,7 +112,7 @@ class ConditionOptions(Options):
     body_rise_c: Number = 15.0
     body_time_constant_s: PositiveNumber = 600.0
     power_on_s: NonNegativeNumber = 30.0
-    recorded: tuple[Annotated[str, AfterValidator(_recordable)], ...] = tuple(COLUMN_OF)
+    recorded: tuple[Annotated[str, among(COLUMN_OF, "optional column")], ...] = tuple(COLUMN_OF)
 
 
 class RobotOptions(Options):

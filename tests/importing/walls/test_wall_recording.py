@@ -154,7 +154,7 @@ def test_known_and_unknown_still_say_what_the_header_does_not(
 def _with_planes_of_nonsense(recording: Recording, out: Path, only: str | None = None) -> Recording:
     """Copy a recording, its planes turned by 20 degrees and moved by 200 mm, each another way."""
     turns = {name: k for k, name in enumerate(np.unique(recording.frames.target))}
-    with RecordingWriter.with_header_of(out, recording) as writer:
+    with RecordingWriter.like(out, recording, rows=False) as writer:
         for k in range(recording.num_frames):
             row = recording.frames.row(k)
             if only in (None, row.target):

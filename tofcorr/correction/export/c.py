@@ -1,7 +1,7 @@
 """The corrector as C99 source, for robots and controllers without any library.
 
-Its text stands in the templates of `c_code`. A term is written as cubic pieces over equal segments,
-which C evaluates without knowing the term.
+Its text stands in the templates beside this file. A term is written as cubic pieces over equal
+segments, which C evaluates without knowing the term.
 """
 
 import ctypes
@@ -136,7 +136,7 @@ def c_sources(state: CalibrationState, metadata: str, name: str) -> dict[str, st
         ConfigError: C cannot hold one of the terms.
     """
     environment = Environment(
-        loader=PackageLoader("tofcorr.correction.export.c_code", ""),
+        loader=PackageLoader("tofcorr.correction.export", ""),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -167,9 +167,9 @@ def _filled_in(state: CalibrationState, metadata: str, name: str) -> dict[str, A
     row_error, column_error, rest = separated(model.pixel_error() + runtime.left_over)
     pieces = [pieces_of(term, limits) for term in polynomials(model)[1]]
     variables = {axis.variable for one in pieces for axis in one.axes}
-    needs_amplitude = model.needs_amplitude()
-    most = state.saturation_amplitude
-    saturation = most is not None and not (needs_amplitude and amplitudes.high < np.float32(most))
+    saturation = state.saturation_amplitude
+    if runtime.needs_amplitude and amplitudes.high < np.float32(saturation or 0.0):
+        saturation = None  # The calibrated range excludes saturated pixels already.
     return {
         "title": comment(f"Depth correction {state.name}."),
         "version": __version__,
@@ -177,23 +177,19 @@ def _filled_in(state: CalibrationState, metadata: str, name: str) -> dict[str, A
         # Pixels that are corrected together: five arrays of them take a fifth of a first-level
         # cache of 32 KiB; fewer spend more on the ends of the loops. Set on benchmarks/runtime.py.
         "block": min(320, camera.width),
-        "width": camera.width,
-        "height": camera.height,
+        "camera": camera,
         "row_error": row_error,
         "column_error": column_error,
         "error_image": rest,
         "z_of_radial": ray_directions(camera)[..., 2] if is_z else None,
         "limits": limits,
-        "saturation_amplitude": most,
         "is_z": is_z,
         # The clamped distance is read in float32; depth along the axis is tested in double.
         "uses_distance": not is_z or "distance" in variables or runtime.distance.degree > 0,
         "saturation": saturation,
-        "needs_amplitude": needs_amplitude,
-        "reads_amplitude": needs_amplitude or saturation,
+        "reads_amplitude": runtime.needs_amplitude or saturation,
         "has_log": "log_amplitude" in variables or (network is not None and network.uses_amplitude),
         "runtime": runtime,
-        "normalised": runtime.has_normalised,
         "pieces": pieces,
         "network": network,
         "tolerance": AGREEMENT,

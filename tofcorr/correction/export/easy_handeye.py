@@ -7,7 +7,7 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.pose import Mount
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
-from tofcorr.files import staged_file
+from tofcorr.files import write_text
 from tofcorr.options import dump_yaml
 
 _KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -55,5 +55,4 @@ def export_easy_handeye(
         parameters |= {"name": path.stem, "calibration_type": kind}
         parameters |= {"freehand_robot_movement": True}
         mapping = {"parameters": parameters, "transform": mount.mapping()}
-    with staged_file(path) as part:
-        part.write_text(mount.comment() + dump_yaml(mapping), encoding="utf-8")
+    write_text(path, mount.comment() + dump_yaml(mapping))

@@ -90,11 +90,10 @@ def _pose(mount: Mount | None) -> dict[str, Value]:
 
 
 def _coefficients(error: ErrorModel) -> list[dict[str, Value]]:
-    units = error.paper_units()
     return [
-        {"group": group, "symbol": symbol, "value": value, "unit": units[group][symbol]}
-        for group, named in error.paper_coefficients().items()
-        for symbol, value in named.items()
+        {"group": group, "symbol": symbol, "value": value, "unit": unit}
+        for group, named in error.paper_values().items()
+        for symbol, (value, unit) in named.items()
     ]
 
 

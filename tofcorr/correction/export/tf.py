@@ -6,7 +6,7 @@ from pathlib import Path
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.pose import Mount, decimals
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files import staged_file
+from tofcorr.files import write_text
 from tofcorr.options import dump_yaml
 
 
@@ -45,5 +45,4 @@ def export_tf(corrector: DepthCorrector, path: Path | str, reference: Calibratio
         f"commands:\n  ros2: |-\n    ros2 run {program} {shlex.join(words)}\n"
         f"  ros1: |-\n    rosrun {program} {shlex.join([*numbers, names.tool, names.camera])}\n"
     )
-    with staged_file(path) as part:
-        part.write_text(mount.comment() + dump_yaml(mapping) + commands, encoding="utf-8")
+    write_text(path, mount.comment() + dump_yaml(mapping) + commands)

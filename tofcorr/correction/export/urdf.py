@@ -1,15 +1,16 @@
 """The camera's pose as a fixed joint of a robot description (URDF, xacro)."""
 
 import math
+from importlib.resources import files
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from jinja2 import Template
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.pose import Mount, decimals
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files import staged_file
+from tofcorr.files import write_text
 
 
 def export_urdf(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -28,8 +29,22 @@ def export_urdf(corrector: DepthCorrector, path: Path | str, reference: Calibrat
         ConfigError: The calibration has no estimated hand-eye transform.
         ExportError: The file cannot be written.
     """
-    with staged_file(path) as part:
-        part.write_text(_description(Mount(reference, "urdf")), encoding="utf-8")
+    mount = Mount(reference, "urdf")
+    template = Template(
+        files("tofcorr.correction.export").joinpath("urdf.xacro.j2").read_text("utf-8"),
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    text = template.render(
+        # Two hyphens would end an XML comment.
+        words=[line.replace("--", "- -") for line in mount.in_words()],
+        parent=mount.frames.tool,
+        child=mount.frames.camera,
+        xyz=" ".join(decimals(mount.translation)),
+        rpy=" ".join(decimals(roll_pitch_yaw(mount.transform[:3, :3]))),
+    )
+    write_text(path, text)
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:
@@ -45,25 +60,3 @@ def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:
         s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]
     )
     return roll, pitch, yaw
-
-
-def _description(mount: Mount) -> str:
-    parent, child = mount.frames.tool, mount.frames.camera
-    xyz = " ".join(decimals(mount.translation))
-    rpy = " ".join(decimals(roll_pitch_yaw(mount.transform[:3, :3])))
-    # Two hyphens would end an XML comment.
-    words = "\n".join(f"       {line.replace('--', '- -')}" for line in mount.in_words())
-    return f"""<?xml version="1.0"?>
-<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="tofcorr_camera">
-  <!--
-{words}
-       Include it where the parent link is defined: <xacro:include filename="..."/>
-  -->
-  <link name={quoteattr(child)}/>
-  <joint name={quoteattr(f"{parent}_to_{child}")} type="fixed">
-    <origin xyz="{xyz}" rpy="{rpy}"/>
-    <parent link={quoteattr(parent)}/>
-    <child link={quoteattr(child)}/>
-  </joint>
-</robot>
-"""

@@ -372,7 +372,7 @@ def _fingerprint(
         mostly: Structure lies between images if they hold more than this share of it, and within
             images if these do. Chosen.
     """
-    clauses = [named.study.candidates.probes[name].trace for name in named.probes]
+    clauses = [named.study.probes[name].trace for name in named.probes]
     whole = max(after.within, 0.0) + max(after.between, 0.0)
     share = after.between / max(whole, OpenSet.least_variance)
     if share > mostly:

@@ -108,7 +108,7 @@ class NamedEffects:
 
     def columns_of(self, model: Model) -> tuple[str, ...]:
         """Return the effects of a model that have columns, probes left out."""
-        return tuple(name for name in model if name in self.study.candidates.effects)
+        return tuple(name for name in model if name in self.study.effects)
 
 
 def name_effects(study: Study) -> NamedEffects:
@@ -141,7 +141,7 @@ def name_effects(study: Study) -> NamedEffects:
         probes=tuple(name for name in models.best()[0] if name not in CATALOGUE),
         closed={
             name: base - evidence.left_out_squares((name,))
-            for name in (*study.candidates.effects, *evidence.maps)
+            for name in (*study.effects, *evidence.maps)
         },
         squares=float(base.sum()),
         tested=shape[1] >= tests.least_images,
@@ -172,7 +172,7 @@ def _with_names(found: NamedEffects, evidence: Evidence) -> NamedEffects:
     sets = {n: own for n, own in sets.items() if found.probability_of_any(*own) > tests.named_from}
     maps = {name: evidence.maps[name].values for name in sets if name in evidence.maps}
     for name, values in maps.items():
-        spent = {name, *study.candidates.maps[name].contains}
+        spent = {name, *study.maps[name].contains}
         study = without_map(study, values, spent)
     study = with_poses_reestimated(study, found.columns_of(tuple(sets)))
     return replace(found, study=study, names=tuple(sets), maps=maps, sets=sets)

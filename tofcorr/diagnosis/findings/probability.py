@@ -93,7 +93,7 @@ class Evidence:
         self._base = _solved(self._factor, some[:, :base, base:])
         self.gram = some[:, base:, base:] - self._base.mT @ self._base
         residual = study.residual_of(beside, gls=True)
-        self.maps = {n: FittedMap(study, e, residual) for n, e in study.candidates.maps.items()}
+        self.maps = {n: FittedMap(study, e, residual) for n, e in study.maps.items()}
         self._studies = {"": study}
         self._given: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
 

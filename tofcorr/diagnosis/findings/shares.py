@@ -155,7 +155,7 @@ def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | No
     """Return a named map's values, or what an effect adds beyond its columns, (M,), metres."""
     if name in named.maps:
         return named.maps[name]
-    effects = study.candidates.effects
+    effects = study.effects
     if effects[name].linear:
         return None
     if [n for n in named.columns if not effects[n].linear] == [name]:

@@ -177,7 +177,7 @@ def _sums(
     rest = base.new_zeros(len(base), layout.base - base.shape[1])
     columns = {BASE: torch.cat([base, rest], dim=1)}
     for name in names:
-        columns[name] = study.candidates.effects[name].scaled_columns(inputs)
+        columns[name] = study.effects[name].scaled_columns(inputs)
     for part in columns.values():
         seen &= part.isfinite().all(dim=1)
     sigma = study.fit.noise.at(brightness_of(made), torch.zeros_like(made.frame))
@@ -212,8 +212,8 @@ def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str
     generator = torch.Generator().manual_seed(seed)
     found: dict[str, float | None] = {}
     for name in named.closed:
-        if name not in study.candidates.effects:  # A map of independent values.
-            needed = noncentrality(study, len(study.candidates.maps[name].coefficients))
+        if name not in study.effects:  # A map of independent values.
+            needed = noncentrality(study, len(study.maps[name].coefficients))
             detectable = (needed / float(study.weight.sum())) ** 0.5
             found[name] = max(detectable, study.material_mm / 1000)
         elif 1 - absorbed_share(study, name) < LEAST_LEFT:
@@ -283,7 +283,7 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
         advice.append(f"{goal}: {CATALOGUE[effect].remedy}.")
     return advice + [
         f"{name} could not be tested: it needs {', '.join(wants)}. Best: {CATALOGUE[name].remedy}."
-        for name, wants in study.candidates.missing.items()
+        for name, wants in study.missing.items()
     ]
 
 
@@ -292,7 +292,7 @@ def _questions(study: Study, named: NamedEffects) -> list[Question]:
 
     Three at most: what a person records in one go.
     """
-    effects = study.candidates.effects
+    effects = study.effects
     sets = [(own[0], own[1:]) for own in named.cause_sets if len(own) > 1]
     asked = [one for one in sets if effects.keys() >= {one[0], *one[1]}]
     hidden = (name for name in hidden_effects(study) if name not in named.names)

@@ -209,7 +209,7 @@ def absorption_table(study: Study) -> np.ndarray:
         remains the share that each other effect (column) absorbs; NaN of itself and where nothing
         remains. Shape (E, 1 + E).
     """
-    names, layout, gram = tuple(study.candidates.effects), study.sums.layout, study.unabsorbed
+    names, layout, gram = tuple(study.effects), study.sums.layout, study.unabsorbed
     members = [torch.arange(*layout.effects[name]) for name in names]
     table = np.full((len(names), 1 + len(names)), np.nan)
     for row, (name, own) in enumerate(zip(names, members, strict=True)):
@@ -223,7 +223,7 @@ def absorption_table(study: Study) -> np.ndarray:
 
 def absorption_map(result: "DiagnosisResult") -> Figure:
     """Draw the share of each effect that calibration absorbs, then that other effects absorb."""
-    names = tuple(result.evidence.study.candidates.effects)
+    names = tuple(result.evidence.study.effects)
     figure, (axes,) = panels(5)
     axes.set_facecolor("#f3e9e9")
     shown = axes.imshow(

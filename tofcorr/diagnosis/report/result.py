@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial, partialmethod
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -138,12 +138,8 @@ class DiagnosisResult:
             "version": 3,
             "simulator": self.simulator_kind,
             "stages": [
-                {
-                    "name": stage.name,
-                    "gap_mm": _mm(stage.gap),
-                    "ci": None if stage.gap is None else _mm(stage.gap.interval),
-                    "where": _regions(stage, 5),  # What fits beside a picture.
-                }
+                # As many places as fit beside a picture.
+                {"name": stage.name, **_sized(stage.gap), "where": _regions(stage, 5)}
                 for stage in self.stages
             ],
             "attribution": [
@@ -182,7 +178,7 @@ class DiagnosisResult:
             "ranking": [_ranked(self.evidence.study, named, name) for name in named.ranking]
             + [
                 {"effect": name, **untested, "available": False, "missing": missing}
-                for name, missing in self.evidence.study.candidates.missing.items()
+                for name, missing in self.evidence.study.missing.items()
             ],
             "where": _regions(self.stages[1], 60),  # More than anyone reads.
             "transfer_mm": transfer
@@ -204,8 +200,7 @@ class DiagnosisResult:
             | {"frames": closure.frames},
             "degraded": degraded
             and {
-                "gap_mm": _mm(degraded.gap),
-                "ci": _mm(degraded.gap.interval),
+                **_sized(degraded.gap),
                 "poses": degraded.poses,
                 "left_out": list(degraded.left_out),
             },
@@ -232,30 +227,12 @@ class DiagnosisResult:
 
         return all_figures(self)
 
-    def _draw(self, name: str) -> "Figure":
+    def plot(self, name: str) -> "Figure":
+        """Return one figure, by its name in `tofcorr.diagnosis.report.figures.FIGURES`."""
         # With it comes matplotlib, which takes half as long to import as torch.
         from tofcorr.diagnosis.report.figures import FIGURES
 
         return FIGURES[name](self)
-
-    plot_gap = partialmethod(_draw, "stages")
-    """Draw the gap at each stage, with intervals."""
-    plot_attribution = partialmethod(_draw, "attribution")
-    """Draw the share of each cause in the squared gap, with intervals."""
-    plot_where_as_given = partialmethod(_draw, "where_as_given")
-    """Draw the bias of the simulator as given; of the fitted one without a simulator."""
-    plot_where = partialmethod(_draw, "where")
-    """Draw the bias after recalibration, and with the effects, along covariates."""
-    plot_image = partialmethod(_draw, "map")
-    """Draw the mean residual over the image at each stage."""
-    plot_pose_series = partialmethod(_draw, "series")
-    """Draw the mean residual of each pose in the order of the recording."""
-    plot_effects = partialmethod(_draw, "which")
-    """Draw what each effect closes, with intervals, and its score."""
-    plot_absorption = partialmethod(_draw, "aliases")
-    """Draw the share of each effect that calibration and other effects absorb."""
-    plot_poses = partialmethod(_draw, "poses")
-    """Draw the held-out error of each pose before and after the effects."""
 
 
 def _ranked(study: Study, named: NamedEffects, name: str) -> dict[str, Any]:
@@ -263,7 +240,7 @@ def _ranked(study: Study, named: NamedEffects, name: str) -> dict[str, Any]:
     closes, fraction = named.closed_gap(name)
     members = next((own for own in named.cause_sets if name in own), ())
     absorbed = None
-    if name in study.candidates.effects:
+    if name in study.effects:
         absorbed = round(absorbed_share(study, name), 3)
     return {
         "effect": name,
@@ -299,6 +276,11 @@ def _mm(metres: float | tuple[float, float] | None) -> Any:  # noqa: ANN401 - as
     if isinstance(metres, tuple):
         return [_mm(end) for end in metres]
     return None if metres is None else round(metres * 1e3, 4)
+
+
+def _sized(gap: Estimated | None) -> dict[str, Any]:
+    """Return a gap and its interval, millimetres."""
+    return {"gap_mm": _mm(gap), "ci": None if gap is None else _mm(gap.interval)}
 
 
 def _rounded(shares: tuple[float, float] | list[float]) -> list[float | None]:

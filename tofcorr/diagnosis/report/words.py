@@ -272,7 +272,7 @@ def effect_line(named: NamedEffects, name: str) -> str:
         words += f"; these data cannot tell it ({own}) from {', '.join(rivals)}"
     there = probable(named.probability_of_any(*named.sets[name]))
     words += f"; {'one of them' if rivals else 'it'} is {there} there"
-    absorbed = absorbed_share(study, name) if name in study.candidates.effects else 0.0
+    absorbed = absorbed_share(study, name) if name in study.effects else 0.0
     if absorbed > 0.2:
         words += f"; calibration absorbs about {percent(absorbed)} of such an effect"
     return words
@@ -312,8 +312,8 @@ def list_remarks(
         first, *more = remainder.fingerprint
         clauses = [f"The gap that remains {first}.", *(f"It {clause}." for clause in more)]
         remarks.append(" ".join(clauses))
-    if study.candidates.missing:
-        remarks.append(f"Not tested (missing data): {', '.join(study.candidates.missing)}.")
+    if study.missing:
+        remarks.append(f"Not tested (missing data): {', '.join(study.missing)}.")
     return tuple(filter(None, remarks))
 
 

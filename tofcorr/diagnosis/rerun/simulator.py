@@ -120,10 +120,10 @@ class Evidence:
         study, named = self.study, self.named
         fitted = fitted_coefficients(named.study, named.columns)
         effects: list[CatalogueEffect] = [
-            named.study.candidates.effects[name].with_coefficients(c) for name, c in fitted.items()
+            named.study.effects[name].with_coefficients(c) for name, c in fitted.items()
         ]
-        for name in filter(study.candidates.maps.__contains__, named.names):
-            values, effect = self.patterns.get(name), study.candidates.maps[name]
+        for name in filter(study.maps.__contains__, named.names):
+            values, effect = self.patterns.get(name), study.maps[name]
             if values is None:
                 # Estimated from all poses; cross-fitted values were subtracted.
                 residual = study.residual_of(named.columns)
@@ -369,7 +369,7 @@ def whole_patterns(found: Evidence) -> dict[str, Tensor]:
     Nothing is returned where all pixels were chosen, or where the built-in simulator cannot do all
     that the model does: other pixels have the value zero then.
     """
-    maps = found.study.candidates.maps
+    maps = found.study.maps
     names = [name for name in found.named.names if name in maps]
     cannot = not names or not found.study.observations.is_sample or found.rendered
     if cannot or found.tables[1]:
@@ -553,9 +553,9 @@ def _parameters(
     for own in fit.coefficients + given + thetas[:, model.num_geometry : model.num_columns]:
         error.set_coefficient_vector(own)
         drawn.append(error.paper_coefficients())
-    for group, units in error.paper_units().items():
+    for group, units in error.paper_values().items():
         for name in drawn[0].get(group, ()):
-            yield group, "parameter", name, units[name], [one[group][name] for one in drawn]
+            yield group, "parameter", name, units[name][1], [one[group][name] for one in drawn]
     start = found.named.study.sums.layout.base
     for effect in found.effects:
         if isinstance(effect, MapEffect):

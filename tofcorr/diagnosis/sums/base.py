@@ -60,6 +60,9 @@ from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from, resolve
 from tofcorr.plausibility.look import Look
 from tofcorr.simulation.effects.base import CatalogueEffect, EffectInputs
 
+TermsAndWords = tuple[ErrorModelOptions, list[str]]
+"""Terms of a base model, and what must be said of those left out."""
+
 
 def unknown_amplitude_columns(observations: Observations, inputs: EffectInputs) -> Tensor:
     """Return the columns, shape (M, K), metres at one prior standard deviation: that of an effect.
@@ -86,9 +89,7 @@ def unknown_amplitude_columns(observations: Observations, inputs: EffectInputs) 
     return torch.cat([forms * (target == k)[:, None] for k in target.unique()], dim=1)
 
 
-def definite_base(
-    recording: Recording, base: ErrorModelOptions
-) -> tuple[ErrorModelOptions, list[str]]:
+def definite_base(recording: Recording, base: ErrorModelOptions) -> TermsAndWords:
     """Return the terms that the recording can support, with every `auto` replaced, and warnings.
 
     Amplitude terms are left out, with a warning, where no amplitude was recorded. What else says
@@ -122,9 +123,7 @@ def definite_base(
     return ErrorModelOptions(terms=terms), warnings
 
 
-def supported_base(
-    recording: Recording, base: ErrorModelOptions
-) -> tuple[ErrorModelOptions, list[str]]:
+def supported_base(recording: Recording, base: ErrorModelOptions) -> TermsAndWords:
     """Return the terms whose inputs a recording has, and the kinds of the others."""
     dataset, kept, lacking = Dataset((recording,)), [], []
     for term in base.terms:

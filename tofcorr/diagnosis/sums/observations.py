@@ -29,7 +29,7 @@ from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.walls import name_walls
 from tofcorr.geometry import se3
-from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance, tangents
+from tofcorr.geometry.rays import ray_directions, ray_plane_distance, tangents
 from tofcorr.geometry.se3 import by_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.effects.base import EffectInputs
@@ -260,7 +260,7 @@ def seen_points(
         incidence, (M,); and the point in the world, (M, 3), metres.
     """
     frame, rays = observations.frame, observations.rays
-    normal, offset = _camera_planes(observations, tool_from_camera)
+    normal, offset = observations.facts.planes_seen(tool_from_camera)
     slope = by_frame(rays, normal[:, :, None], frame)[:, 0]
     distance = -offset[frame] / slope
     pose = observations.facts.world_from_tool @ tool_from_camera
@@ -273,7 +273,7 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tu
 
     The twist acts from the right, tool_from_camera exp(twist), translation first.
     """
-    planes, offset = _camera_planes(observations, tool_from_camera)
+    planes, offset = observations.facts.planes_seen(tool_from_camera)
     # One vector of all pixels after another: elementwise operations are fastest so.
     normal, rays = planes.T[:, observations.frame], observations.rays.T.contiguous()
     # A camera that moves by t and turns by w changes its height over the plane by n . t, and the
@@ -282,13 +282,6 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tu
     distance = -offset[observations.frame] / slope
     by_rotation = torch.linalg.cross(normal, rays, dim=0) * (distance / slope)
     return distance, torch.cat([-normal / slope, by_rotation]).T
-
-
-def _camera_planes(observations: Observations, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Return normal (F, 3) and offset (F,) of each frame's plane in the camera's coordinates."""
-    facts = observations.facts
-    pose = facts.world_from_tool @ tool_from_camera
-    return plane_in_frame(facts.normal_world, facts.offset, pose)
 
 
 def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> EffectInputs:
@@ -334,7 +327,7 @@ def predicted_images(
     rows: slice = slice(None),
 ) -> Tensor:
     """Return the distance of the plane in all pixels of some frames and rows; NaN where none."""
-    normal, offset = (x[part] for x in _camera_planes(observations, tool_from_camera))
+    normal, offset = (x[part] for x in observations.facts.planes_seen(tool_from_camera))
     return ray_plane_distance(ray_directions(observations.recording.camera)[rows], normal, offset)
 
 

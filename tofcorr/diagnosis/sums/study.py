@@ -139,23 +139,6 @@ def _previous_frame(inputs: EffectInputs) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CandidateEffects:
-    """The candidates of one recording, by name.
-
-    Attributes:
-        effects: Effects with columns.
-        maps: Effects with one value a cell of the image.
-        probes: Patterns that no effect of the catalogue makes, with columns.
-        missing: Untestable effects and their missing inputs.
-    """
-
-    effects: Mapping[str, CatalogueEffect]
-    maps: Mapping[str, MapEffect]
-    probes: Mapping[str, Probe]
-    missing: Mapping[str, list[str]]
-
-
-@dataclass(frozen=True, kw_only=True)
 class Study:
     """A recording under diagnosis. Functions that change the model return another study.
 
@@ -164,7 +147,10 @@ class Study:
         observations: The chosen pixels.
         fit: The base model, fitted.
         inputs: What effects may depend on.
-        candidates: What may be added to the base model.
+        effects: Effects with columns that may be added to the base model, by name.
+        maps: Effects with one value a cell of the image, likewise.
+        probes: Patterns that no effect of the catalogue makes, with columns, likewise.
+        missing: Untestable effects and their missing inputs.
         columns: Of the base model (`BASE`), metres per unit coefficient, and of effects and probes
             by name, metres at one standard deviation of the prior, shape (M, K) each. They are
             never copied into one matrix of all pixels.
@@ -180,7 +166,10 @@ class Study:
     observations: Observations
     fit: BaseFit
     inputs: EffectInputs
-    candidates: CandidateEffects
+    effects: Mapping[str, CatalogueEffect]
+    maps: Mapping[str, MapEffect]
+    probes: Mapping[str, Probe]
+    missing: Mapping[str, list[str]]
     columns: Mapping[str, Tensor]
     pose: Tensor
     residual: Tensor
@@ -272,13 +261,10 @@ def build_study(
     kinds = {name: CATALOGUE[name] for name in wanted if name not in options.leave_out}
     missing = {name: wants for name, kind in kinds.items() if (wants := kind.missing(inputs))}
     known = {n: kind.for_recording(inputs) for n, kind in kinds.items() if n not in missing}
-    candidates = CandidateEffects(
-        effects={n: each for n, each in known.items() if not isinstance(each, MapEffect)},
-        maps={n: each for n, each in known.items() if isinstance(each, MapEffect)},
-        probes=probes_for(inputs),
-        missing=missing,
-    )
-    sources = {**candidates.effects, **candidates.probes}
+    maps = {n: each for n, each in known.items() if isinstance(each, MapEffect)}
+    effects = {n: each for n, each in known.items() if n not in maps}
+    probes = probes_for(inputs)
+    sources = {**effects, **probes}
     found = in_threads(lambda source: source.scaled_columns(inputs), sources.values())
     # What is uncertain of the simulator's own error, or stands in for the amplitude.
     further = [] if fit.known is None else [fit.known.uncertain]
@@ -294,7 +280,10 @@ def build_study(
         observations=observations,
         fit=fit,
         inputs=inputs,
-        candidates=candidates,
+        effects=effects,
+        maps=maps,
+        probes=probes,
+        missing=missing,
         columns=columns,
         pose=pose,
         residual=fit.residual,
@@ -351,9 +340,8 @@ def without_map(study: Study, values: Tensor, spent: Collection[str]) -> Study:
         values: The map's value in each pixel, shape (M,), metres.
         spent: Maps that are candidates no longer.
     """
-    maps = {name: m for name, m in study.candidates.maps.items() if name not in spent}
-    changed = with_residual(study, study.residual - values)
-    return replace(changed, candidates=replace(study.candidates, maps=maps))
+    maps = {name: m for name, m in study.maps.items() if name not in spent}
+    return replace(with_residual(study, study.residual - values), maps=maps)
 
 
 def relinearised(study: Study, names: Sequence[str]) -> Study:
@@ -368,7 +356,7 @@ def relinearised(study: Study, names: Sequence[str]) -> Study:
         study: The recording.
         names: Effects of the model.
     """
-    effects = study.candidates.effects
+    effects = study.effects
     bent = [name for name in names if name in effects and not effects[name].linear]
 
     def loss(study: Study) -> float:
@@ -414,7 +402,7 @@ def hidden_effects(study: Study, *, absorbed: float = 0.97) -> list[str]:
         study: The recording.
         absorbed: From this share on, that calibration absorbs, another recording is needed. Chosen.
     """
-    return [name for name in study.candidates.effects if absorbed_share(study, name) > absorbed]
+    return [name for name in study.effects if absorbed_share(study, name) > absorbed]
 
 
 def signal(study: Study, name: str) -> float:
@@ -438,8 +426,8 @@ def left_over(gram: Tensor, members: Tensor, own: Tensor, prior: Tensor) -> Tens
 
 def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor]:
     """Return the coefficients of chosen effects in their own units, by name."""
-    known = [name for name in chosen if name in study.candidates.effects]
-    theta, effects = study.sums.ols.solve(known), study.candidates.effects
+    known = [name for name in chosen if name in study.effects]
+    theta, effects = study.sums.ols.solve(known), study.effects
     parts = theta[study.sums.layout.base :].split([len(effects[n].coefficients) for n in known])
     return {n: own * effects[n].prior_sd() for n, own in zip(known, parts, strict=True)}
 
@@ -454,16 +442,15 @@ def without_absorbed(study: Study) -> tuple[Study, list[str]]:
     """
     if not study.observations.num_walls:
         return study, []
-    shares = {name: absorbed_by_planes(study, name) for name in study.candidates.effects}
+    shares = {name: absorbed_by_planes(study, name) for name in study.effects}
     hidden = {n: [MEASURED_PLANES.words] for n, share in shares.items() if 20 * (1 - share) < 1}
     if hidden:
-        known = study.candidates
-        effects = {name: effect for name, effect in known.effects.items() if name not in hidden}
-        missing = {**known.missing, **hidden}
-        kept = [*effects, *known.probes]
+        effects = {name: effect for name, effect in study.effects.items() if name not in hidden}
+        kept = [*effects, *study.probes]
         study = replace(
             study,
-            candidates=replace(known, effects=effects, missing=missing),
+            effects=effects,
+            missing={**study.missing, **hidden},
             columns={name: study.columns[name] for name in (BASE, *kept)},
             sums=study.sums.of(kept).with_pose_uncertainty(),
         )
@@ -472,7 +459,7 @@ def without_absorbed(study: Study) -> tuple[Study, list[str]]:
         for name, share in shares.items()
         if share > 0.5 and name not in hidden
     ]
-    count, missing = study.observations.num_walls, study.candidates.missing
+    count, missing = study.observations.num_walls, study.missing
     unjudged = [name for name, wants in missing.items() if MEASURED_PLANES.words in wants]
     planes = "plane of 1 wall is" if count == 1 else f"planes of {count} walls are"
     sentence = f"The {planes} estimated together with the base model (recording.yaml: planes)."

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter
+from pydantic import Field, NonNegativeInt, TypeAdapter
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.frames.source import open_folder
@@ -15,15 +15,13 @@ from tofcorr.importing.numbers import read_text
 from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.posed import import_posed
 from tofcorr.importing.robot_images import PosedOptions
-from tofcorr.options import Number, Options, PositiveNumber, Vector3, refused_in_words
+from tofcorr.options import Number, OpenOptions, PositiveNumber, Vector3, refused_in_words
 
 _Nine = Annotated[tuple[Number, ...], Field(min_length=9, max_length=9)]
 
 
-class _View(Options):
+class _View(OpenOptions):
     """What `scene_camera.json` says of an image; other keys are ignored."""
-
-    model_config = ConfigDict(extra="ignore")
 
     matrix: _Nine = Field(alias="cam_K")
     unit_mm: PositiveNumber = Field(alias="depth_scale")

@@ -5,6 +5,7 @@ import math
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.polynomials import legendre
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import (
     AMPLITUDE,
@@ -12,7 +13,6 @@ from tofcorr.simulation.effects.base import (
     EffectInputs,
     LinearDelay,
     inner_range,
-    legendre,
     side_by_side,
     terms_in,
 )

@@ -19,15 +19,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from tofcorr.conditions import condition
-from tofcorr.data.recording import CHUNK_PIXELS, OUTSIDE
+from tofcorr.data.recording import CHUNK_PIXELS
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import (
     phase_from_radial_distance,
-    plane_in_frame,
     unambiguous_range,
 )
 from tofcorr.geometry.se3 import by_frame
-from tofcorr.options import FiniteNumber, Options
+from tofcorr.options import STRAY, FiniteNumber, Options
 from tofcorr.simulation.hooks import Effect, FrameFacts, FrameState
 
 # Long: every effect needs all of it, and its parts call one another.
@@ -525,28 +524,22 @@ class GeometryEffect(CatalogueEffect):
         """
 
         def plane(at: Tensor) -> Tensor:
-            moved = self.moved(inputs.facts, at)
-            return torch.cat(plane_in_camera(inputs, moved), dim=1).flatten()
+            normal, height = self.moved(inputs.facts, at).planes_seen(inputs.tool_from_camera)
+            return torch.cat([normal, height[:, None]], dim=1).flatten()
 
         frame, rays = inputs.frame, inputs.rays
         by_plane = by_parameters(plane, coefficients).reshape(len(inputs.facts.offset), 4, -1)
-        normal, height = plane_in_camera(inputs, self.moved(inputs.facts, coefficients))
+        moved = self.moved(inputs.facts, coefficients)
+        normal, height = moved.planes_seen(inputs.tool_from_camera)
         along = (rays * normal[frame]).sum(-1, keepdim=True)
-        values = torch.cat([rays * (height[frame] / along**2), -1 / along], dim=1)
+        values = torch.cat([rays * (height[frame, None] / along**2), -1 / along], dim=1)
         return by_frame(values, by_plane, frame)
-
-
-def plane_in_camera(inputs: EffectInputs, facts: FrameFacts) -> tuple[Tensor, Tensor]:
-    """Return the target's normal (F, 3) and offset (F, 1) in the camera frame."""
-    pose = facts.world_from_tool @ inputs.tool_from_camera
-    normal, height = plane_in_frame(facts.normal_world, facts.offset, pose)
-    return normal, height[:, None]
 
 
 def distance_to(inputs: EffectInputs, facts: FrameFacts) -> Tensor:
     """Return how far along each ray the plane of its frame is, shape (M,), metres."""
-    normal, height = plane_in_camera(inputs, facts)
-    return -inputs.of_frame(height[:, 0]) / (inputs.rays * inputs.of_frame(normal)).sum(-1)
+    normal, height = facts.planes_seen(inputs.tool_from_camera)
+    return -inputs.of_frame(height) / (inputs.rays * inputs.of_frame(normal)).sum(-1)
 
 
 class SignalEffect(CatalogueEffect):
@@ -574,7 +567,7 @@ class SignalEffect(CatalogueEffect):
         return inputs.metres_per_radian * (shares / light[:, None]).imag
 
 
-# What the equations of several effects share: derivatives, phases, ranges, polynomials, blur.
+# What the equations of several effects share: derivatives, phases, ranges, blur.
 
 
 def by_parameters(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
@@ -613,37 +606,15 @@ def phase_difference(signal: Tensor, own: Tensor) -> Tensor:
     return torch.atan2(product.imag.contiguous(), product.real + (product == 0))
 
 
-def inner_range(values: Tensor, beyond: float = OUTSIDE) -> tuple[float, float]:
+def inner_range(values: Tensor, beyond: float = STRAY) -> tuple[float, float]:
     """Return the ends of what values (M,) lie between, but for a share of them at either end."""
     ordered, last = values.sort().values, len(values) - 1
     return float(ordered[int(beyond * last)]), float(ordered[int((1 - beyond) * last)])
 
 
-# Legendre polynomials on [-1, 1], in one and two variables.
-
-
-def legendre(scaled: Tensor, degree: int) -> list[Tensor]:
-    """Return the Legendre polynomials P_0 ... P_degree of values (M,), each (M,)."""
-    found = [torch.ones_like(scaled), scaled]
-    for k in range(1, degree):
-        found.append(((2 * k + 1) * scaled * found[-1] - k * found[-2]) / (k + 1))
-    return found[: degree + 1]
-
-
-def products(x: Tensor, y: Tensor, low: int, high: int) -> list[Tensor]:
-    """Return P_i(x) P_j(y) for low <= i + j <= high, ordered as `exponents`, each (M,)."""
-    of_x, of_y = legendre(x, high), legendre(y, high)
-    return [of_x[i] * of_y[j] for i, j in exponents(low, high)]
-
-
 def side_by_side(columns: list[Tensor]) -> Tensor:
     """Return columns (M,) as a matrix (M, K), each of them in one piece of memory."""
     return torch.stack(columns).movedim(0, -1)
-
-
-def exponents(low: int, high: int) -> list[tuple[int, int]]:
-    """Return all (i, j) with low <= i + j <= high."""
-    return [(total - j, j) for total in range(low, high + 1) for j in range(total + 1)]
 
 
 # Half width of the kernel in standard deviations: 0.3 % of a Gaussian lies beyond 3. As many

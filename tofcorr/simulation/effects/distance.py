@@ -2,12 +2,12 @@
 
 from torch import Tensor
 
+from tofcorr.geometry.polynomials import legendre
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import (
     Coefficient,
     EffectInputs,
     LinearDelay,
-    legendre,
     side_by_side,
     terms_in,
 )

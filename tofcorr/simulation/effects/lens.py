@@ -8,7 +8,6 @@ from tofcorr.simulation.effects.base import (
     CatalogueEffect,
     Coefficient,
     EffectInputs,
-    plane_in_camera,
 )
 from tofcorr.simulation.hooks import FrameState
 
@@ -46,7 +45,7 @@ class LensEffect(CatalogueEffect):
         """
         normal = inputs.normals_camera
         if normal is None:
-            normal = plane_in_camera(inputs, inputs.facts)[0][inputs.frame]
+            normal = inputs.facts.planes_seen(inputs.tool_from_camera)[0][inputs.frame]
         rays = true_rays(inputs.rays, coefficients, _focal(inputs.camera))
         facing = (inputs.rays * normal).sum(-1) / (rays * normal).sum(-1)
         return inputs.radial_distance * (facing - 1)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry import se3
+from tofcorr.geometry.polynomials import exponents, products
 from tofcorr.geometry.rays import SPEED_OF_LIGHT
 from tofcorr.simulation.effects.base import (
     FIXED_TARGET,
@@ -14,9 +15,7 @@ from tofcorr.simulation.effects.base import (
     Coefficient,
     EffectInputs,
     SignalEffect,
-    exponents,
     inputs_from_state,
-    products,
     side_by_side,
 )
 from tofcorr.simulation.effects.surface import LEAST_COSINE

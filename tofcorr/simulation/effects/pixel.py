@@ -2,13 +2,12 @@
 
 from torch import Tensor
 
+from tofcorr.geometry.polynomials import exponents, products
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import (
     Coefficient,
     EffectInputs,
     LinearDelay,
-    exponents,
-    products,
     side_by_side,
     terms_in,
 )

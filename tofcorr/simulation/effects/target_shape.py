@@ -4,15 +4,14 @@ from typing import Self
 
 from torch import Tensor
 
+from tofcorr.geometry.polynomials import exponents, products
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import (
     FIXED_TARGET,
     Coefficient,
     EffectInputs,
     LinearEffect,
-    exponents,
     inputs_from_state,
-    products,
     side_by_side,
     terms_in,
 )
