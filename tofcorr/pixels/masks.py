@@ -44,8 +44,15 @@ def image_planes(
     return fit_plane(rays[some], batch.radial_distance.flatten(1)[:, seen][:, some], valid[:, some])
 
 
+def _without_plane(batch: FrameBatch) -> Bool[Tensor, "B 1"]:
+    """Return which images have too few valid pixels for a plane of their own."""
+    return batch.valid.flatten(1).sum(dim=1, keepdim=True) < 3
+
+
 def off_the_wall(rays: Float[Tensor, "H W 3"], gross: float = 15.0, least: float = 0.05) -> Mask:
     """Return the mask of pixels far off the plane of most of their image.
+
+    Fewer than three pixels determine no plane; none of them is left out.
 
     Args:
         rays: Unit rays, shape (H, W, 3).
@@ -58,6 +65,7 @@ def off_the_wall(rays: Float[Tensor, "H W 3"], gross: float = 15.0, least: float
         off = deviation(rays.to(distance).flatten(0, 1), distance, image_planes(batch, rays)).abs()
         known = torch.where(off.isfinite(), off, torch.nan)
         limit = (gross * known.nanmedian(dim=1, keepdim=True).values).clamp(min=least)
+        limit = torch.where(_without_plane(batch), torch.inf, limit)
         return ~(off <= limit).view(batch.valid.shape)
 
     return mask
@@ -111,7 +119,8 @@ def edges(contrast: float) -> Mask:
 def grazing(limit_deg: float, rays: Float[Tensor, "H W 3"]) -> Mask:
     """Return the mask of pixels that see the wall too obliquely, where multipath is large.
 
-    The wall's direction is fitted to the measured points; no hand-eye transform is needed.
+    The wall's direction is fitted to the measured points; no hand-eye transform is needed. Fewer
+    than three points determine none, and are kept.
 
     Args:
         limit_deg: Largest angle between the ray and the wall's normal, degrees.
@@ -121,7 +130,7 @@ def grazing(limit_deg: float, rays: Float[Tensor, "H W 3"]) -> Mask:
     def mask(batch: FrameBatch) -> Tensor:
         normal = torch.nn.functional.normalize(image_planes(batch, rays), dim=1)
         cosine = torch.einsum("hwa,ba->bhw", rays.to(normal), normal).abs()
-        return cosine < math.cos(math.radians(limit_deg))
+        return (cosine < math.cos(math.radians(limit_deg))) & ~_without_plane(batch)[:, :, None]
 
     return mask
 
