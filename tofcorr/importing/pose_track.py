@@ -88,9 +88,10 @@ class PoseTrack:
             kept = _without_repeats(time, poses, source)
             time = time[kept]
         own = None if names is None else tuple(names[int(k)] for k in kept)
-        row = np.isin(np.arange(len(poses)), kept).cumsum() - 1
-        pose = poses[kept]
-        return cls(world_from_tool=pose, timestamp=time, names=own, source=source, of_row=row)
+        row = np.searchsorted(kept, np.arange(len(poses)), side="right") - 1
+        return cls(
+            world_from_tool=poses[kept], timestamp=time, names=own, source=source, of_row=row
+        )
 
     @property
     def repeats(self) -> list[str]:

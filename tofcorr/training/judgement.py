@@ -189,21 +189,20 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
     weak = [one for k, one in enumerate(every) if one.sigma > _WEAK and k not in unseen]
     of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
     others = [one for one in weak if not set(one.shares) <= curves]
+    held = f"a prior of {wide:g} mm and {wide:g} mrad is used"
     if undetermined := [one.in_words() for one in others if one.is_undetermined]:
-        lacking = f"{'; '.join(undetermined)}: a prior of {wide:g} mm and {wide:g} mrad is used"
+        lacking = f"{'; '.join(undetermined)}: {held}"
         yield of_pose, f"The images do not determine {lacking}. Record more tilts and distances."
-    if unseen:
-        hidden = "; ".join(every[k].in_words() for k in unseen)
-        held = f"a prior of {wide:g} mm and {wide:g} mrad is used"
-        yield "good", f"From no pose does one ray show {hidden}: {held}."
+    if hidden := [every[k].in_words() for k in unseen]:
+        yield "good", f"From no pose does one ray show {'; '.join(hidden)}: {held}."
     if uncertain := [one for one in others if not one.is_undetermined]:
         of_hand_eye = any(name.startswith(("t_", "w_")) for one in uncertain for name in one.shares)
         words = "; ".join(f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in uncertain[:3])
         count = f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad)"
         yield of_pose if of_hand_eye else "good", f"{count}: {words}."
     if free:
-        hidden = {name for k in unseen for name in every[k].shares}
-        seen = torch.tensor([float(name not in hidden) for name in HAND_EYE_SYMBOLS])
+        unknown = {name for k in unseen for name in every[k].shares}
+        seen = torch.tensor([float(name not in unknown) for name in HAND_EYE_SYMBOLS])
         shift, turn = worst_axes(fit.hand_eye_covariance * seen[:, None] * seen)
         if max(shift, turn) > _WEAK:
             size = f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only"

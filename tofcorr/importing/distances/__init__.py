@@ -6,12 +6,14 @@ from typing import Any
 import click
 
 from tofcorr.importing.command_line import (
+    invalid_option,
     number_list,
     option,
     pose_format_option,
     posed_options,
     print_report,
     recording_out_option,
+    rotate_option,
     take_posed_options,
 )
 
@@ -19,10 +21,8 @@ _POSES = "Poses beside each file of distances, in the order of the sources."
 _COUNTS = "Millimetres per count; left out: 1 for numbers typically above 20, else 1000."
 _WALL = "Name of each source's wall; several may share one. Left out: the source's."
 _PLANE = "Measured plane of each source's wall, in the base: NX,NY,NZ,D of n.x + d = 0, metres."
-_NONE = "Numbers that mean 'no return', besides those up to zero."
 _ORDER = "How the table lists zones: row by row, or column by column."
 _FLIP = "Mirrors zones that are listed from right to left, from the bottom up, or both."
-_TURNS = "Degrees clockwise by which zones, after flips, are turned to be as the sensor sees."
 
 
 @click.command(name="distances")
@@ -37,8 +37,8 @@ _TURNS = "Degrees clockwise by which zones, after flips, are turned to be as the
 @option(
     "--flip", _FLIP, default="none", type=click.Choice(["none", "horizontal", "vertical", "both"])
 )
-@option("--rotate", _TURNS, default="0", type=click.Choice(["0", "90", "180", "270"]))
-@option("--invalid", _NONE, default="0", type=number_list(*range(1, 9)))
+@rotate_option
+@invalid_option
 @option("--fov-deg", "Field of view of all zones, degrees: H,V.", type=number_list(1, 2))
 @option("--depth-unit-mm", _COUNTS, "unit_mm", type=float)
 @posed_options

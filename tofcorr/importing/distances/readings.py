@@ -105,20 +105,20 @@ def open_distances(
         ConfigError: There are not as many poses, names or planes as sources, or two planes of one
             wall.
     """
-    for what, given in (("--poses", poses), ("--wall", names), ("--plane", planes)):
-        if given and len(given) != len(sources):
-            raise ConfigError(f"expected one {what} per source ({len(sources)}), got {len(given)}.")
+    for what, every in (("--poses", poses), ("--wall", names), ("--plane", planes)):
+        if every and len(every) != len(sources):
+            raise ConfigError(f"expected one {what} per source ({len(sources)}), got {len(every)}.")
     names, warnings = _wall_names(sources, names, planes), list[str]()
     files = [_file_in(source, "distances") for source in sources]
     tables = [read_distances(path, layout, coding.invalid, warnings) for path in files]
     paths = poses or [_file_in(source, "poses") for source in sources]
-    read = [read_poses(path, pose_format) for path in paths]
+    given = [read_poses(path, pose_format) for path in paths]
     # Row by row: a pose that is repeated belongs to its row nevertheless.
-    tracks = [track.world_from_tool[track.of_row] for track in read]
+    tracks = [track.world_from_tool[track.of_row] for track in given]
     for path, track, table in zip(paths, tracks, tables, strict=True):
         if len(track) != len(table):
             raise CalibrationDataError(f"{path}: {len(track)} poses beside {len(table)} rows.")
-    warnings += [f"{said}; each belongs to its own row." for one in read for said in one.repeats]
+    warnings += [f"{said}; each belongs to its own row." for one in given for said in one.repeats]
     readings = np.concatenate(tables)
     typical = float(np.nanmedian(readings))
     # No such sensor sees 20 m.
@@ -130,15 +130,16 @@ def open_distances(
     if layout.size == 1:
         warnings.append("One pixel: its ray is the optical axis; a turn about it cannot be found.")
     origin = ", ".join(map(str, sources)) if len(sources) < 3 else f"{sources[0]}, ..."
-    every = (unit * readings / 1000).astype(np.float32)
+    metres = (unit * readings / 1000).astype(np.float32)
 
     def read(number: int) -> DepthImage:
-        if not np.isfinite(every[number]).any():
+        if not np.isfinite(metres[number]).any():
             raise RefusedViewError("no zone has a return")
-        return DepthImage(every[number])
+        return DepthImage(metres[number])
 
     targets = np.repeat(names, [len(table) for table in tables])
-    rows = np.concatenate([np.arange(len(table)) for table in tables])
+    # Counted on from file to file of one wall.
+    rows = [np.sum(targets[:k] == name) for k, name in enumerate(targets)]
     return RobotImages(
         origin=origin,
         names=[f"{name} {row}" for name, row in zip(targets, rows, strict=True)],
