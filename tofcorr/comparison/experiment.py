@@ -269,11 +269,11 @@ class ModelFitter:
 
         Sums and solutions grow with the square of the coefficients. Fitted to the times of the
         shipped `all_models` on the simulated `demo`, where 15 double them, and a network of 10 000
-        pixels, trained once for each fold as well, takes 200 times as long.
+        pixels, trained once for each fold as well, takes 150 times as long.
         """
         training = self._trainings[model.name]
         unknowns = len(ErrorModel(training.model, self.domain).coefficient_vector())
-        return 1 + (unknowns / 15) ** 2 + 200 * (training.residual is not None)
+        return 1 + (unknowns / 15) ** 2 + 150 * (training.residual is not None)
 
     def bare(self, name: str, train: np.ndarray, held_out: np.ndarray) -> FittedModel:
         """Return a hand-eye transform without depth correction.
