@@ -88,10 +88,8 @@ class PoseTrack:
             kept = _without_repeats(time, poses, source)
             time = time[kept]
         own = None if names is None else tuple(names[int(k)] for k in kept)
-        row = np.searchsorted(kept, np.arange(len(poses)), side="right") - 1
-        return cls(
-            world_from_tool=poses[kept], timestamp=time, names=own, source=source, of_row=row
-        )
+        at = np.searchsorted(kept, np.arange(len(poses)), side="right") - 1
+        return cls(world_from_tool=poses[kept], timestamp=time, names=own, source=source, of_row=at)
 
     @property
     def repeats(self) -> list[str]:

@@ -22,6 +22,7 @@ _COUNTS = "Millimetres per count; left out: 1 for numbers typically above 20, el
 _WALL = "Name of each source's wall; several may share one. Left out: the source's."
 _PLANE = "Measured plane of each source's wall, in the base: NX,NY,NZ,D of n.x + d = 0, metres."
 _ORDER = "How the table lists zones: row by row, or column by column."
+_FLIPS = ["none", "horizontal", "vertical", "both"]
 _FLIP = "Mirrors zones that are listed from right to left, from the bottom up, or both."
 
 
@@ -34,9 +35,7 @@ _FLIP = "Mirrors zones that are listed from right to left, from the bottom up, o
 @option("--plane", _PLANE, "planes", type=number_list(4), multiple=True)
 @option("--zones", "COLUMNSxROWS of the sensor, as rows of the table list them.", default="1x1")
 @option("--order", _ORDER, default="rows", type=click.Choice(["rows", "columns"]))
-@option(
-    "--flip", _FLIP, default="none", type=click.Choice(["none", "horizontal", "vertical", "both"])
-)
+@option("--flip", _FLIP, default="none", type=click.Choice(_FLIPS))
 @rotate_option
 @invalid_option
 @option("--fov-deg", "Field of view of all zones, degrees: H,V.", type=number_list(1, 2))
