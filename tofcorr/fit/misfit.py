@@ -286,7 +286,7 @@ def assumptions(seen: MisfitPixels, fit: Fit) -> tuple[Shift, ...]:
     # Such errors remain after a careful calibration of the lens, and of a wall by touching it. With
     # a longer focal length rays come nearer the axis, with a shifted point they move the other way.
     # A zone of a sensor of few is as wide as many pixels: it is known to a part of one.
-    step = min(1.0, fit.domain.width / 64)
+    step = min(1.0, fit.domain.width / 32)
     right, down = seen.moved_rays(-step * one / fx, none), seen.moved_rays(none, -step * one / fy)
     lens = {
         "focal_length": ("focal length 0.1 % longer", -seen.moved_rays(x, y) / 1000),
