@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from comparison.evaluated import options
+from comparison.evaluated import compared, options
 from synthetic_scene import EA, Scene, make_scene, write_scene
 
 from tofcorr.comparison.experiment import Experiment
@@ -24,4 +24,4 @@ def dataset(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="session")
 def evaluation(dataset: Dataset) -> Experiment:
     asked = options(repeats={"number": 3, "test_fraction": 0.25})
-    return Experiment("wall", dataset, asked)
+    return compared("wall", dataset, asked)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from comparison.evaluated import options
+from comparison.evaluated import compared, options
 from synthetic_scene import Scene, write_scene
 
 from tofcorr.comparison.experiment import Experiment
@@ -45,6 +45,10 @@ def test_every_split_is_measured_as_a_training_on_its_frames_would_be(
             found = [values[metric][named.name][-1] for metric in ("mean_abs_mm", "rms_mm")]
             # Both fits end within a millionth of a standard error of the optimum.
             assert found == pytest.approx([expected.mean_abs_mm(test), expected.rms_mm(test)], 1e-6)
+            if protocol == "half":
+                white = test[dataset.targets[test] == "white"]
+                by_wall = evaluation.by_wall("half")["white"][named.name]
+                assert by_wall == pytest.approx(expected.rms_mm(white), 1e-6)
 
 
 def test_before_has_no_correction_and_hand_eye_only_no_term(
@@ -69,7 +73,7 @@ def test_errors_along_the_ray_and_in_z_are_those_of_the_true_distance(
     """With the true hand-eye, measured minus true is known without any plane."""
     recording = dataset.first
     known = replace(recording, tool_from_camera=scene.truth.tool_from_camera.numpy())
-    found = Experiment("wall", Dataset((known,)), options(folds=0))
+    found = compared("wall", Dataset((known,)), options(folds=0))
     test = found.splits["half"]["half"]
     true = ray_plane_distance(scene.rays, *planes_in_camera(scene))
     error = (torch.from_numpy(np.array(recording.depth)).double() - true)[test]
@@ -122,7 +126,7 @@ def test_without_a_robot_hand_eye_only_is_before(scene: Scene, tmp_path: Path) -
     normal, offset = (one.numpy() for one in planes_in_camera(scene))
     poses = np.repeat(np.eye(4)[None], 32, axis=0)
     still = replace(recording.frames, world_from_tool=poses, normal_world=normal, offset=offset)
-    found = Experiment("wall", Dataset((replace(recording, frames=still),)), options())
+    found = compared("wall", Dataset((replace(recording, frames=still),)), options())
     assert not found.hand_eye_estimated
     values = found.values["folds"]["mean_abs_mm"]
     np.testing.assert_allclose(values[BEFORE], values[HAND_EYE_ONLY], rtol=1e-12)
@@ -134,6 +138,6 @@ def test_too_few_poses_are_refused_and_fits_that_do_not_converge_told(
 ) -> None:
     with pytest.raises(CalibrationDataError, match="16 poses cannot be divided into 17 folds"):
         Experiment("wall", dataset, options(folds=17))
-    found = Experiment("wall", dataset, options(folds=0, solver={"max_iterations": 1}))
+    found = compared("wall", dataset, options(folds=0, solver={"max_iterations": 1}))
     assert len(found.warnings) == 3
     assert "Not converged" in found.warnings[0]

@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from comparison.evaluated import MODELS, options
+from comparison.evaluated import MODELS, compared, options
 from synthetic_scene import Scene, write_scene
 
-from tofcorr.comparison.experiment import Experiment
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import MaskOptions, usable_pixels
@@ -30,9 +29,9 @@ def test_pixels_outside_the_window_count_as_masked_out(scene: Scene, tmp_path: P
     masked = write_scene(scene, tmp_path / "b", guess, **with_outliers(scene, masked=True))
     asked = options(models=MODELS[1:2], folds=2)
     window = asked.model_copy(update={"outlier_window_mm": 200.0})
-    found = Experiment("a", Dataset((spoilt,)), window)
-    expected = Experiment("b", Dataset((masked,)), window)
-    unguarded = Experiment("c", Dataset((spoilt,)), asked)
+    found = compared("a", Dataset((spoilt,)), window)
+    expected = compared("b", Dataset((masked,)), window)
+    unguarded = compared("c", Dataset((spoilt,)), asked)
     assert found.fitter.num_pixels == expected.fitter.num_pixels
     for column in asked.columns:
         values = found.values["folds"]["rms_mm"][column]

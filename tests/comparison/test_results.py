@@ -1,7 +1,9 @@
 """`tofcorr.evaluate` and `tofcorr.select`: what the commands print, draw and write, as results."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -9,8 +11,11 @@ from simulated_walls import EA, simulated_wall
 
 import tofcorr
 from tofcorr.cli.main import group as cli
+from tofcorr.comparison.experiment import ModelFitter
+from tofcorr.comparison.options import ComparedModel
 from tofcorr.data.recording import Recording
 from tofcorr.options import dump_yaml
+from tofcorr.pixels.passes import FittedModel
 
 MODELS = [{"name": "constant"}, {"name": "EA", "model": EA.to_mapping()}]
 EVALUATE = {"models": MODELS, "folds": 3}
@@ -84,3 +89,36 @@ def test_every_set_is_a_row_and_recordings_of_one_selection_are_taken_together(
     assert twice.sets[0].targets == evaluation.sets[0].targets
     values = twice.sets[1].values["half"]["rms_mm"]["EA"]
     assert values == evaluation.sets[0].values["half"]["rms_mm"]["EA"]
+
+
+@pytest.mark.parametrize(
+    ("command", "config"), [(tofcorr.evaluate, EVALUATE), (tofcorr.select, SELECT)]
+)
+def test_what_is_finished_when_stopped_is_filed_and_nothing_else(
+    command: Callable[..., Any],
+    config: dict[str, Any],
+    wall: Recording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ctrl-C in the fifth minute of six left nothing."""
+    fit, stopped, told = ModelFitter.fit, ["EA"], list[str]()
+
+    def interrupted(self: ModelFitter, model: ComparedModel, *frames: Any) -> FittedModel:
+        if model.name in stopped:
+            raise KeyboardInterrupt
+        return fit(self, model, *frames)
+
+    monkeypatch.setattr(ModelFitter, "fit", interrupted)
+    result = command(wall, config, out=tmp_path / "out", tell=told.append)
+    assert "Stopped: EA not finished, and left out" in repr(result)
+    (written,) = (tmp_path / "out").glob("*on.json")
+    assert '"EA"' not in written.read_text()
+    assert '"constant"' in written.read_text()
+    assert f"{len(config['models'])} models" in told[0]
+    assert [line.split(":")[0] for line in told if "RMS held out" in line][-1] == "constant"
+    assert any(line.startswith("The other models will take about") for line in told)
+    stopped.append("constant")
+    with pytest.raises(KeyboardInterrupt):
+        command(wall, config, out=tmp_path / "nothing", tell=told.append)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from comparison.evaluated import options
+from comparison.evaluated import compared, options
 from synthetic_scene import EA, Scene, write_scene
 
-from tofcorr.comparison.experiment import Experiment, ModelFitter
+from tofcorr.comparison.experiment import ModelFitter
 from tofcorr.comparison.options import SelectionOptions
 from tofcorr.comparison.select import select
 from tofcorr.data.recording import Recording
@@ -112,14 +112,14 @@ def test_a_comparison_of_unknown_planes_judges_by_the_walls_found_in_training_im
 ) -> None:
     planes = {"known": "known", "found": "unknown"}
     models = [{"name": name, "model": EA, "planes": one} for name, one in planes.items()]
-    right = Experiment("wall", Dataset((recording,)), options(models[0], folds=0))
+    right = compared("wall", Dataset((recording,)), options(models[0], folds=0))
     expected = right.values["half"]["mean_abs_mm"]["known"][0]
     unknown = options(*models, folds=0, planes="unknown")
-    by_walls = Experiment("wall", misplaced(recording), unknown)
+    by_walls = compared("wall", misplaced(recording), unknown)
     by_walls_found = by_walls.values["half"]["mean_abs_mm"]["found"][0]
     assert by_walls_found == pytest.approx(expected, rel=0.1)
     # Hand-eye and constant can follow a shift common to all walls only in part.
-    by_record = Experiment("wall", misplaced(recording), options(*models, folds=0))
+    by_record = compared("wall", misplaced(recording), options(*models, folds=0))
     assert by_record.values["half"]["mean_abs_mm"]["found"][0] > 2 * expected
 
 

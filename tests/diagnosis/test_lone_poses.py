@@ -38,7 +38,7 @@ def far(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 def _with_one_more(far: Recording, near: Recording, folder: Path) -> Recording:
     """Append a recording's frames to another's, as if taken some hours later."""
-    with RecordingWriter.with_header_of(folder, far) as writer:
+    with RecordingWriter.like(folder, far, rows=False) as writer:
         for recording, later in ((far, 0.0), (near, 1e4)):
             for frame, row in enumerate(recording.frames.rows()):
                 own = {"timestamp": row.timestamp + later, "pose_id": f"{later} {frame}"}

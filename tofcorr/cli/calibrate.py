@@ -1,5 +1,6 @@
 """The commands that calibrate a camera: inspect, train, compare, check."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,12 +96,13 @@ def evaluate_command(
     cross-validation by image with paired t-tests, and repeated random splits if asked for. The
     columns "before" (no calibration) and "hand-eye only" (no depth correction) are there to compare
     with. Writes evaluation.json, evaluation.md, comparison.png and TensorBoard files to OUT.
+    Ctrl-C ends it early: the report then holds the models that were finished.
     """
     from tofcorr.comparison.evaluate import evaluate
 
     if device:
         options = options.model_copy(update={"device": device})
-    click.echo(repr(evaluate(recordings, options, **given)))
+    click.echo(repr(evaluate(recordings, options, tell=partial(click.echo, err=True), **given)))
     click.echo(f"\nWritten to {given['out']}.")
 
 
@@ -113,11 +115,12 @@ def select_command(options: "SelectionOptions", recordings: tuple[Path, ...], **
     """Compare models on images, distances and targets that they were not fitted to.
 
     Names the simplest model within one standard error of the best, and those that do not differ
-    significantly from it. Writes selection.json and selection.md to OUT.
+    significantly from it. Writes selection.json and selection.md to OUT. Ctrl-C ends it early:
+    the report then holds the models that were finished.
     """
     from tofcorr.comparison.select import select
 
-    click.echo(repr(select(recordings, options, **given)))
+    click.echo(repr(select(recordings, options, tell=partial(click.echo, err=True), **given)))
     click.echo(f"Written to {given['out']}.")
 
 

@@ -1,6 +1,6 @@
 """`tofcorr.evaluate`: models side by side on held-out images."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import combinations
@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, ScalarFormatter
 
-from tofcorr.comparison.experiment import METRICS, Experiment
+from tofcorr.comparison.experiment import METRICS, Experiment, compare
 from tofcorr.comparison.options import (
     BEFORE,
     HAND_EYE_ONLY,
@@ -24,7 +24,7 @@ from tofcorr.files import staged_folder, write_json
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.plausibility.examine import vet
-from tofcorr.progress import event_writer
+from tofcorr.progress import LOG, event_writer
 from tofcorr.training.figures import save_figure
 from tofcorr.training.report import number_or_none
 from tofcorr.version import __version__
@@ -84,6 +84,7 @@ class EvaluationResult:
                     "left_out": one.left_out,
                     "hand_eye_estimated": one.hand_eye_estimated,
                     "hand_eye": one.hand_eye,
+                    "by_wall_rms_mm": {kind: one.by_wall(kind) for kind in one.splits},
                     "held_out": {
                         protocol: self._held_out(one, protocol) for protocol in one.splits
                     },
@@ -174,7 +175,8 @@ class EvaluationResult:
             found.append(self._repeats_table("rms_mm", "distance to the plane"))
             found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
             found.append(self._tests_table("repeats", "rms_mm"))
-        return found
+        walls = any(len(one.targets) > 1 for one in self.sets)
+        return [*found, self._walls_table()] if walls else found
 
     def _table(self, title: str, rows: list[list[str]], note: str) -> Table:
         seed = f" Seed {self.options.seed}." if "seed" not in note else ""
@@ -191,6 +193,17 @@ class EvaluationResult:
         title = f"Table 1. Mean absolute error per pixel (RMS), mm, on {held_out}"
         note = "'hand-eye only': hand-eye refitted, no depth correction."
         return self._table(title, rows, f"One random split a set, seed {self.options.seed}. {note}")
+
+    def _walls_table(self) -> Table:
+        shown = {"folds" if self.options.folds else "half": "images", "walls": "wall"}
+        rows = [
+            [f"{one.name}, {wall}, {what}", *(f"{error:.2f}" for error in errors.values())]
+            for one in self.sets
+            for protocol, what in shown.items()
+            for wall, errors in (one.by_wall(protocol) if protocol in one.splits else {}).items()
+        ]
+        note = "'images': some of each wall's were held out; 'wall': all of one wall's, in turn."
+        return self._table("Held-out RMS distance to each wall, mm", rows, note)
 
     def _folds_table(self) -> Table:
         folds, columns = self.options.folds, self.options.columns
@@ -244,11 +257,13 @@ def evaluate(
     *,
     out: str | Path | None = None,
     force: bool = False,
+    tell: Callable[[str], object] = LOG.info,
 ) -> EvaluationResult:
     """Compare models on images that they were not fitted to, every recording as a set of its own.
 
     The protocols are those of Abdo and Borgeat (2010): a random half of the poses held out, and
     k-fold cross-validation by image with paired t-tests; and repeated random splits.
+    Ctrl-C ends it early: the result then holds the models that were finished.
 
     Args:
         recordings: A folder, an opened recording, or a sequence of either: a row of the tables
@@ -258,6 +273,7 @@ def evaluate(
         out: Folder for `evaluation.json`, `evaluation.md`, `comparison.png`, `config.yaml` and
             TensorBoard files; nothing may be there yet. None writes nothing.
         force: Compare whatever the recordings look like.
+        tell: Called with what the work will cost, and with a line as each model ends.
 
     Raises:
         ConfigError: The configuration is not valid.
@@ -277,7 +293,8 @@ def evaluate(
             Experiment(name, one, options, inspection)
             for name, one, inspection in zip(names, data, inspections, strict=True)
         )
-        result = EvaluationResult(evaluations, options, headlines)
+        done = compare(evaluations, tell)
+        result = EvaluationResult(evaluations, options.only(done), headlines)
         if folder is not None:
             result.write(folder)
     return result

@@ -9,14 +9,15 @@ which say which pixels the comparison is about.
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
+from time import perf_counter
 
 import numpy as np
 
 from tofcorr.comparison.options import BEFORE, ComparedModel, ComparisonOptions, masks_of
 from tofcorr.comparison.statistics import Estimate
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.planes import estimate_walls
 from tofcorr.fit.fitting import fit, hand_eye_alone
@@ -26,7 +27,7 @@ from tofcorr.pixels.dataset import Dataset, covered_domain, hand_eye_is_free, re
 from tofcorr.pixels.passes import FittedModel, FrameErrors, held_out_errors, image_moments
 from tofcorr.pixels.sample import MaskOptions, usable_pixels
 from tofcorr.plausibility.finding import Inspection
-from tofcorr.progress import through
+from tofcorr.progress import LOG, through
 from tofcorr.training.calibration import TrainingOptions, without_correction
 from tofcorr.training.judgement import frames_left_out, left_out_mapping, left_out_words
 
@@ -54,6 +55,8 @@ METRICS: dict[str, Callable[[dict[str, FrameErrors]], float]] = {
 class Experiment:
     """Models on one set of images, each measured on frames that it was not fitted to.
 
+    A column exists once `measure` has ended for it; `compare` does that for all.
+
     Every model is measured on the same pixels: those of the recordings' masks that the options'
     own masks leave.
 
@@ -74,8 +77,8 @@ class Experiment:
         options: The models, as the recordings made them.
         splits: What was held out.
         skipped: What could not be, and why.
-        models: By split as in `splits`, and by column.
-        errors: The same of their errors on the frames held out, by kind.
+        hand_eye: tool_from_camera of each column, fitted to the first split's training frames.
+        errors: Errors on the frames held out: by protocol, split, column and kind.
         fitter: What fitted them, and the pixels that measure them.
         left_out: Frames that are neither fitted nor measured, and how far off they are, as in the
             report of a training.
@@ -101,19 +104,25 @@ class Experiment:
             self.left_out = left_out_mapping(left_out, inspection)
             splits = {kind: without_frames(own, left_out) for kind, own in splits.items()}
         self.splits = splits
-        self.fitter = fitter = ModelFitter(dataset, self.options, left_out)
-        self.models: list[dict[str, FittedModel]] = []
-        tests = [test for own in splits.values() for test in own.values()]
-        for test in through(tests, f"comparing {name}".strip()):
-            train = np.setdiff1d(frames, [*left_out, *test])
-            bare = {one: fitter.bare(one, train, test) for one in self.options.baselines}
-            fitted = {one.name: fitter.fit(one, train, test) for one in self.options.models}
-            self.models.append(bare | fitted)
-        in_a_row = [one for columns in self.models for one in columns.values()]
-        found = iter(held_out_errors(fitter.measured, in_a_row, self.options.device))
-        by_split = iter([{column: next(found) for column in columns} for columns in self.models])
-        self.errors = {kind: [next(by_split) for _ in own] for kind, own in splits.items()}
-        self.warnings = [*left_out_words(left_out), *fitter.warnings]
+        self.fitter = ModelFitter(dataset, self.options, left_out)
+        self.warnings = self.fitter.warnings
+        self.warnings += left_out_words(left_out)
+        self.hand_eye = dict[str, list[list[float]]]()
+        by_column = dict[str, dict[str, FrameErrors]]
+        self.errors = {kind: [by_column() for _ in own] for kind, own in splits.items()}
+
+    def measure(self, column: str) -> float:
+        """Fit one column to each split's frames; return the RMS of the first protocol, mm."""
+        fitter, model = self.fitter, {one.name: one for one in self.options.models}.get(column)
+        fitted = partial(fitter.bare, column) if model is None else partial(fitter.fit, model)
+        tests = [test for splits in self.splits.values() for test in splits.values()]
+        tests = through(tests, f"{self.name} {column}".strip(), "split")
+        found = [fitted(np.setdiff1d(fitter.frames, test), test) for test in tests]
+        self.hand_eye[column] = found[0].model.hand_eye().detach().tolist()
+        errors = iter(held_out_errors(fitter.measured, found, self.options.device))
+        for place in (one for splits in self.errors.values() for one in splits):
+            place[column] = next(errors)
+        return self.held_out(next(iter(self.errors)), column).rms_mm()
 
     @property
     def hand_eye_estimated(self) -> bool:
@@ -126,17 +135,25 @@ class Experiment:
         names, counts = np.unique(self.dataset.targets, return_counts=True)
         return dict(zip(names.tolist(), counts.tolist(), strict=True))
 
-    @property
-    def hand_eye(self) -> dict[str, list[list[float]]]:
-        """tool_from_camera of each column, fitted to the first split's training frames."""
-        return {k: one.model.hand_eye().detach().tolist() for k, one in self.models[0].items()}
+    def held_out(self, protocol: str, column: str) -> FrameErrors:
+        """Return a column's distances to the plane on held-out frames, of all splits in turn."""
+        parts = [vars(one[column]["to_plane"]) for one in self.errors[protocol]]
+        return FrameErrors(**{key: np.concatenate([one[key] for one in parts]) for key in parts[0]})
+
+    def by_wall(self, protocol: str) -> dict[str, dict[str, float]]:
+        """Return the RMS of each wall's held-out pixels by the wall's name and by column, mm."""
+        walls = {name: np.flatnonzero(self.dataset.targets == name) for name in self.targets}
+        errors = {column: self.held_out(protocol, column) for column in self.options.columns}
+        return {k: {c: one.rms_mm(own) for c, one in errors.items()} for k, own in walls.items()}
 
     @cached_property
     def values(self) -> dict[str, dict[str, dict[str, np.ndarray]]]:
         """For each protocol, metric and column, one value a split, shape (S,), millimetres."""
         return {
             protocol: {
-                metric: {k: np.array([measure(one[k]) for one in splits]) for k in self.models[0]}
+                metric: {
+                    k: np.array([measure(one[k]) for one in splits]) for k in self.options.columns
+                }
                 for metric, measure in METRICS.items()
             }
             for protocol, splits in self.errors.items()
@@ -158,6 +175,43 @@ class Experiment:
         return Estimate(difference, self.options.overlap(protocol))
 
 
+def compare(sets: Sequence[Experiment], tell: Callable[[str], object] = LOG.info) -> list[str]:
+    """Measure every column on every set, one column after the other.
+
+    Ctrl-C, once a model is finished, ends it: what is not finished is left out, with a warning.
+
+    Args:
+        sets: With the same columns.
+        tell: Called with a sentence about the work ahead, and with one as each column ends.
+
+    Returns:
+        The columns that were measured.
+    """
+    options, done = sets[0].options, list[str]()
+    fits = sum(len(splits) for one in sets for splits in one.splits.values())
+    tell(f"{len(options.models)} models, {fits} fits each; how long follows with the first.")
+    sizes = {one.name: sets[0].fitter.size(one) for one in options.models}
+    try:
+        for column in options.columns:
+            start = perf_counter()
+            errors = ", ".join(f"{one.measure(column):.2f}" for one in sets)
+            done.append(column)
+            spent = perf_counter() - start
+            tell(f"{column}: {errors} mm RMS held out, after {spent:.0f} s")
+            if column == options.models[0].name and len(sizes) > 1:
+                ahead = spent * (sum(sizes.values()) / sizes[column] - 1)
+                tell(f"The other models will take about {max(ahead / 60, 1):.0f} min.")
+    except KeyboardInterrupt:
+        if not set(done) - set(options.baselines):
+            raise
+        for one in sets:
+            one.options = one.options.only(done)
+            one.hand_eye = {column: one.hand_eye[column] for column in done}
+        missing = ", ".join(column for column in options.columns if column not in done)
+        sets[0].warnings.append(f"Stopped: {missing} not finished, and left out.")
+    return done
+
+
 class ModelFitter:
     """Fits the models of a comparison to some of a data set's frames, as a training would.
 
@@ -167,6 +221,7 @@ class ModelFitter:
         left_out: Global numbers of frames that no fit uses and no error measures.
 
     Attributes:
+        frames: Global numbers of all others.
         measured: The data set with the pixels that measure every model: the common masks.
         domain: The ranges that scale the models' variables, of all measured pixels.
         num_pixels: How many of its pixels measure, of all frames together.
@@ -180,7 +235,7 @@ class ModelFitter:
         self, dataset: Dataset, options: ComparisonOptions, left_out: Collection[int] = ()
     ) -> None:
         self._dataset, self._options = dataset, options
-        used = np.setdiff1d(np.arange(dataset.num_frames), list(left_out))
+        self.frames = used = np.setdiff1d(np.arange(dataset.num_frames), list(left_out))
         self._trainings = {model.name: options.training(model) for model in options.models}
         self.measured = usable_pixels(dataset, options, robust=False)
         self.domain = covered_domain(self.measured, used)
@@ -199,7 +254,8 @@ class ModelFitter:
         if not (training.weights.noise or training.weights.robust != "none" or own_window):
             # The pixels are those of any other split: they are read once.
             if model.name not in self._of_all_frames:
-                self._of_all_frames[model.name] = self._moments(dataset, training.model)
+                # Those of one model at a time: they take most of the memory.
+                self._of_all_frames = {model.name: self._moments(dataset, training.model)}
             moments = self._of_all_frames[model.name].images(train.tolist())
         found = fit(dataset, train, training, self.domain, moments=moments)
         if not found.solution.converged:
@@ -207,6 +263,17 @@ class ModelFitter:
             self.warnings.append(f"{fitted}: {found.solution.message}")
         planes = self._judged_against(found.walls, model.name, held_out, found.model)
         return FittedModel(found.model, held_out, planes)
+
+    def size(self, model: ComparedModel) -> float:
+        """Return about how long a model takes to fit, in times one without terms.
+
+        Sums and solutions grow with the square of the coefficients. Fitted to the times of the
+        shipped `all_models` on the simulated `demo`, where 15 double them, and a network of 10 000
+        pixels, trained once for each fold as well, takes 150 times as long.
+        """
+        training = self._trainings[model.name]
+        unknowns = len(ErrorModel(training.model, self.domain).coefficient_vector())
+        return 1 + (unknowns / 15) ** 2 + 150 * (training.residual is not None)
 
     def bare(self, name: str, train: np.ndarray, held_out: np.ndarray) -> FittedModel:
         """Return a hand-eye transform without depth correction.

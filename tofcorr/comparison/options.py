@@ -1,6 +1,6 @@
 """The options of `evaluate` and `select`: models, and which held-out pixels measure them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -119,6 +119,11 @@ class ComparisonOptions(MaskOptions):
         """The headings of the models in tables."""
         return [*self.baselines, *(model.name for model in self.models)]
 
+    def only(self, columns: Collection[str]) -> Self:
+        """Return the options with the models of some columns."""
+        models = tuple(model for model in self.models if model.name in columns)
+        return self.model_copy(update={"models": models})
+
     def splits(self, dataset: Dataset) -> tuple[Splits, dict[str, str]]:
         """Return what is held out, and why something that was asked for cannot be.
 
@@ -186,6 +191,8 @@ class EvaluationOptions(ComparisonOptions):
         test_fraction: Share of the poses held out in the single split of the first table.
         folds: Folds of the cross-validation in the second table; 0 leaves it out.
         repeats: Further random splits.
+        walls: Whether each wall is held out in turn as well; where walls are estimated, its plane
+            alone is found in its own images.
     """
 
     config_folder: ClassVar[str] = "evaluate"
@@ -194,6 +201,7 @@ class EvaluationOptions(ComparisonOptions):
     test_fraction: float = Field(default=0.5, gt=0.0, lt=1.0)
     folds: NonNegativeInt = 6
     repeats: RepeatOptions = RepeatOptions()
+    walls: bool = False
 
     @model_validator(mode="after")
     def _folds_can_be_fitted(self) -> Self:
@@ -221,7 +229,8 @@ class EvaluationOptions(ComparisonOptions):
                 f"repeat {k}": drawn(repeats.test_fraction, int(seed))
                 for k, seed in enumerate(seeds, start=1)
             }
-        return found, {}
+        targets = _by_target(dataset)
+        return found | ({"walls": targets} if self.walls and len(targets) > 1 else {}), {}
 
     def overlap(self, protocol: str) -> float:
         """Return what random splits have in common."""
@@ -282,8 +291,12 @@ class SelectionOptions(ComparisonOptions):
             return _by_image(dataset, self.folds, self.seed)
         if by == "distance":
             return _by_distance(dataset, self.distance_bands)
-        names = np.unique(dataset.targets)
-        return {str(name): np.flatnonzero(dataset.targets == name) for name in names}
+        return _by_target(dataset)
+
+
+def _by_target(dataset: Dataset) -> dict[str, np.ndarray]:
+    names = np.unique(dataset.targets)
+    return {str(name): np.flatnonzero(dataset.targets == name) for name in names}
 
 
 def _by_image(dataset: Dataset, number: int, seed: int) -> dict[str, np.ndarray]:

@@ -1,6 +1,6 @@
 """`tofcorr.select`: the model that predicts best on held-out images, distances and targets."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcorr.comparison.experiment import Experiment
+from tofcorr.comparison.experiment import Experiment, compare
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
 from tofcorr.comparison.statistics import Ranking, Table
 from tofcorr.error_terms.base import Domain
@@ -20,6 +20,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.pixels.passes import FrameErrors
 from tofcorr.plausibility.examine import vet
+from tofcorr.progress import LOG
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import number_or_none
 
@@ -170,8 +171,11 @@ def select(
     *,
     out: str | Path | None = None,
     force: bool = False,
+    tell: Callable[[str], object] = LOG.info,
 ) -> SelectionResult:
     """Compare models on images, distances and targets that they were not fitted to.
+
+    Ctrl-C ends it early: the result then holds the models that were finished.
 
     Args:
         recordings: A folder, an opened recording, or a sequence of either, all of one camera; they
@@ -181,6 +185,7 @@ def select(
         out: Folder for `selection.json` and `selection.md`; nothing may be there yet. None writes
             nothing.
         force: Compare whatever the recordings look like.
+        tell: Called with what the work will cost, and with a line as each model ends.
 
     Raises:
         ConfigError: The configuration is not valid.
@@ -194,16 +199,14 @@ def select(
         planes = resolved_planes(options.planes, dataset.recordings)
         inspection = vet(dataset, planes, force=force)
         found = Experiment("", dataset, options, inspection)
+        options = options.only(compare([found], tell))
         complexity = {
             model.name: _complexity(found.options.training(model), found.fitter.domain, dataset)
             for model in found.options.models
         }
         rankings = {}
         for by, groups in found.errors.items():
-            errors = {
-                name: _by_pose(dataset, [one[name]["to_plane"] for one in groups], options)
-                for name in complexity
-            }
+            errors = {k: _by_pose(dataset, found.held_out(by, k), options) for k in complexity}
             rankings[by] = Ranking(errors, complexity, len(groups))
         # What the page says of the models is what was asked for.
         result = SelectionResult(rankings, found, options, inspection.headline)
@@ -213,13 +216,12 @@ def select(
     return result
 
 
-def _by_pose(dataset: Dataset, groups: list[FrameErrors], options: SelectionOptions) -> np.ndarray:
+def _by_pose(dataset: Dataset, held_out: FrameErrors, options: SelectionOptions) -> np.ndarray:
     """Return a model's held-out error of each pose with a usable pixel, in the poses' order, mm."""
     absolute = options.metric == "mean_abs"
-    poses = dataset.pose_groups()[np.concatenate([group.frames for group in groups])]
-    sums = np.concatenate([one.absolute if absolute else one.squared for one in groups])
-    total = np.bincount(poses, sums)
-    pixels = np.bincount(poses, np.concatenate([one.count for one in groups]))
+    poses = dataset.pose_groups()[held_out.frames]
+    total = np.bincount(poses, held_out.absolute if absolute else held_out.squared)
+    pixels = np.bincount(poses, held_out.count)
     mean = total[pixels > 0] / pixels[pixels > 0]
     return 1e3 * (mean if absolute else np.sqrt(mean))
 

@@ -285,12 +285,16 @@ def assumptions(seen: MisfitPixels, fit: Fit) -> tuple[Shift, ...]:
     one, none = torch.ones_like(x), torch.zeros_like(x)
     # Such errors remain after a careful calibration of the lens, and of a wall by touching it. With
     # a longer focal length rays come nearer the axis, with a shifted point they move the other way.
-    right, down = seen.moved_rays(-one / fx, none), seen.moved_rays(none, -one / fy)
-    errors = {
+    # A zone of a sensor of few is as wide as many pixels: it is known to a part of one.
+    step = min(1.0, fit.domain.width / 32)
+    right, down = seen.moved_rays(-step * one / fx, none), seen.moved_rays(none, -step * one / fy)
+    lens = {
         "focal_length": ("focal length 0.1 % longer", -seen.moved_rays(x, y) / 1000),
-        "principal_point_right": ("principal point 1 px further right", right),
-        "principal_point_down": ("principal point 1 px further down", down),
+        "principal_point_right": (f"principal point {step:g} px further right", right),
+        "principal_point_down": (f"principal point {step:g} px further down", down),
     }
+    # A single ray is where the hand-eye transform puts it, whatever the lens.
+    errors = {} if fit.domain.height * fit.domain.width == 1 else lens
     if not seen.walls_estimated:
         errors["plane_offset"] = ("d of all planes 1 mm larger", one / 1000)
         errors["plane_tilt"] = ("all planes turned by 0.1 deg", math.radians(1 / 10) * seen.on_wall)

@@ -342,6 +342,16 @@ class Fit(Core):
     assumptions: tuple[Shift, ...] = ()
 
     @property
+    def unseen(self) -> list[int]:
+        """Numbers of the directions that a sensor of one ray shows from no pose.
+
+        A turn about the ray changes no distance, and a shift along it is a constant error.
+        """
+        along = {"t_z", "w_z", "c0"} if self.domain.height * self.domain.width == 1 else set()
+        every = enumerate(self.observability.directions)
+        return [k for k, one in every if one.is_undetermined and set(one.shares) <= along]
+
+    @property
     def gain(self) -> float:
         """How much the corrected depth of the fitted pixels changes with the measured one.
 

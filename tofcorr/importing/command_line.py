@@ -68,13 +68,16 @@ intrinsics_options = _adding(
 """Adds the options that say where the camera intrinsics come from."""
 
 _COUNTS = "Millimetres per count; left out: 1 for whole numbers, 1000 (metres) for floats."
-_NONE = "Numbers that mean 'no return', besides NaN."
+_NONE = "Numbers that mean 'no return', besides NaN and those up to zero."
 _TURNS = "Degrees clockwise by which images are turned to fit the intrinsics."
+invalid_option = option("--invalid", _NONE, default="0,65535", type=number_list(*range(1, 9)))
+_TURN = click.Choice(["0", "90", "180", "270"])
+rotate_option = option("--rotate", _TURNS, default="0", type=_TURN)
 coding_options = _adding(
     option("--depth-unit-mm", _COUNTS, "unit_mm", type=float),
-    option("--invalid", _NONE, default="0,65535", type=number_list(*range(1, 9))),
+    invalid_option,
     option("--big-endian", "The two bytes of each number are swapped.", is_flag=True),
-    option("--rotate", _TURNS, default="0", type=click.Choice(["0", "90", "180", "270"])),
+    rotate_option,
 )
 """Adds the options that say how the numbers of depth images are to be read."""
 

@@ -41,12 +41,15 @@ class PoseTrack:
         timestamp: Shape (P,), seconds, strictly increasing; None where the file gives no times.
         names: What each pose is called in the file, such as an image's name; None without names.
         source: Where they come from, for messages.
+        of_row: The pose of each row of the file, shape (R,): rows that repeat time stamp and pose
+            of the one before have one pose.
     """
 
     world_from_tool: np.ndarray
     timestamp: np.ndarray | None
     names: tuple[str, ...] | None
     source: str
+    of_row: np.ndarray
 
     def __len__(self) -> int:
         """Return the number of poses."""
@@ -63,7 +66,8 @@ class PoseTrack:
         """Build a track after checking that every pose is rigid and that times increase.
 
         Rotations that are orthonormal to 0.001 are made exact: files round them. Equal poses of
-        equal time stamps are one pose. Stamps may count finer units than seconds since 1970.
+        equal time stamps are one pose (`of_row`). Stamps may count finer units than seconds since
+        1970.
 
         Raises:
             CalibrationDataError: There is no pose, a pose is not rigid, times decrease, or two
@@ -84,7 +88,15 @@ class PoseTrack:
             kept = _without_repeats(time, poses, source)
             time = time[kept]
         own = None if names is None else tuple(names[int(k)] for k in kept)
-        return cls(world_from_tool=poses[kept], timestamp=time, names=own, source=source)
+        at = np.searchsorted(kept, np.arange(len(poses)), side="right") - 1
+        return cls(world_from_tool=poses[kept], timestamp=time, names=own, source=source, of_row=at)
+
+    @property
+    def repeats(self) -> list[str]:
+        """Say how many rows repeat another one, without a full stop; nothing if none does."""
+        count = len(self.of_row) - len(self)
+        said = f"{self.source}: {count} poses repeat time stamp and pose of the one before"
+        return [said] * (count > 0)
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """Return the poses at some times, shape (N, 4, 4); NaN outside the track, if it has times.

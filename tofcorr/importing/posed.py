@@ -122,6 +122,9 @@ class PosedImport:
             lag = refined
             warnings = [*_lag_warnings(lag), *warnings]
         sieve.refused |= chosen.refused | found.left_out
+        warnings = [*warnings, *(f"{said}; they count once." for said in source.track.repeats)]
+        if source.planes is not None:
+            found = found.measured(source.planes)
         return PreparedImport(
             views=self._reported(chosen, found),
             frames=self._frames(chosen, found),
@@ -334,7 +337,7 @@ class PosedImport:
             modulation_frequency=options.modulation_frequency_hz,
             saturation_amplitude=options.saturation_amplitude,
             tool_from_camera=found.tool_from_camera if known is None else known,
-            planes="estimated",
+            planes="estimated" if self._source.planes is None else "recorded",
             frame_names=names,
         )
 

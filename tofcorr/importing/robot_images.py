@@ -1,6 +1,6 @@
 """Depth images that a camera took while a robot moved: read, paired with poses, and chosen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -70,6 +70,8 @@ class RobotImages:
         refused: Images that the source has left out already.
         warnings: What the source has to say, sentences for people.
         targets: Which wall each image shows, shape (I,), text; None: walls are looked for.
+        planes: Where each of these walls was measured, (nx, ny, nz, d) of n . x + d = 0 in the
+            world of the recording, metres, by name; None: walls are estimated.
         tool_from_camera: The hand-eye transform where it is known, shape (4, 4); else None.
         camera_frame: What the images call the camera's frame; empty if they do not.
     """
@@ -83,6 +85,7 @@ class RobotImages:
     refused: Refused = field(default_factory=dict)
     warnings: Sequence[str] = ()
     targets: np.ndarray | None = None
+    planes: Mapping[str, np.ndarray] | None = None
     tool_from_camera: np.ndarray | None = None
     camera_frame: str = ""
 

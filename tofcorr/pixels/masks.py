@@ -40,8 +40,15 @@ def image_planes(
     return fit_plane(rays[some], batch.radial_distance.flatten(1)[:, seen][:, some], valid[:, some])
 
 
+def _without_plane(batch: FrameBatch) -> Tensor:
+    """Return which images have too few valid pixels for a plane of their own, (B, 1), bool."""
+    return batch.valid.flatten(1).sum(dim=1, keepdim=True) < 3
+
+
 def off_the_wall(batch: FrameBatch, rays: Rays, gross: float = 15.0, least: float = 0.05) -> Chosen:
     """Return which pixels are far off the plane of most of their image.
+
+    Fewer than three pixels determine no plane; none of them is left out.
 
     Args:
         batch: The images.
@@ -53,6 +60,7 @@ def off_the_wall(batch: FrameBatch, rays: Rays, gross: float = 15.0, least: floa
     off = deviation(rays.to(distance).flatten(0, 1), distance, image_planes(batch, rays)).abs()
     known = torch.where(off.isfinite(), off, torch.nan)
     limit = (gross * known.nanmedian(dim=1, keepdim=True).values).clamp(min=least)
+    limit = torch.where(_without_plane(batch), torch.inf, limit)
     return ~(off <= limit).view(batch.valid.shape)
 
 
@@ -98,7 +106,8 @@ def edges(batch: FrameBatch, contrast: float) -> Chosen:
 def grazing(batch: FrameBatch, limit_deg: float, rays: Rays) -> Chosen:
     """Return which pixels see the wall too obliquely, where multipath is large.
 
-    The wall's direction is fitted to the measured points; no hand-eye transform is needed.
+    The wall's direction is fitted to the measured points; no hand-eye transform is needed. Fewer
+    than three points determine none, and are kept.
 
     Args:
         batch: The images.
@@ -107,7 +116,7 @@ def grazing(batch: FrameBatch, limit_deg: float, rays: Rays) -> Chosen:
     """
     normal = torch.nn.functional.normalize(image_planes(batch, rays), dim=1)
     cosine = torch.einsum("hwa,ba->bhw", rays.to(normal), normal).abs()
-    return cosine < math.cos(math.radians(limit_deg))
+    return (cosine < math.cos(math.radians(limit_deg))) & ~_without_plane(batch)[:, :, None]
 
 
 def raw_errors(batch: FrameBatch, rays: Rays, tool_from_camera: Float[Tensor, "4 4"]) -> Images:

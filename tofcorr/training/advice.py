@@ -336,8 +336,9 @@ def advise(
         enough: Pixels of an image that its moments are predicted from.
 
     Returns:
-        Their indices in the pool, and the advice for the report: each pose with the standard
-        deviation of the worst direction (mm or mrad) to expect once it is added.
+        Their indices in the pool, and the advice for the report: the worst direction that poses
+        can show, and each pose with the standard deviation of the worst one (mm or mrad) to expect
+        once it is added.
     """
     best = fit.solution.parameters
     design = Design(fit.model.error, fit.domain, dataset.ray_directions())
@@ -349,7 +350,11 @@ def advise(
     if beyond:
         moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
     added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
-    order, covariances = choose_views(fit.observability.precision, added, number)
+    # What no pose shows is not what further poses are for.
+    shown = [k for k in range(len(added[0])) if k not in fit.unseen]
+    basis = fit.observability.vectors[:, shown]
+    precision, added = (basis.T @ each @ basis for each in (fit.observability.precision, added))
+    order, covariances = choose_views(precision, added, number)
     worst = [1e3 * worst_sigma(covariance) for covariance in covariances]
     names = "distance_m", "tilt_deg", "roll_by_deg"
     poses = [
@@ -361,7 +366,8 @@ def advise(
         }
         for k, sigma in zip(order, worst[1:], strict=True)
     ]
-    return order, {"worst_sigma_mm_or_mrad": worst[0], "poses": poses}
+    direction = fit.observability.directions[shown[0]].in_words()
+    return order, {"direction": direction, "worst_sigma_mm_or_mrad": worst[0], "poses": poses}
 
 
 def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[list[int], Tensor]:

@@ -5,7 +5,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
+import torch
 
+from tofcorr.estimation.moments import HAND_EYE_SYMBOLS
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
@@ -116,6 +118,7 @@ def judge(
     known = f"the hand-eye transform is determined to {1e3 * _WEAK:g} mm and mrad"
     if all(one.sigma <= _WEAK for one in fit.observability.directions):
         known = "every direction is determined"
+    known += ", but for what one ray does not show" if fit.unseen else ""
     first = dict(reversed([*odd, *said]))
     first["good"] = f"{_measured(errors, 1e3 * inspection.look.noise)}, and {known}."
     verdict: Verdict = min(first, key=_VERDICTS.index)
@@ -182,19 +185,25 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
         yield "usable", solution.message
     wide, of_pose = 1e3 * PRIOR_SIGMA, "usable" if free else "good"
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
-    weak = [one for one in fit.observability.directions if one.sigma > _WEAK]
+    every, unseen = fit.observability.directions, fit.unseen
+    weak = [one for k, one in enumerate(every) if one.sigma > _WEAK and k not in unseen]
     of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
     others = [one for one in weak if not set(one.shares) <= curves]
+    held = f"a prior of {wide:g} mm and {wide:g} mrad is used"
     if undetermined := [one.in_words() for one in others if one.is_undetermined]:
-        lacking = f"{'; '.join(undetermined)}: a prior of {wide:g} mm and {wide:g} mrad is used"
+        lacking = f"{'; '.join(undetermined)}: {held}"
         yield of_pose, f"The images do not determine {lacking}. Record more tilts and distances."
+    if hidden := [every[k].in_words() for k in unseen]:
+        yield "good", f"From no pose does one ray show {'; '.join(hidden)}: {held}."
     if uncertain := [one for one in others if not one.is_undetermined]:
         of_hand_eye = any(name.startswith(("t_", "w_")) for one in uncertain for name in one.shares)
         words = "; ".join(f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in uncertain[:3])
         count = f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad)"
         yield of_pose if of_hand_eye else "good", f"{count}: {words}."
     if free:
-        shift, turn = worst_axes(fit.hand_eye_covariance)
+        unknown = {name for k in unseen for name in every[k].shares}
+        seen = torch.tensor([float(name not in unknown) for name in HAND_EYE_SYMBOLS])
+        shift, turn = worst_axes(fit.hand_eye_covariance * seen[:, None] * seen)
         if max(shift, turn) > _WEAK:
             size = f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only"
             yield "usable", f"The hand-eye is known to {size}: record more tilts and distances."
@@ -239,8 +248,8 @@ def report_text(report: Mapping[str, Any]) -> str:
         lines += _hand_eye_lines(report)
     if advice := report["advice"]:
         largest = f"{advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad)"
-        direction = report["observability"]["weakest"][0]["direction"]
-        lines.append(f"The largest standard error is {largest}, of {direction}. To lower it, add:")
+        lines.append(f"The largest standard error is {largest}, of {advice['direction']}.")
+        lines[-1] += " To lower it, add:"
         lines += [
             f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
             f"deg, rolled by {pose['roll_by_deg']:+.0f}: then {pose['worst_sigma_mm_or_mrad']:.2f}"

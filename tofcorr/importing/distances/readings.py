@@ -4,53 +4,67 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.importing.images import DepthImage
+from tofcorr.importing.images import DepthCoding, DepthImage, turned
 from tofcorr.importing.intrinsics import GivenIntrinsics, intrinsics_from_numbers
 from tofcorr.importing.numbers import Line, any_numbers, lines_of, read_text
 from tofcorr.importing.pose_files import read_poses
-from tofcorr.importing.pose_track import PoseTrack
+from tofcorr.importing.pose_track import LEAST_SECONDS, PoseTrack
 from tofcorr.importing.robot_images import RobotImages
 from tofcorr.importing.run import RefusedViewError
 
+Planes = Sequence[tuple[float, ...]]
 _FILES = {"distances": "measurements.csv", "poses": "transforms.csv"}
 """What a folder holds."""
 
 
-def zones_of(text: str) -> tuple[int, int]:
-    """Read columns and rows, such as `8x8`.
+def layout_of(zones: str, order: str, flip: str, rotate: str) -> np.ndarray:
+    """Return where each zone stands in a reading, counted from zero, shape (H, W).
 
     Most sensors have 8 zones a side (VL53L5CX); those of more than 64 give images, not tables.
 
+    Args:
+        zones: COLUMNSxROWS as written, such as `8x8`.
+        order: `rows`: row by row; or `columns`.
+        flip: `horizontal`: each row is written from right to left; `vertical`: from the bottom;
+            `both`; or `none`.
+        rotate: Degrees clockwise by which what was flipped is turned.
+
     Raises:
-        ConfigError: The text is something else.
+        ConfigError: `zones` is something else.
+
+    Example:
+        >>> layout_of("3x2", "columns", "horizontal", "0").tolist()
+        [[4, 2, 0], [5, 3, 1]]
     """
-    match = re.fullmatch(r"(\d+)x(\d+)", text.strip().lower())
+    match = re.fullmatch(r"(\d+)x(\d+)", zones.strip().lower())
     if match is None or not all(1 <= int(part) <= 64 for part in match.groups()):
-        raise ConfigError(f"--zones must be COLUMNSxROWS, such as 1x1 or 8x8, got '{text[:40]}'.")
-    return int(match[1]), int(match[2])
+        raise ConfigError(f"--zones must be COLUMNSxROWS, such as 1x1 or 8x8, got '{zones[:40]}'.")
+    shape = int(match[2]), int(match[1])
+    places = np.arange(shape[0] * shape[1]).reshape(shape, order="C" if order == "rows" else "F")
+    axes = {"none": (), "vertical": (0,), "horizontal": (1,), "both": (0, 1)}
+    return turned(np.flip(places, axes[flip]), int(rotate))
 
 
-def sensor_lens(
-    zones: tuple[int, int], field_of_view_deg: tuple[float, ...] | None
-) -> GivenIntrinsics:
+def sensor_lens(layout: np.ndarray, field_of_view_deg: tuple[float, ...] | None) -> GivenIntrinsics:
     """Return the intrinsics of a pinhole camera with one pixel a zone.
 
     Args:
-        zones: Columns and rows.
+        layout: Of the zones, shape (H, W).
         field_of_view_deg: Of all zones together, horizontally and vertically (one number: both),
             degrees; not needed for one pixel, whose ray is the optical axis.
 
     Raises:
         ConfigError: A field of view is missing, or not between 0 and 180 degrees.
     """
-    columns, rows = zones
-    focal = [1.0, 1.0]
-    if zones != (1, 1):
+    rows, columns = layout.shape
+    focal, zones = [1.0, 1.0], (columns, rows)
+    if layout.size > 1:
         if field_of_view_deg is None:
             raise ConfigError(f"A sensor of {columns}x{rows} zones needs --fov-deg H,V.")
         if not all(0 < angle < 180 for angle in field_of_view_deg):
@@ -64,56 +78,68 @@ def sensor_lens(
 
 def open_distances(
     sources: Sequence[Path],
-    zones: tuple[int, int],
+    layout: np.ndarray,
     lens: GivenIntrinsics,
+    coding: DepthCoding,
     *,
     poses: Sequence[Path] = (),
     pose_format: str | None = None,
     names: Sequence[str] = (),
-    unit_mm: float | None = None,
+    planes: Planes = (),
 ) -> RobotImages:
     """Read distances before one or several walls, as images of a few pixels.
 
     Args:
-        sources: For each wall a file of distances, or a folder with one and a file of poses.
-        zones: Columns and rows of the sensor.
-        lens: Its zones as pixels.
-        poses: For each wall a file of poses; none where folders hold them.
+        sources: Files of distances before one wall each, or folders with one and a file of poses.
+        layout: Where each zone stands in a reading, shape (H, W).
+        lens: The zones as pixels.
+        coding: Millimetres per count, None: inferred; and the numbers that mean "no return",
+            besides those up to zero.
+        poses: For each source a file of poses; none where folders hold them.
         pose_format: Of `tofcorr.importing.pose_files.POSE_FORMATS`; None: told from the content.
-        names: What each wall is called; none: as its file or folder.
-        unit_mm: Millimetres per count; None: inferred.
+        names: What each source's wall is called; none: as the file or folder.
+        planes: Where each source's wall was measured, (nx, ny, nz, d), metres; none: unknown.
 
     Raises:
         CalibrationDataError: A file is missing or damaged, or rows and poses are not as many.
-        ConfigError: There are not as many poses or names as sources.
+        ConfigError: There are not as many poses, names or planes as sources, or two planes of one
+            wall.
     """
-    names = _wall_names(sources, poses, names)
-    tables = [read_distances(_file_in(source, "distances"), zones) for source in sources]
+    for what, every in (("--poses", poses), ("--wall", names), ("--plane", planes)):
+        if every and len(every) != len(sources):
+            raise ConfigError(f"expected one {what} per source ({len(sources)}), got {len(every)}.")
+    names, warnings = _wall_names(sources, names, planes), list[str]()
+    files = [_file_in(source, "distances") for source in sources]
+    tables = [read_distances(path, layout, coding.invalid, warnings) for path in files]
     paths = poses or [_file_in(source, "poses") for source in sources]
-    tracks = [read_poses(path, pose_format).world_from_tool for path in paths]
+    given = [read_poses(path, pose_format) for path in paths]
+    # Row by row: a pose that is repeated belongs to its row nevertheless.
+    tracks = [track.world_from_tool[track.of_row] for track in given]
     for path, track, table in zip(paths, tracks, tables, strict=True):
         if len(track) != len(table):
             raise CalibrationDataError(f"{path}: {len(track)} poses beside {len(table)} rows.")
-    readings, warnings = np.concatenate(tables), []
+    warnings += [f"{said}; each belongs to its own row." for one in given for said in one.repeats]
+    readings = np.concatenate(tables)
     typical = float(np.nanmedian(readings))
     # No such sensor sees 20 m.
-    unit = unit_mm or (1.0 if typical >= 20 else 1000.0)
-    if unit_mm is None:
+    unit = coding.unit_mm or (1.0 if typical >= 20 else 1000.0)
+    if coding.unit_mm is None:
         word = "millimetres" if unit == 1 else "metres"
         read_as = f"Distances are typically {typical:g} and read as {word}"
         warnings.append(f"{read_as}; state --depth-unit-mm {unit:g} if that is right.")
-    if zones == (1, 1):
+    if layout.size == 1:
         warnings.append("One pixel: its ray is the optical axis; a turn about it cannot be found.")
     origin = ", ".join(map(str, sources)) if len(sources) < 3 else f"{sources[0]}, ..."
-    every = (unit * readings / 1000).astype(np.float32)
+    metres = (unit * readings / 1000).astype(np.float32)
 
     def read(number: int) -> DepthImage:
-        if not np.isfinite(every[number]).any():
+        if not np.isfinite(metres[number]).any():
             raise RefusedViewError("no zone has a return")
-        return DepthImage(every[number])
+        return DepthImage(metres[number])
 
     targets = np.repeat(names, [len(table) for table in tables])
-    rows = np.concatenate([np.arange(len(table)) for table in tables])
+    # Counted on from file to file of one wall.
+    rows = [np.sum(targets[:k] == name) for k, name in enumerate(targets)]
     return RobotImages(
         origin=origin,
         names=[f"{name} {row}" for name, row in zip(targets, rows, strict=True)],
@@ -121,20 +147,20 @@ def open_distances(
         read=read,
         track=PoseTrack.checked(np.concatenate(tracks), origin),
         targets=targets,
+        planes=dict(zip(names, map(np.array, planes), strict=True)) if planes else None,
         warnings=warnings,
     )
 
 
-def _wall_names(
-    sources: Sequence[Path], poses: Sequence[Path], names: Sequence[str]
-) -> Sequence[str]:
-    for what, given in (("--poses", poses), ("--wall", names)):
-        if given and len(given) != len(sources):
-            raise ConfigError(f"expected one {what} per source ({len(sources)}), got {len(given)}.")
-    names = [*names] or [source.stem for source in sources]
-    if len(set(names)) < len(names):
-        raise ConfigError(f"Two walls have one name: {', '.join(names)}. Name them with --wall.")
-    return names
+def _wall_names(sources: Sequence[Path], names: Sequence[str], planes: Planes) -> Sequence[str]:
+    found = [*names] or [source.stem for source in sources]
+    if not names and len(set(found)) < len(found):
+        raise ConfigError(f"Two sources have one name: {', '.join(found)}. Name their --wall.")
+    if planes and len(set(zip(found, planes, strict=True))) > len(set(found)):
+        raise ConfigError("One --wall has two different planes (--plane); expected one.")
+    if not all(any(plane[:3]) for plane in planes):
+        raise ConfigError("--plane must be NX,NY,NZ,D with a normal that is not zero.")
+    return found
 
 
 def _file_in(source: Path, what: str) -> Path:
@@ -146,43 +172,48 @@ def _file_in(source: Path, what: str) -> Path:
     return source
 
 
-def read_distances(path: Path, zones: tuple[int, int]) -> np.ndarray:
+def read_distances(
+    path: Path, layout: np.ndarray, invalid: tuple[float, ...], warnings: list[str]
+) -> np.ndarray:
     """Read a table of distances: one row a pose, one or several readings a row.
 
-    A row holds, after an optional time stamp, the distances of all zones row by row, once or
-    several times over. Numbers up to zero mean "no return". A header row is skipped.
+    A row holds, after an optional time stamp, the distances of all zones, once or several times
+    over. Numbers up to zero mean "no return". A header row is skipped.
 
     Args:
         path: The file.
-        zones: Columns and rows of the sensor.
+        layout: Where each zone stands in a reading, shape (H, W).
+        invalid: Further numbers that mean "no return".
+        warnings: Gets a sentence where rows repeat a time stamp.
 
     Returns:
-        The median of the readings at each pose, as written, shape (P, rows, columns); NaN without
-        return.
+        The median of the readings at each pose, as written, shape (P, H, W); NaN without return.
 
     Raises:
         CalibrationDataError: The file cannot be read, or a row does not hold whole readings.
     """
-    columns, rows = zones
     lines = lines_of(read_text(path))
     if lines and not any(any_numbers(text).shape == () for text in lines[0][1]):
         lines = lines[1:]
-    readings = [_readings(line, columns * rows, path) for line in lines]
-    medians = [np.ma.median(np.ma.masked_where(~(one > 0), one), axis=0) for one in readings]
-    found = np.reshape([np.ma.filled(median, np.nan) for median in medians], (-1, rows, columns))
-    if not np.isfinite(found).any():
+    rows = [_readings(line, layout.size, path) for line in lines]
+    masked = [np.ma.masked_where(~(one > 0) | np.isin(one, invalid), one) for _, one in rows]
+    medians = [np.ma.filled(np.ma.median(one, axis=0), np.nan) for one in masked]
+    if not np.isfinite(medians).any():
         raise CalibrationDataError(f"{path}: no distance is above zero.")
-    return found
+    if alike := sum(before[0] == after[0] != "" for before, after in pairwise(rows)):
+        warnings.append(f"{path}: {alike} rows repeat the time stamp before them; all are used.")
+    return np.array(medians)[:, layout]
 
 
-def _readings(line: Line, zones: int, path: Path) -> np.ndarray:
-    """Return the readings of one row, shape (R, zones)."""
-    number, fields = line
-    # A time, or a number of the row.
-    if any_numbers(fields[0]).shape or (len(fields) % zones == 1 and zones > 1):
-        fields = fields[1:]
+def _readings(line: Line, zones: int, path: Path) -> tuple[str, np.ndarray]:
+    """Return the time stamp of one row, empty without one, and its readings, shape (R, zones)."""
+    (number, fields), stamp = line, ""
+    first = any_numbers(fields[0])
+    # A time, or a number of the row. No distance is a time since 1970.
+    if first.shape or first >= LEAST_SECONDS or (len(fields) % zones == 1 and zones > 1):
+        stamp, *fields = fields
     values = any_numbers(fields)
     if not values.size or values.size % zones:
         said = f"{values.size} numbers are not whole readings of {zones} zones (--zones)"
         raise CalibrationDataError(f"{path}, line {number}: {said}.")
-    return np.where(np.isfinite(values), values, 0.0).reshape(-1, zones)
+    return stamp, np.where(np.isfinite(values), values, 0.0).reshape(-1, zones)

@@ -1,8 +1,8 @@
 """Walls of images from known robot poses, without measured planes: found, named and reported."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -48,6 +48,16 @@ class FoundWalls:
     misfit_mm: float
     left_out: dict[str, str]
 
+    def measured(self, planes: Mapping[str, np.ndarray]) -> "FoundWalls":
+        """Return the walls where they were measured, with normals towards the camera as found.
+
+        Args:
+            planes: (nx, ny, nz, d) by the wall's name, the normal of any length and sense.
+        """
+        given = np.array([planes[name] / np.linalg.norm(planes[name][:3]) for name in self.names])
+        away = (given[:, :3] * self.walls[:, :3]).sum(axis=1, keepdims=True) < 0
+        return replace(self, walls=np.where(away, -given, given))
+
     def to_mapping(self) -> dict[str, Any]:
         """Return the walls for a report."""
         keys = ("name", "normal_world", "offset_m", "images", "share")
@@ -91,7 +101,8 @@ def walls_of_planes(
     fewest = 4
     if seeing < fewest:
         flat = f"flat on {options.least_share:.0%} and to within {options.tolerance_mm:g} mm"
-        said = f"{seeing} of {len(images)} images show anything {flat}; {fewest} must"
+        what = f"show anything {flat}" if targets is None else "have enough readings for a plane"
+        said = f"{seeing} of {len(images)} images {what}; {fewest} must"
         raise CalibrationDataError(f"{origin}: {said}.")
     given = labels = None
     if targets is not None:
@@ -149,12 +160,16 @@ def _left_out(
     seen, on_wall = (set(planes.image[own].tolist()) for own in (joint.wall > -2, joint.wall >= 0))
     flat = f"nothing flat covers {100 * options.least_share:g} % of it to within "
     flat += f"{options.tolerance_mm:g} mm"
+    # Where each image shows one known wall, that wall is what it is off.
+    known = planes.label is not None
+    flat, nearest = ("fewer than three returns", "its") if known else (flat, "the nearest")
     found = {k: {} for k in range(len(names))}
     for k in found.keys() - on_wall:
         found[k][names[k]] = "none of its planes is on a wall" if k in seen else flat
     for k in (joint.wall < 0).nonzero()[:, 0].tolist():
         off, image = float(joint.deviation[k]), int(planes.image[k])
-        far = f"{1000 * off:.0f} mm from the nearest wall" if math.isfinite(off) else "faces none"
-        name = f"{names[image]}, plane {int(planes.number[k]) + 1}"
-        found[image][name] = f"{far}, or not seen in enough images"
+        far = f"{1000 * off:.0f} mm from {nearest} wall"
+        far = far if math.isfinite(off) else "turned away from its wall" if known else "faces none"
+        name = names[image] if known else f"{names[image]}, plane {int(planes.number[k]) + 1}"
+        found[image][name] = far if known else f"{far}, or not seen in enough images"
     return {name: reason for own in found.values() for name, reason in own.items()}
