@@ -91,10 +91,11 @@ def open_distances(
     tables = [read_distances(_file_in(source, "distances"), zones) for source in sources]
     paths = poses or [_file_in(source, "poses") for source in sources]
     tracks = [read_poses(path, pose_format).world_from_tool for path in paths]
-    for path, track, table in zip(paths, tracks, tables, strict=True):
+    for path, track, (table, _) in zip(paths, tracks, tables, strict=True):
         if len(track) != len(table):
             raise CalibrationDataError(f"{path}: {len(track)} poses beside {len(table)} rows.")
-    readings, warnings = np.concatenate(tables), []
+    readings, scatter = (np.concatenate(part) for part in zip(*tables, strict=True))
+    warnings: list[str] = []
     typical = float(np.nanmedian(readings))
     # No such sensor sees 20 m.
     unit = unit_mm or (1.0 if typical >= 20 else 1000.0)
@@ -112,8 +113,16 @@ def open_distances(
             raise RefusedViewError("no zone has a return")
         return DepthImage(every[number])
 
-    targets = np.repeat(names, [len(table) for table in tables])
-    rows = np.concatenate([np.arange(len(table)) for table in tables])
+    targets = np.repeat(names, [len(table) for table, _ in tables])
+    rows = np.concatenate([np.arange(len(table)) for table, _ in tables])
+    usual, widest = unit * float(np.median(scatter)), unit * float(scatter.max())
+    if widest > max(20, 10 * usual):  # More than errors of a sensor, and no noise.
+        where, said = (
+            int(scatter.argmax()),
+            f"scatter by {widest:.0f} mm, of most by {usual:.0f} mm",
+        )
+        place = f"row {rows[where]} of {targets[where]}"
+        warnings.append(f"The readings of {place} {said}: what it saw moved; leave it out.")
     return RobotImages(
         origin=origin,
         names=[f"{name} {row}" for name, row in zip(targets, rows, strict=True)],
@@ -146,7 +155,7 @@ def _file_in(source: Path, what: str) -> Path:
     return source
 
 
-def read_distances(path: Path, zones: tuple[int, int]) -> np.ndarray:
+def read_distances(path: Path, zones: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Read a table of distances: one row a pose, one or several readings a row.
 
     A row holds, after an optional time stamp, the distances of all zones row by row, once or
@@ -157,8 +166,8 @@ def read_distances(path: Path, zones: tuple[int, int]) -> np.ndarray:
         zones: Columns and rows of the sensor.
 
     Returns:
-        The median of the readings at each pose, as written, shape (P, rows, columns); NaN without
-        return.
+        The median of the readings at each pose, as written, shape (P, rows, columns), NaN without
+        return; and the largest standard deviation of a zone's readings at each pose, (P,).
 
     Raises:
         CalibrationDataError: The file cannot be read, or a row does not hold whole readings.
@@ -168,11 +177,12 @@ def read_distances(path: Path, zones: tuple[int, int]) -> np.ndarray:
     if lines and not any(any_numbers(text).shape == () for text in lines[0][1]):
         lines = lines[1:]
     readings = [_readings(line, columns * rows, path) for line in lines]
-    medians = [np.ma.median(np.ma.masked_where(~(one > 0), one), axis=0) for one in readings]
-    found = np.reshape([np.ma.filled(median, np.nan) for median in medians], (-1, rows, columns))
+    known = [np.ma.masked_where(~(one > 0), one) for one in readings]
+    medians = [np.ma.filled(np.ma.median(one, axis=0), np.nan) for one in known]
+    found = np.reshape(medians, (-1, rows, columns))
     if not np.isfinite(found).any():
         raise CalibrationDataError(f"{path}: no distance is above zero.")
-    return found
+    return found, np.array([float(np.ma.filled(one.std(axis=0), 0.0).max()) for one in known])
 
 
 def _readings(line: Line, zones: int, path: Path) -> np.ndarray:
