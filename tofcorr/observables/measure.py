@@ -135,12 +135,11 @@ def _noise_of_neighbours(
 
     ratio, without = ratio_of(total), ratio_of(total - observed.within)
     share, *shares = _second_difference_share(np.concatenate([ratio[None], without])).tolist()
-    raw = table.of_neighbours
     # In the images of small squares most pixels have a neighbour of their brightness, but no second
     # difference: half the squared difference is that much smaller.
     nearest = table.of_nearest / ratio[:, 0].mean()
-    at_edges = ~np.isfinite(raw) & np.isfinite(nearest)
-    variance = np.where(at_edges, nearest, raw) / share
+    at_edges = ~np.isfinite(table.of_neighbours) & np.isfinite(nearest)
+    variance = np.where(at_edges, nearest, table.of_neighbours) / share
     edges = float(variance[at_edges].sum() / np.nansum(variance)) if at_edges.any() else 0.0
     left_out = -np.log(np.array(shares) / share)
     left_out -= edges * np.log(without[..., 0].mean(-1) / ratio[:, 0].mean())

@@ -396,10 +396,9 @@ def lateness(problem: LinearResiduals) -> Late | None:
     late: list[Late] = []
     for what, column in columns.items():
         size = max(float(np.sqrt(np.mean(column[problem.used] ** 2))), TINY)
-        (found,) = problem.added(column[..., None] / size)
-        moved = -float(found.value[0])  # The estimate takes it off.
-        if moved > max(WORTH_A_WORD, SIGMAS * found.size_error):
-            late.append((what, moved / size, found))
+        (found,) = problem.added(column[..., None] / -size)  # An estimate takes it off.
+        if found.value[0] > max(WORTH_A_WORD, SIGMAS * found.size_error):
+            late.append((what, float(found.value[0]) / size, found))
     return min(late, key=lambda one: problem.frame_rms(one[2].left).sum(), default=None)
 
 

@@ -250,9 +250,8 @@ class Look:
     @cached_property
     def _left(self) -> np.ndarray | None:
         """What is left of the residuals by what explains most; None where that cannot be told."""
-        found = [self.drift, self.late and self.late[2], self.shape and self.shape["kind"]]
-        left = [one.left for one in found[:2] if one] or [one.left for one in found[2:] if one]
-        return min(left, key=lambda one: float(self.of_camera.frame_rms(one).sum()), default=None)
+        others = self.late and self.late[2], self.shape and self.shape["kind"]
+        return next((one.left for one in (self.drift, *others) if one), None)
 
     @cached_property
     def rms(self) -> np.ndarray:

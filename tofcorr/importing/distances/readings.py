@@ -115,14 +115,12 @@ def open_distances(
 
     targets = np.repeat(names, [len(table) for table, _ in tables])
     rows = np.concatenate([np.arange(len(table)) for table, _ in tables])
-    usual, widest = unit * float(np.median(scatter)), unit * float(scatter.max())
-    if widest > max(20, 10 * usual):  # More than errors of a sensor, and no noise.
-        where, said = (
-            int(scatter.argmax()),
-            f"scatter by {widest:.0f} mm, of most by {usual:.0f} mm",
+    usual, most = unit * float(np.median(scatter)), unit * float(scatter.max())
+    if most > max(20, 10 * usual):  # More than errors of a sensor, and no noise.
+        said = (
+            f"The readings of row {rows[scatter.argmax()]} of {targets[scatter.argmax()]} scatter"
         )
-        place = f"row {rows[where]} of {targets[where]}"
-        warnings.append(f"The readings of {place} {said}: what it saw moved; leave it out.")
+        warnings.append(f"{said} by {most:.0f} mm, of most by {usual:.0f} mm: leave it out.")
     return RobotImages(
         origin=origin,
         names=[f"{name} {row}" for name, row in zip(targets, rows, strict=True)],

@@ -193,13 +193,11 @@ _CAMERA = {
     "aspect": ("focal length", "the horizontal focal length alone were {size:.0f} % {longer}"),
     "centre": (
         "principal point",
-        "the principal point lay {first:+z.0f} % of the focal length to the right and "
-        "{second:+z.0f} % further down",
+        "the principal point lay {first:+z.0f} % of the focal length right, {second:+z.0f} % down",
     ),
     "corner": (
         "distortion",
-        "the distortion moved the corners of the image {size:.1f} % of the focal length further "
-        "{out}",
+        "the distortion moved the corners {size:.1f} % of the focal length {out}",
     ),
     "bend": (
         "distortion",
@@ -238,9 +236,8 @@ def _target(look: Look, shape: "dict[str, Estimate]") -> Iterator[Finding]:
     half_width = float(np.quantile(places, 0.9))
     sag, rising = np.abs(curved.value) * half_width**2, np.abs(rim.value)
     if ((rising > SPOILS) & (rising > SIGMAS * rim.error)).any():
-        where = f"{1e3 * float(rising.max()):.0f} mm off at one end of what is seen of it"
-        cause = "a second reflection, or a bend: mask it"
-        yield doubtful(f"The target lies {where}, from wherever it is seen: {cause}.", check="rim")
+        where = f"{1e3 * float(rising.max()):.0f} mm off at one end, from wherever it is seen"
+        yield doubtful(f"The target lies {where}: a second reflection? Mask it.", check="rim")
     elif ((sag > SPOILS) & (sag > SIGMAS * curved.error * half_width**2)).any():
         where = f"{1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of its middle"
         said = f"The target is bent by {where}, from wherever it is seen"
@@ -269,11 +266,12 @@ def late(look: Look) -> Iterator[Finding]:
     """Are a pose and its image of one moment, or does one hold a share of the frame before?"""
     if look.late is not None:
         what, share, found = look.late
-        error = abs(100 * share * found.size_error / found.size)
-        much = f"{what[0]} holds {100 * share:.1f} % (standard error {error:.1g} %) of {what[1]}"
-        said = f"{much}, and moves points by {1e3 * found.size:.1f} mm"
+        size = f"{1e3 * found.size:.1f} mm (standard error {1e3 * found.size_error:.1f} mm)"
+        said = (
+            f"Each {what[0]} holds {100 * share:.1f} % of {what[1]}, which moves points by {size}"
+        )
         cause = "the robot still moved, poses lag, or the camera filters over time"
-        yield doubtful(f"Each {said}: {cause}; wait after a move.", spoils=found.size > SPOILS)
+        yield doubtful(f"{said}: {cause}; wait after a move.", spoils=found.size > SPOILS)
 
 
 def agreement(look: Look) -> Iterator[Finding]:

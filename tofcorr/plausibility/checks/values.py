@@ -76,19 +76,14 @@ def depth_values(look: Look) -> Iterator[Finding]:
         severity = "doubtful" if 2 * len(missing) > len(valid) else "note"
         said = f"Hardly any usable pixel is left in {in_words(frames)}"
         yield Finding(severity, f"{said}: no return, saturated, or masked out.", frames)
-    top = look.stored == values.max()
-    frames, below = (
-        top.any(1),
-        np.unique(values[values < values.max()], return_counts=True)[1][-20:],
-    )
+    levels, count = np.unique(values, return_counts=True)
+    at_top, below = (look.stored == levels[-1]).any(1), count[-21:-1]
     # Rounded distances repeat as well: of three that fall into 20 steps, one triple in 400 shares
     # the last. Repeats of the farthest pose count once.
-    few = len(np.unique(look.group[frames])) < 3 or below.sum() <= 3
-    if not few and top.sum() >= 3 * below.max():
-        named = tuple(look.sampled[frames].tolist())
-        said = f"{top.sum()} pixels of {in_words(named)} hold exactly the largest distance"
-        limit = f"{values.max():.4g} m: the camera's range ends there; write NaN"
-        yield doubtful(f"{said}, {limit}.", named)
+    if len(np.unique(look.group[at_top])) > 2 < below.sum() and count[-1] >= 3 * below.max():
+        frames = tuple(look.sampled[at_top].tolist())
+        said = f"{count[-1]} pixels of {in_words(frames)} hold exactly the largest distance"
+        yield doubtful(f"{said}, {levels[-1]:.4g} m: the range ends there; write NaN.", frames)
     elif len(values) >= FEWEST_PIXELS:
         yield from _repeated_or_rounded(values)
 
@@ -101,12 +96,9 @@ def repeats(look: Look) -> Iterator[Finding]:
     middle, group = np.nanmedian(look.scene.distance, axis=1), look.group[look.usable]
     apart = np.array([np.ptp(middle[group == own]) for own in group])
     typical = float(np.median(apart[apart > 0])) if apart.any() else 0.0
-    wild = np.flatnonzero(apart > max(CAMERA, 10 * typical))
-    if len(wild):
-        frames = tuple(look.frames[wild].tolist())
+    if frames := tuple(look.frames[apart > max(CAMERA, 10 * typical)].tolist()):
         said = f"{in_words(frames).capitalize()} differ by {1e3 * apart.max():.0f} mm within a pose"
-        others = f"frames of other poses by {1e3 * typical:.1f} mm: what was seen moved"
-        yield doubtful(f"{said}, {others}; leave them out.", frames)
+        yield doubtful(f"{said}, others by {1e3 * typical:.1f} mm: leave them out.", frames)
 
 
 def _repeated_or_rounded(values: np.ndarray) -> Iterator[Finding]:
@@ -251,7 +243,9 @@ def _of_the_depth(look: Look, amplitude: np.ndarray) -> Iterator[Finding]:
     with np.errstate(divide="ignore", invalid="ignore"):
         bright, far = np.log(amplitude), np.log(np.abs(scene.cosine) / scene.distance**2)
     used = scene.on_plane & np.isfinite(bright + far)
-    slope, error = _slope(far, bright, used)
+    count, sums = used.sum(1, keepdims=True), (np.where(used, one, 0.0) for one in (far, bright))
+    means = (one.sum(1, keepdims=True) / np.maximum(count, 1) for one in sums)
+    slope, error = _slope(*means, count > 0)
     if not changing and 3 * abs(slope - 1) > max(2, 3 * SIGMAS * error):
         said = f"The amplitude falls with the distance to the power of {2 * slope:.1f}"
         cause = f"light with that of 2 (standard error {2 * error:.1g})"
@@ -261,9 +255,11 @@ def _of_the_depth(look: Look, amplitude: np.ndarray) -> Iterator[Finding]:
     used &= (np.square(bright).sum(1) < used.sum(1) / 100)[:, None]
     slope, error = _slope(deep, bright, used)
     if slope < -max(1.0, SIGMAS * error):
-        said = f"The amplitude has {slope:.2f} times the relative noise of the depth"
-        sure = f"standard error {error:.1g}; -2 where it was divided by the square of the depth"
-        yield doubtful(f"{said} ({sure}): it was computed from the depth; use the camera's own.")
+        said = (
+            f"The amplitude has {slope:.2f} (standard error {error:.1g}) times the relative noise"
+        )
+        cause = "it was computed from the depth (-2: divided by its square); use the camera's own"
+        yield doubtful(f"{said} of the depth: {cause}.")
 
 
 def _slope(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[float, float]:
@@ -271,9 +267,9 @@ def _slope(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[float, float
     x, y = (np.where(used, one - one[used].sum() / max(used.sum(), 1), 0.0) for one in (x, y))
     square = max(float((x * x).sum()), TINY)
     slope = float((x * y).sum()) / square
-    error = float(np.linalg.norm((x * (y - slope * x)).sum(1))) / square
-    # Of fewer frames the error is hardly known.
-    return slope, error if used.any(1).sum() > 8 else math.inf
+    # Of few frames the error is hardly known.
+    known = used.any(1).sum() > 8
+    return slope, np.linalg.norm((x * (y - slope * x)).sum(1)) / square if known else math.inf
 
 
 def temperatures(look: Look) -> Iterator[Finding]:
