@@ -243,9 +243,9 @@ def _of_the_depth(look: Look, amplitude: np.ndarray) -> Iterator[Finding]:
     with np.errstate(divide="ignore", invalid="ignore"):
         bright, far = np.log(amplitude), np.log(np.abs(scene.cosine) / scene.distance**2)
     used = scene.on_plane & np.isfinite(bright + far)
-    count, sums = used.sum(1, keepdims=True), (np.where(used, one, 0.0) for one in (far, bright))
-    means = (one.sum(1, keepdims=True) / np.maximum(count, 1) for one in sums)
-    slope, error = _slope(*means, count > 0)
+    count = np.maximum(used.sum(1, keepdims=True), 1)
+    means = (np.where(used, one / count, 0.0).sum(1, keepdims=True) for one in (far, bright))
+    slope, error = _slope(*means, used.any(1, keepdims=True))
     if not changing and 3 * abs(slope - 1) > max(2, 3 * SIGMAS * error):
         said = f"The amplitude falls with the distance to the power of {2 * slope:.1f}"
         cause = f"light with that of 2 (standard error {2 * error:.1g})"
@@ -255,11 +255,9 @@ def _of_the_depth(look: Look, amplitude: np.ndarray) -> Iterator[Finding]:
     used &= (np.square(bright).sum(1) < used.sum(1) / 100)[:, None]
     slope, error = _slope(deep, bright, used)
     if slope < -max(1.0, SIGMAS * error):
-        said = (
-            f"The amplitude has {slope:.2f} (standard error {error:.1g}) times the relative noise"
-        )
+        said = f"The amplitude has {slope:.2f} times the relative noise of the depth"
         cause = "it was computed from the depth (-2: divided by its square); use the camera's own"
-        yield doubtful(f"{said} of the depth: {cause}.")
+        yield doubtful(f"{said} (standard error {error:.1g}): {cause}.")
 
 
 def _slope(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[float, float]:
@@ -267,9 +265,8 @@ def _slope(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[float, float
     x, y = (np.where(used, one - one[used].sum() / max(used.sum(), 1), 0.0) for one in (x, y))
     square = max(float((x * x).sum()), TINY)
     slope = float((x * y).sum()) / square
-    # Of few frames the error is hardly known.
-    known = used.any(1).sum() > 8
-    return slope, np.linalg.norm((x * (y - slope * x)).sum(1)) / square if known else math.inf
+    error = float(np.linalg.norm((x * (y - slope * x)).sum(1))) / square
+    return slope, error if used.any(1).sum() > 8 else math.inf  # Hardly known of fewer frames.
 
 
 def temperatures(look: Look) -> Iterator[Finding]:
