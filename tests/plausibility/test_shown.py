@@ -36,8 +36,7 @@ def thrice(parts: Parts, *, away: float = 0.0) -> Parts:
     """Every pose three times, 3 mm of noise; what is seen at one moves."""
     noise = 0.003 * np.random.default_rng(2).standard_normal((66, *parts.depth.shape[1:]))
     noise[30] += away
-    repeated = parts.frames(np.repeat(np.arange(22), 3))
-    return repeated.changed(depth=repeated.depth + noise)
+    return parts.frames(np.arange(66) // 3).changed(depth=np.repeat(parts.depth, 3, axis=0) + noise)
 
 
 def capped(parts: Parts) -> Parts:

@@ -390,9 +390,8 @@ def _of_neighbours(images: _PoseImages) -> np.ndarray:
         `temporal`: products of deviations from the mean of the repeats; `within`: half squares of
         differences in one image, where there is a second difference too; shape (2, 3, 2, 2).
     """
-    residual = images.residual
     sums = np.zeros((2, 3, len(AXES), len(LAGS)))
-    deviation = residual - known_mean(residual)
+    deviation = images.residual - known_mean(images.residual)
     for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
         if len(deviation) > 1:
             first, later = _shifted_pair(deviation, axis, lag)

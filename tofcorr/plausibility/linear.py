@@ -303,7 +303,7 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
 def _from_end(place: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return what falls from 1 at the largest of the places that are used, (F, P)."""
     low, high = np.quantile(place[used], [0.01, 0.99])
-    return np.exp(10 * (place.clip(low, high) - high) / (high - low))
+    return np.exp(10 * (place.clip(low, high) - high) / max(high - low, TINY))
 
 
 def exact_camera(problem: LinearResiduals, declared: str) -> tuple[Estimate, np.ndarray]:
