@@ -250,7 +250,7 @@ class Look:
     @cached_property
     def _left(self) -> np.ndarray | None:
         """What is left of the residuals by what explains most; None where that cannot be told."""
-        others = self.late and self.late[2], self.shape and self.shape["kind"]
+        others = self.late and self.late[2], self.shape["kind"] if self.shape else None
         return next((one.left for one in (self.drift, *others) if one), None)
 
     @cached_property

@@ -244,8 +244,8 @@ def _of_the_depth(look: Look, amplitude: np.ndarray) -> Iterator[Finding]:
         bright, far = np.log(amplitude), np.log(np.abs(scene.cosine) / scene.distance**2)
     used = scene.on_plane & np.isfinite(bright + far)
     count = np.maximum(used.sum(1, keepdims=True), 1)
-    means = (np.where(used, one / count, 0.0).sum(1, keepdims=True) for one in (far, bright))
-    slope, error = _slope(*means, used.any(1, keepdims=True))
+    x, y = (np.where(used, one / count, 0.0).sum(1, keepdims=True) for one in (far, bright))
+    slope, error = _slope(x, y, used.any(1, keepdims=True))
     if not changing and 3 * abs(slope - 1) > max(2, 3 * SIGMAS * error):
         said = f"The amplitude falls with the distance to the power of {2 * slope:.1f}"
         cause = f"light with that of 2 (standard error {2 * error:.1g})"
