@@ -80,7 +80,7 @@ def depth_values(look: Look) -> Iterator[Finding]:
     at_top, below = (look.stored == levels[-1]).any(1), count[-21:-1]
     # Rounded distances repeat as well: of three that fall into 20 steps, one triple in 400 shares
     # the last. Repeats of the farthest pose count once.
-    if len(np.unique(look.group[at_top])) > 2 < below.sum() and count[-1] >= 3 * below.max():
+    if len(np.unique(look.group[at_top])) > 2 < below.sum() and count[-1] >= 3 * below.mean():
         frames = tuple(look.sampled[at_top].tolist())
         said = f"{count[-1]} pixels of {in_words(frames)} hold exactly the largest distance"
         yield doubtful(f"{said}, {levels[-1]:.4g} m: the range ends there; write NaN.", frames)
