@@ -1,11 +1,13 @@
 """A recording against a simulated one: what differs is found, what does not is not."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy_camera import Camera, record
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.figures import drawings
@@ -14,6 +16,7 @@ from tofcorr.plausibility.page import WIDTH
 
 REAL = Camera(times=2.0, threshold=120.0, filter_px=0.7, base_share=0.003, gain=0.93)
 ONES = np.ones((20, 1))
+SPOILT = {"pattern": 0.02, "edges": 0.008}
 FOUND = {"edge-preserving filter of the camera", "amplitude threshold"}
 
 
@@ -59,6 +62,24 @@ def test_other_poses_are_compared_at_like_brightness(tmp_path: Path) -> None:
     assert not noise["same_poses"]
     assert noise["ratio"] == pytest.approx(2.0, rel=0.06)
     assert set(found.explained_by) >= FOUND
+
+
+@pytest.mark.parametrize("spoilt", [(0, 1), (1, 0), (1, 1)])
+@pytest.mark.parametrize("by", SPOILT)
+def test_neither_a_fixed_pattern_nor_mixed_pixels_are_noise(
+    by: str, spoilt: tuple[int, int], tmp_path: Path
+) -> None:
+    """The ratio was 1.6 to 4.5, with a pattern of 20 mm, and 1.1 to 4.9, with 8 mm at edges."""
+    pair = []
+    for k, times in enumerate((4.0, 1.0)):
+        pattern, edges = (size * spoilt[k] * (by == kind) for kind, size in SPOILT.items())
+        camera = Camera(times=times, floor=1.5e-3, shot=0.0, read=0.0, pattern=pattern)
+        one = record(tmp_path / str(k), camera, 111 + k).recording
+        high, low = (find(one.amplitude, (1, 3, 3)) for find in (maximum_filter, minimum_filter))
+        mixed = np.asarray(one.depth) + edges * (high > 2 * low)
+        pair.append(replace(one, depth=mixed.astype(np.float32)))
+    ratio = Observables(*pair, seed=1).to_dict()["noise"]["ratio"]
+    assert ratio == pytest.approx(4.0, rel=0.05)
 
 
 def test_a_simulator_without_noise_has_no_ratio(tmp_path: Path) -> None:

@@ -127,23 +127,19 @@ def _noise_of_neighbours(
         out of the factors that all poses share.
     """
     total, table = observed.within.sum(0), observed.table
-    of_second, of_nearest = (float(observed.shared[:, lag].mean()) for lag in (0, 1))
 
     def ratio_of(sums: np.ndarray) -> np.ndarray:
         """Return mean squares of differences over those of second differences (..., 2, 2)."""
         near, wide, counts = np.moveaxis(sums, -3, 0)
-        wide = wide - of_second * counts
-        wide = np.where(wide > LEAST_VARIANCE * counts, wide, 0.0)
-        return quotient(near - observed.shared[:, 1:] * counts, wide)
+        return quotient(near, np.where(wide > LEAST_VARIANCE * counts, wide, 0.0))
 
     ratio, without = ratio_of(total), ratio_of(total - observed.within)
     share, *shares = _second_difference_share(np.concatenate([ratio[None], without])).tolist()
-    raw = table.of_neighbours - of_second
     # In the images of small squares most pixels have a neighbour of their brightness, but no second
     # difference: half the squared difference is that much smaller.
-    nearest = (table.of_nearest - of_nearest) / ratio[:, 0].mean()
-    at_edges = ~np.isfinite(raw) & np.isfinite(nearest)
-    variance = np.where(at_edges, nearest, raw) / share
+    nearest = table.of_nearest / ratio[:, 0].mean()
+    at_edges = ~np.isfinite(table.of_neighbours) & np.isfinite(nearest)
+    variance = np.where(at_edges, nearest, table.of_neighbours) / share
     edges = float(variance[at_edges].sum() / np.nansum(variance)) if at_edges.any() else 0.0
     left_out = -np.log(np.array(shares) / share)
     left_out -= edges * np.log(without[..., 0].mean(-1) / ratio[:, 0].mean())

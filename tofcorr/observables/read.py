@@ -4,6 +4,7 @@ from itertools import product
 
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from tofcorr.data.recording import Recording, iterate_frames, repeats_of
 from tofcorr.errors import CalibrationDataError
@@ -57,10 +58,8 @@ class Observed:
         temporal: Of deviations from the mean of repeated frames: sums of products of neighbours,
             their squares, and numbers, in each pose, along `AXES` at `LAGS`: shape (P, 3, 2, 2).
         within: Half squares of differences of neighbours in one image, squares of second
-            differences there, and numbers, likewise.
+            differences there, and numbers, likewise; without the pattern and the edges of squares.
         pattern: Variance of what the residuals of different poses share, m^2.
-        shared: The same of second differences, then of the differences in `within` by lag; by axis,
-            shape (2, 3).
         between_frames: Half the squared differences of frames one and two apart, of each pose,
             summed over tiles of the image, shape (2, T), m^2.
         repeated: Variance of the mean residual of each pose less that of its noise, shape (P,),
@@ -75,18 +74,18 @@ class Observed:
         self.recording = recording
         names = sorted(set(recording.frames.target.tolist()))
         shape = (recording.camera.height, recording.camera.width)
-        # What poses share: of residuals; of second differences and of those at each lag, by axis.
-        whole, *patterns = (_BetweenPoses(shape) for _ in range(1 + len(AXES) * (1 + len(LAGS))))
-        shared = {key: patterns.pop(0) for key in product(AXES, (0, *LAGS))}
         self.map_missing, self.map_frames = np.zeros((2, *shape))
         tables, sums, repeated, counts = ([] for _ in range(4))
         self.between_frames: list[np.ndarray] = []
         fit = _SurfaceFit(recording.camera)
-        for number, frames in enumerate(repeats_of(recording)):
+        poses, shared = repeats_of(recording), _BetweenPoses(shape)
+        for frames in poses:
+            shared.add(_PoseImages(recording, frames[:_MOST_REPEATS], fit))
+        for number, frames in enumerate(poses):
             images = _PoseImages(recording, frames[:_MOST_REPEATS], fit)
             residual = images.residual
-            whole.add(known_mean(residual), images.weight, images.place)
-            sums.append(_of_neighbours(images, shared))
+            images.compare(shared.without(images))
+            sums.append(_of_neighbours(images))
             repeated.append(_repeated_variance(residual))
             self.between_frames.append(_frame_differences(residual))
             target = str(recording.frames.target[frames[0]])
@@ -100,8 +99,7 @@ class Observed:
         self.repeats, losing, saturated = np.array(counts).T
         self.losing_poses, self.saturated = int(losing.sum()), int(saturated.sum())
         self.temporal, self.within = np.stack(sums, axis=1)
-        self.pattern = whole.variance()
-        self.shared = np.reshape([each.variance() for each in shared.values()], (len(AXES), -1))
+        self.pattern = shared.variance()
         self.repeated = np.array(repeated)
 
 
@@ -123,7 +121,8 @@ class _PoseImages:
         saturated: Pixels on the target at or above the stated saturation, shape (R, h, w), bool.
         distance: To the plane of the images, shape (h, w), metres; NaN where unknown.
         cosine: Of the angle of incidence on that plane, shape (h, w); NaN where unknown.
-        second: Second differences by axis, as of `second_differences`.
+        varying: What neighbours are compared by, shape (R, h, w), metres; NaN at edges of squares.
+        second: Its second differences by axis, as of `second_differences`.
         place: Rows and columns of the rectangle.
     """
 
@@ -157,8 +156,21 @@ class _PoseImages:
             known = [one[np.isfinite(one)] for one in around]
             offsets = [np.median(one) if len(one) else 0.0 for one in known]
             around = around - np.array(offsets)[:, None, None]
-        self.residual, self.weight = _clipped(around + of_mean, self.amplitude)
-        self.second = {k: second_differences(self.residual, self.amplitude, k) for k in AXES}
+        # Each by its own spread: else a pixel that is far off in all frames would lose its noise.
+        still, self.weight = _clipped(of_mean[None], self.amplitude)
+        self.residual = _clipped(around, self.amplitude)[0] + still
+
+    def compare(self, varying: np.ndarray) -> None:
+        """Take what changes from pose to pose, (R, h, w), as what neighbours are compared by.
+
+        A pixel that sees two squares, or is next to one that does, has errors of its own.
+        """
+        if self.amplitude is not None:
+            mean = known_mean(self.amplitude)
+            high, low = (f(mean, 3) for f in (maximum_filter, minimum_filter))
+            varying = np.where(high - low > SAME_BRIGHTNESS * (high + low), np.nan, varying)
+        self.varying = varying
+        self.second = {k: second_differences(varying, self.amplitude, k) for k in AXES}
 
 
 class _SurfaceFit:
@@ -290,7 +302,7 @@ def _frame_differences(residual: np.ndarray) -> np.ndarray:
 
 
 class _BetweenPoses:
-    """What images of different poses have in common, pixel by pixel.
+    """What images of different poses have in common, pixel by pixel: a pattern and not the noise.
 
     Args:
         shape: Height and width of the camera's images.
@@ -299,19 +311,28 @@ class _BetweenPoses:
     def __init__(self, shape: tuple[int, int]) -> None:
         self._sums = np.zeros((4, *shape))
 
-    def add(self, image: np.ndarray, weight: np.ndarray, place: tuple[slice, slice]) -> None:
-        """Add a part of the mean image of one pose.
+    def add(self, images: _PoseImages) -> None:
+        """Add the images of one pose."""
+        self._sums[:, *images.place] += self._parts(images)
 
-        Args:
-            image: NaN where unknown, shape (h, w), from the first row and column of the part on.
-            weight: Its weights, shape (h, w).
-            place: Rows and columns of the part in the camera's image.
+    def without(self, images: _PoseImages) -> np.ndarray:
+        """Return the residuals of a pose that was added, less what other poses show in each pixel.
+
+        They are scaled to the variance of their noise: the mean of the others has some. A pixel
+        that no other pose shows stays as it is.
         """
-        weight = np.where(np.isfinite(image), weight, 0.0)
-        value = weight * np.where(weight > 0, image, 0.0)
-        row, column = (side.start for side in place)
-        part = self._sums[:, row : row + image.shape[0], column : column + image.shape[1]]
-        part += np.stack([value, value**2, weight, weight**2])
+        total, _, weight, _ = self._sums[:, *images.place] - self._parts(images)
+        frames, known = len(images.residual), weight > 0
+        scale = frames * weight / np.where(known, frames * weight + images.weight, 1.0)
+        varying = images.residual - total / np.where(known, weight, 1.0)
+        return np.where(known, np.sqrt(scale) * varying, images.residual)
+
+    @staticmethod
+    def _parts(images: _PoseImages) -> np.ndarray:
+        mean = known_mean(images.residual)
+        weight = np.where(np.isfinite(mean), images.weight, 0.0)
+        value = weight * np.nan_to_num(mean)
+        return np.stack([value, value**2, weight, weight**2])
 
     def variance(self) -> float:
         """Return the mean product of two poses in one pixel: the variance of a fixed pattern."""
@@ -362,17 +383,15 @@ def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: i
     return found
 
 
-def _of_neighbours(images: _PoseImages, shared: dict[tuple[int, int], _BetweenPoses]) -> np.ndarray:
+def _of_neighbours(images: _PoseImages) -> np.ndarray:
     """Sum over neighbours along each axis, at each lag, what `Observed` says.
 
     Returns:
         `temporal`: products of deviations from the mean of the repeats; `within`: half squares of
-        differences in one image, where there is a second difference too; shape (2, 3, 2, 2). What
-        poses share of both kinds of differences is added to `shared`.
+        differences in one image, where there is a second difference too; shape (2, 3, 2, 2).
     """
-    residual, weight, second = images.residual, images.weight, images.second
     sums = np.zeros((2, 3, len(AXES), len(LAGS)))
-    deviation = residual - known_mean(residual)
+    deviation = images.residual - known_mean(images.residual)
     for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
         if len(deviation) > 1:
             first, later = _shifted_pair(deviation, axis, lag)
@@ -382,14 +401,10 @@ def _of_neighbours(images: _PoseImages, shared: dict[tuple[int, int], _BetweenPo
             first, later = first[both], later[both]
             squares = (first @ first + later @ later) / 2
             sums[0, :, row, column] = first @ later, squares, len(first)
-        found = _differences(residual, images.amplitude, axis, lag) / 2**0.5
-        at, _ = _shifted_pair(second[axis], axis, lag)
+        found = _differences(images.varying, images.amplitude, axis, lag) / 2**0.5
+        at, _ = _shifted_pair(images.second[axis], axis, lag)
         both = np.isfinite(found) & np.isfinite(at)
         sums[1, :, row, column] = (found[both] ** 2).sum(), (at[both] ** 2).sum(), both.sum()
-        mean = known_mean(np.where(both, found, np.nan))
-        shared[axis, lag].add(mean, _shifted_pair(weight, axis, lag)[0], images.place)
-    for axis in AXES:
-        shared[axis, 0].add(known_mean(second[axis]), weight, images.place)
     return sums
 
 
@@ -429,7 +444,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
         "raw_amplitude": raw,
         "of_repeats": quotient(squares, known.sum(0) - 1),
         "of_neighbours": known_mean(np.stack(second)),
-        "of_nearest": _of_nearest(images.residual, images.amplitude)[at],
+        "of_nearest": _of_nearest(images.varying, images.amplitude)[at],
         "frames": on_target.sum(0),
         "missing": images.missing[chosen].sum(0),
         "saturated": images.saturated[chosen].sum(0),

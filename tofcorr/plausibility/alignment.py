@@ -57,6 +57,7 @@ class Scene:
         distance: Along the rays, shape (F, P), metres; NaN: not usable.
         own_normal: Of the plane through the frame's own points, on the camera's side, in the camera
             frame, shape (F, 3).
+        cosine: Between rays and that normal, shape (F, P).
         known: Whether a frame's pixels determine that plane, shape (F,), bool.
         on_plane: Which pixels lie on it, shape (F, P), bool; where it is not known, all that are
             usable.
@@ -64,14 +65,16 @@ class Scene:
         flatness: Root mean square distance of the pixels on it to it, shape (F,), metres.
         moments: Mean of q q^T over these pixels with q = (point, 1, ray) in the camera frame, shape
             (F, 7, 7).
+        before: world_from_tool of the frame recorded before each, shape (F, 4, 4), metres.
+        after: The same of the frame after it.
         moves: Whether a robot moves the camera; without one the hand-eye is the identity.
         guess: The recorded tool_from_camera, shape (4, 4).
     """
 
     def __init__(self, look: "Look", stored: np.ndarray, pixel: np.ndarray) -> None:
         self.poses, self.moves = look.poses, look.data.moves
-        planes = (look.data.column(name) for name in ("normal_world", "offset"))
-        self.normal, self.offset = (one.numpy()[look.sampled] for one in planes)
+        self.before, self.after = (look.column("world_from_tool", later=k) for k in (-1, 1))
+        self.normal, self.offset = (look.column(name) for name in ("normal_world", "offset"))
         self.guess = np.asarray(look.recording.tool_from_camera, dtype=np.float64)
         self.rays = rays = look.rays[pixel]
         self.distance = stored / rays[..., 2] if look.recording.depth_kind == "z" else stored
@@ -97,9 +100,9 @@ class Scene:
         plane = torch.cat([normal, offset[:, None]], dim=1)
         squares = torch.einsum("fa,fab,fb->f", plane, points, plane)
         self.own_normal, self.flatness = normal.numpy(), squares.clamp(min=0).sqrt().numpy()
+        self.cosine = np.einsum("fpa,fa->fp", rays, self.own_normal)
         with np.errstate(divide="ignore", invalid="ignore"):  # Of frames without a plane.
-            cosine = np.einsum("fpa,fa->fp", rays, self.own_normal)
-            self.off_by = self.distance + offset[:, None].numpy() / cosine
+            self.off_by = self.distance + offset[:, None].numpy() / self.cosine
 
     def changed(self, **parts: Any) -> Self:  # noqa: ANN401 - attributes
         """Return the scene with other attributes."""

@@ -14,6 +14,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS, condition
@@ -21,7 +22,7 @@ from tofcorr.estimation.linear import RESOLVED, Curvature
 from tofcorr.estimation.robust import without_strays
 from tofcorr.geometry.rays import moved_rays, tangents, unambiguous_range
 from tofcorr.plausibility.alignment import TINY, Alignment, Scene
-from tofcorr.plausibility.finding import CAMERA, MANY_FRAMES
+from tofcorr.plausibility.finding import MANY_FRAMES, SIGMAS, SPOILS, WORTH_A_WORD
 
 # Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
 _KNOTS = 8
@@ -67,6 +68,7 @@ class LinearResiduals:
             length or distortion does.
 
     Attributes:
+        hand_eye: tool_from_camera of the alignment, shape (4, 4), metres.
         residual: Distance of each point to its plane, shape (F, P), metres.
         columns: Its derivatives by the unknowns, shape (F, P, K).
         rigid: The first of them, by turns and shifts of the hand-eye transform, shape (F, P, 6).
@@ -81,7 +83,7 @@ class LinearResiduals:
 
     def __init__(self, scene: Scene, found: Alignment, amplitude: np.ndarray | None) -> None:
         rays, used = scene.rays, scene.on_plane
-        self.scene, self.rays = scene, rays
+        self.scene, self.rays, self.hand_eye = scene, rays, found.hand_eye
         normal_tool, offset_tool = scene.planes_in_tool()
         self.normal = normal_tool @ found.hand_eye[:3, :3]
         offset = normal_tool @ found.hand_eye[:3, 3] + offset_tool
@@ -264,7 +266,9 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
         - `kind`: 0: the depth is of the kind declared; 1: it is of the other one;
         - `curvature`: of the target along two directions on it, and mixed, 1/m: its points lie that
           many metres off its plane at a metre from its middle. With it, all of the above but `bend`
-          are estimated together: `left` of `kind` is what no error of a camera explains.
+          are estimated together: `left` of `kind` is what no error of a camera explains;
+        - `rim`: how far the four ends of what is seen of the target, along these directions, read
+          too near, metres; it falls to a third within a tenth of the width.
     """
     scene = problem.scene
     # The errors estimated together are nine.
@@ -290,8 +294,16 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
     s, t = places_on_wall(problem)
     bent = np.stack([s * s, t * t, s * t], axis=-1)
     del blocks["bend"]
+    rim = [_from_end(sign * place, problem.used) for place in (s, t) for sign in (1, -1)]
+    found["rim"] = problem.added(problem.cosine[..., None] * np.stack(rim, axis=-1))[0]
     found["curvature"], *_, found["kind"] = problem.added(bent, *blocks.values(), kind)
     return found
+
+
+def _from_end(place: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return what falls from 1 at the largest of the places that are used, (F, P)."""
+    low, high = np.quantile(place[used], [0.01, 0.99])
+    return np.exp(10 * (place.clip(low, high) - high) / max(high - low, TINY))
 
 
 def exact_camera(problem: LinearResiduals, declared: str) -> tuple[Estimate, np.ndarray]:
@@ -324,7 +336,7 @@ def places_on_wall(problem: LinearResiduals) -> tuple[np.ndarray, np.ndarray]:
     return s - np.median(s[problem.used]), t - np.median(t[problem.used])
 
 
-def pose_drift(problem: LinearResiduals) -> Estimate | None:
+def pose_drift(problem: LinearResiduals, *, warming: bool = False) -> Estimate | None:
     """Estimate by how much the robot's poses, or the wall, move steadily away.
 
     The world shifts and turns in proportion to the frame's number. The size of the estimate is the
@@ -332,6 +344,7 @@ def pose_drift(problem: LinearResiduals) -> Estimate | None:
 
     Args:
         problem: The residuals, in the order in which the frames were recorded.
+        warming: Whether all distances may change steadily too, as those of a warming camera.
 
     Returns:
         None where there is none, there are too few frames, or no robot moves.
@@ -345,13 +358,48 @@ def pose_drift(problem: LinearResiduals) -> Estimate | None:
     # Unknowns of which each moves the points by as much, and independently.
     _, extent, directions = np.linalg.svd(drift[used], full_matrices=False)
     resolved = extent > RESOLVED * extent[0]
-    each = np.where(resolved, np.sqrt(used.sum()) / np.where(resolved, extent, 1.0), 0.0)
-    drift = drift @ (directions.T * each)
+    drift = drift @ (directions[resolved].T * np.sqrt(used.sum()) / extent[resolved])
     when = np.linspace(-0.5, 0.5, len(scene.poses))[:, None, None]
-    (found,) = problem.added(when * drift)
-    # A camera that warms up shifts its distances alike, by about a centimetre, and 80 clean
-    # recordings had 2 mm.
-    return found if found.size > max(CAMERA, 6 * found.size_error) else None
+    found = problem.added(*[when * drift, when * problem.cosine[..., None]][: 1 + warming])[0]
+    # 80 clean recordings had 2 mm.
+    return found if found.size > max(SPOILS, 6 * found.size_error) else None
+
+
+Late = tuple[tuple[str, str], float, Estimate]
+"""What holds a share of what; the share, without unit; and the root mean square of how far that
+moves points off their planes, metres."""
+
+
+def lateness(problem: LinearResiduals) -> Late | None:
+    """Estimate whether poses and images are of different moments, by a share of each move.
+
+    A pose may hold a share of the move from the frame before, or to the next. A camera that filters
+    over time shows a share of what it saw before.
+
+    Returns:
+        What explains most; None where nothing surely is late, or no robot moves.
+    """
+    scene, place = problem.scene, problem.scene.poses[:, None, :3, 3]
+    if not scene.moves or len(scene.poses) < problem.frames_for(1, times=2):
+        return None
+    columns: dict[tuple[str, str], np.ndarray] = {}
+    for move, other in (("before", scene.before), ("after", scene.after)):
+        turn = Rotation.from_matrix(other[:, :3, :3] @ scene.poses[:, :3, :3].mT).as_rotvec()
+        step = other[:, None, :3, 3] - place + np.cross(turn[:, None], problem.world - place)
+        columns["pose", f"the move {move} it"] = np.einsum("fpa,fa->fp", step, scene.normal)
+    camera, seen = scene.before @ problem.hand_eye, problem.distance[problem.used]
+    height = (camera[:, :3, 3] * scene.normal).sum(-1) + scene.offset
+    cosine = np.einsum("fpa,fba,fb->fp", problem.rays, camera[:, :3, :3].mT, scene.normal)
+    # Where no wall was seen, something as far as the walls are is in the image.
+    held = (-height[:, None] / np.minimum(cosine, -_GRAZING)).clip(seen.min(), seen.max())
+    columns["image", "the one before it"] = problem.cosine * (held - problem.distance)
+    late: list[Late] = []
+    for what, column in columns.items():
+        size = max(float(np.sqrt(np.mean(column[problem.used] ** 2))), TINY)
+        (found,) = problem.added(column[..., None] / -size)  # An estimate takes it off.
+        if found.value[0] > max(WORTH_A_WORD, SIGMAS * found.size_error):
+            late.append((what, float(found.value[0]) / size, found))
+    return min(late, key=lambda one: problem.frame_rms(one[2].left).sum(), default=None)
 
 
 def length_scale(given: Alignment, problem: LinearResiduals) -> tuple[float, float]:

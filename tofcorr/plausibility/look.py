@@ -22,10 +22,12 @@ from tofcorr.plausibility.alignment import (
 from tofcorr.plausibility.finding import LARGE_CONSTANT
 from tofcorr.plausibility.linear import (
     Estimate,
+    Late,
     LinearResiduals,
     by_conditions,
     by_phase,
     image_shape,
+    lateness,
     pose_drift,
 )
 
@@ -104,6 +106,7 @@ class Look:
         rays: Unit rays of all pixels of the image, shape (H W, 3).
         sampled: Global numbers of the F frames looked at.
         poses: world_from_tool of these frames, shape (F, 4, 4), metres.
+        group: Number of each frame's repeats: frames that differ by noise alone share it, (F,).
         pixel: Flat index of P pixels in the image of each, on the target by its mask, shape (F, P).
         stored: Depth as stored, shape (F, P), float64, metres; NaN: not usable, or no pixel.
         amplitude: Shape (F, P); None if not recorded.
@@ -125,7 +128,7 @@ class Look:
         self.rays = data.ray_directions().numpy().reshape(-1, 3)
         # Twenty minutes of poses, judged in about a second.
         self.sampled = np.unique(np.linspace(0, total - 1, min(total, 600)).astype(int))
-        self.poses = self.column("world_from_tool")
+        self.poses, self.group = self.column("world_from_tool"), data.repeat_groups()[self.sampled]
         # A plane is then known to a tenth of the noise of one pixel, and 60 frames are read and
         # judged in well below 0.3 s.
         self._read(int(np.clip(12_000 // len(self.sampled), 24, 200)))
@@ -167,9 +170,10 @@ class Look:
         self.off_pixel = _padded(off_pixel, 0).astype(int)
         self.noise, self.noise_rms = _noise_of(np.concatenate(second))
 
-    def column(self, name: str) -> np.ndarray:
-        """Return a column that every recording has, for the frames looked at, shape (F, ...)."""
-        return self.data.column(name).numpy()[self.sampled]
+    def column(self, name: str, later: int = 0) -> np.ndarray:
+        """Return a column of every recording, (F, ...), so many frames after those looked at."""
+        frames = (self.sampled + later).clip(0, self.data.num_frames - 1)
+        return self.data.column(name).numpy()[frames]
 
     def condition(self, name: str) -> np.ndarray:
         """Return a condition of the frames looked at, shape (F,); NaN: unknown."""
@@ -236,13 +240,18 @@ class Look:
     @cached_property
     def drift(self) -> Estimate | None:
         """How far poses or walls drift; None where they do not, or it cannot be estimated."""
-        return None if self.linear is None else pose_drift(self.linear)
+        return None if self.linear is None else pose_drift(self.of_camera)
+
+    @cached_property
+    def late(self) -> Late | None:
+        """Whether poses and images are of different moments; None where it cannot be told."""
+        return None if self.linear is None else lateness(self.of_camera)
 
     @cached_property
     def _left(self) -> np.ndarray | None:
         """What is left of the residuals by what explains most; None where that cannot be told."""
-        explained = self.drift or (None if self.shape is None else self.shape["kind"])
-        return None if explained is None else explained.left
+        others = self.late and self.late[2], self.shape["kind"] if self.shape else None
+        return next((one.left for one in (self.drift, *others) if one), None)
 
     @cached_property
     def rms(self) -> np.ndarray:

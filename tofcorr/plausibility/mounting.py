@@ -15,6 +15,7 @@ import numpy as np
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.plausibility.alignment import TINY, distinct
 from tofcorr.plausibility.finding import (
+    CAMERA,
     MANY_FRAMES,
     WORTH_A_WORD,
     Finding,
@@ -48,8 +49,8 @@ def remounting(look: Look) -> Iterator[Finding]:
         return
     frames = look.frames[look.scene.known]
     poses, fewest = len(distinct(look.linear.scene.poses)), look.linear.frames_for(times=2)
-    # A drift explains what would be found.
-    drifts = look.drift is not None or poses < fewest
+    # A drift beyond what a camera makes explains what would be found.
+    drifts = (look.drift is not None and look.drift.size > CAMERA) or poses < fewest
     mounting = None if drifts else Mounting(look.of_camera)
     if mounting is not None and (found := mounting.moment()):
         where = f"From frame {frames[found[0][0]]} on, or about there,"

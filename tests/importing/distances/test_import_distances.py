@@ -82,6 +82,16 @@ def test_eight_by_eight_zones_are_read_in_either_unit_which_is_named(
     np.testing.assert_allclose(recording.depth, zones.depth_mm / 1e3, atol=1e-6)
 
 
+def test_readings_of_a_row_that_scatter_are_named(zones: Recorded, tmp_path: Path) -> None:
+    """A median of readings hid that they were 113 mm apart, where those of others were 2 mm."""
+    wall, poses = tmp_path / "north.csv", write_matrices(zones.exact, tmp_path / "poses.txt")
+    readings = [[v - 1, v + 1] for v in zones.depth_mm[:, 4, 4]]
+    readings[3][1] += 224
+    wall.write_text("\n".join(f"2024-01-01T10:00:00, {a}, {b}" for a, b in readings))
+    said = run_import("distances", wall, "--poses", poses, out=tmp_path / "out").text
+    assert "row 3 of north scatter by 113 mm, of most by 1 mm" in said
+
+
 def test_rows_without_whole_readings_and_lists_of_other_lengths_are_refused(
     zones: Recorded, tmp_path: Path
 ) -> None:

@@ -115,11 +115,11 @@ def open_distances(
     given = [read_poses(path, pose_format) for path in paths]
     # Row by row: a pose that is repeated belongs to its row nevertheless.
     tracks = [track.world_from_tool[track.of_row] for track in given]
-    for path, track, table in zip(paths, tracks, tables, strict=True):
+    for path, track, (table, _) in zip(paths, tracks, tables, strict=True):
         if len(track) != len(table):
             raise CalibrationDataError(f"{path}: {len(track)} poses beside {len(table)} rows.")
     warnings += [f"{said}; each belongs to its own row." for one in given for said in one.repeats]
-    readings = np.concatenate(tables)
+    readings, scatter = (np.concatenate(part) for part in zip(*tables, strict=True))
     typical = float(np.nanmedian(readings))
     # No such sensor sees 20 m.
     unit = coding.unit_mm or (1.0 if typical >= 20 else 1000.0)
@@ -137,9 +137,15 @@ def open_distances(
             raise RefusedViewError("no zone has a return")
         return DepthImage(metres[number])
 
-    targets = np.repeat(names, [len(table) for table in tables])
+    targets = np.repeat(names, [len(table) for table, _ in tables])
     # Counted on from file to file of one wall.
     rows = [np.sum(targets[:k] == name) for k, name in enumerate(targets)]
+    usual, most = unit * float(np.median(scatter)), unit * float(scatter.max())
+    if most > max(20, 10 * usual):  # More than errors of a sensor, and no noise.
+        said = (
+            f"The readings of row {rows[scatter.argmax()]} of {targets[scatter.argmax()]} scatter"
+        )
+        warnings.append(f"{said} by {most:.0f} mm, of most by {usual:.0f} mm: leave it out.")
     return RobotImages(
         origin=origin,
         names=[f"{name} {row}" for name, row in zip(targets, rows, strict=True)],
@@ -174,7 +180,7 @@ def _file_in(source: Path, what: str) -> Path:
 
 def read_distances(
     path: Path, layout: np.ndarray, invalid: tuple[float, ...], warnings: list[str]
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Read a table of distances: one row a pose, one or several readings a row.
 
     A row holds, after an optional time stamp, the distances of all zones, once or several times
@@ -187,7 +193,8 @@ def read_distances(
         warnings: Gets a sentence where rows repeat a time stamp.
 
     Returns:
-        The median of the readings at each pose, as written, shape (P, H, W); NaN without return.
+        The median of the readings at each pose, as written, shape (P, H, W), NaN without return;
+        and the largest standard deviation of a zone's readings at each pose, (P,).
 
     Raises:
         CalibrationDataError: The file cannot be read, or a row does not hold whole readings.
@@ -202,7 +209,8 @@ def read_distances(
         raise CalibrationDataError(f"{path}: no distance is above zero.")
     if alike := sum(before[0] == after[0] != "" for before, after in pairwise(rows)):
         warnings.append(f"{path}: {alike} rows repeat the time stamp before them; all are used.")
-    return np.array(medians)[:, layout]
+    scatter = [float(np.ma.filled(one.std(axis=0), 0.0).max()) for one in masked]
+    return np.array(medians)[:, layout], np.array(scatter)
 
 
 def _readings(line: Line, zones: int, path: Path) -> tuple[str, np.ndarray]:

@@ -32,7 +32,12 @@ from tofcorr.plausibility.finding import (
     in_words,
     note,
 )
-from tofcorr.plausibility.linear import Estimate, length_scale, places_on_wall
+from tofcorr.plausibility.linear import (
+    Estimate,
+    length_scale,
+    places_on_wall,
+    pose_drift,
+)
 from tofcorr.plausibility.look import Look
 from tofcorr.plausibility.mounting import remounting
 
@@ -78,10 +83,7 @@ def garbage(look: Look) -> Iterator[Finding]:
         what = f"most by {_range_in_words(frequency)}, so they show a target beyond it"
     advice = "mask them (mask.npy, or `mask: ransac` in the configuration)"
     if bent or dominated:  # See `training.left_out`.
-        advice = (
-            "`tofcorr train`, `evaluate` and `select` leave them out, unless their configuration "
-            "says which pixels count; mask.npy does so for every command"
-        )
+        advice = "fits leave them out unless told which pixels count; mask.npy does so everywhere"
     said = f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane"
     yield Finding("doubtful" if bent else "note", f"{said} of their frame: {what}; {advice}.")
 
@@ -136,10 +138,8 @@ def _wrapping(look: Look) -> Iterator[Finding]:
     if 10 * share < 1 or not mostly_wrapped(errors[np.abs(errors) > FAR_OFF], frequency):
         return
     severity = "impossible" if look.fits else "doubtful"
-    by = f"{100 * share:.0f} % of the pixels are off the recorded planes by "
-    said = (
-        f"{by}{_range_in_words(frequency)}: they show targets beyond it. Mask them, or go nearer."
-    )
+    by = f"off the recorded planes by {_range_in_words(frequency)}: they show targets beyond it"
+    said = f"{100 * share:.0f} % of the pixels are {by}. Mask them, or go nearer."
     yield Finding(severity, said, spoils=True, check="wrapping")
 
 
@@ -176,16 +176,12 @@ def shape(look: Look) -> Iterator[Finding]:
     share = float(kind.value[0])
     # 0 is the declared one, 1 the other one, from which it is so many standard errors.
     if 2 * SIGMAS * kind.size_error < 1 and abs(share - 1) < 0.5:
-        sure = (
-            f"{100 * share:.0f} % of the difference, standard error {100 * kind.size_error:.0f} %"
-        )
-        said = (
-            f"recording.yaml says depth_kind: {declared}, but walls are bent as if it were {other}"
-        )
+        said = f"recording.yaml says depth_kind: {declared}, but walls are bent as of {other}"
+        sure = f"{100 * share:.0f} %, standard error {100 * kind.size_error:.0f} %"
         yield impossible(f"{said} ({sure}); write depth_kind: {other}.", check="kind")
         return
     wrong = _wrong_camera(look.shape)
-    yield from _curved(look, look.shape["curvature"]) if wrong is None else [wrong]
+    yield from _target(look, look.shape) if wrong is None else [wrong]
 
 
 # From which size on an error counts, in focal lengths. Chosen: 3 % of the focal length bend a wall
@@ -197,13 +193,11 @@ _CAMERA = {
     "aspect": ("focal length", "the horizontal focal length alone were {size:.0f} % {longer}"),
     "centre": (
         "principal point",
-        "the principal point lay {first:+z.0f} % of the focal length to the right and "
-        "{second:+z.0f} % further down",
+        "the principal point lay {first:+z.0f} % of the focal length right, {second:+z.0f} % down",
     ),
     "corner": (
         "distortion",
-        "the distortion moved the corners of the image {size:.1f} % of the focal length further "
-        "{out}",
+        "the distortion moved the corners {size:.1f} % of the focal length {out}",
     ),
     "bend": (
         "distortion",
@@ -235,30 +229,49 @@ def _wrong_camera(found: dict[str, Estimate]) -> Finding | None:
     return Finding(severity, f"{said}: {ask}, as these are?", spoils=True, check=check)
 
 
-def _curved(look: Look, found: Estimate) -> Iterator[Finding]:
-    """Judge whether the target itself is bent, by what spoils a fit."""
-    used = look.of_camera.used
-    half_width = float(np.quantile(np.hypot(*places_on_wall(look.of_camera))[used], 0.9))
-    curvature = np.abs(found.value)
-    sag = curvature * half_width**2
-    if ((sag > SPOILS) & (curvature > SIGMAS * found.error)).any():
+def _target(look: Look, shape: "dict[str, Estimate]") -> Iterator[Finding]:
+    """Judge whether the target is bent, or its rim reads wrong, by what spoils a fit."""
+    curved, rim = shape["curvature"], shape["rim"]
+    places = np.hypot(*places_on_wall(look.of_camera))[look.of_camera.used]
+    half_width = float(np.quantile(places, 0.9))
+    sag, rising = np.abs(curved.value) * half_width**2, np.abs(rim.value)
+    if ((rising > SPOILS) & (rising > SIGMAS * rim.error)).any():
+        where = f"{1e3 * float(rising.max()):.0f} mm off at one end, from wherever it is seen"
+        yield doubtful(f"The target lies {where}: a second reflection? Mask it.", check="rim")
+    elif ((sag > SPOILS) & (sag > SIGMAS * curved.error * half_width**2)).any():
         where = f"{1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of its middle"
-        said = (
-            f"The target is bent by {where}, from wherever it is seen: use a flat one, or mask it."
-        )
-        yield doubtful(said, spoils=True, check="target")
+        said = f"The target is bent by {where}, from wherever it is seen"
+        yield doubtful(f"{said}: use a flat one, or mask it.", spoils=True, check="target")
 
 
 def drift(look: Look) -> Iterator[Finding]:
-    """Do poses, wall and camera agree as well at the end of a recording as at its beginning?"""
+    """Do poses, wall and camera agree as well at the end of a recording as at its beginning?
+
+    A camera that warms up shifts its distances alike, by about a centimetre. That is no fault, and
+    what it explains is a note; 20 mm may be either.
+    """
     found = look.drift
     if found is not None:
         # Frames miss their planes by a quarter of it in the middle of each half.
         size = f"{1e3 * found.size:.0f} mm (standard error {1e3 * found.size_error:.0f} mm)"
-        severity = "impossible" if found.size > 4 * CAMERA else "doubtful"
         said = f"From first to last frame the points move {size} off the recorded planes"
         cause = "the poses drift, or robot, target or camera was moved; record again, or in parts"
+        severity = "impossible" if found.size > 4 * CAMERA else "doubtful"
+        if found.size < CAMERA and pose_drift(look.of_camera, warming=True) is None:
+            severity, cause = "note", "a camera that warms up, or poses that drift"
         yield Finding(severity, f"{said}: {cause}.")
+
+
+def late(look: Look) -> Iterator[Finding]:
+    """Are a pose and its image of one moment, or does one hold a share of the frame before?"""
+    if look.late is not None:
+        what, share, found = look.late
+        size = f"{1e3 * found.size:.1f} mm (standard error {1e3 * found.size_error:.1f} mm)"
+        said = (
+            f"Each {what[0]} holds {100 * share:.1f} % of {what[1]}, which moves points by {size}"
+        )
+        cause = "the robot still moved, poses lag, or the camera filters over time"
+        yield doubtful(f"{said}: {cause}; wait after a move.", spoils=found.size > SPOILS)
 
 
 def agreement(look: Look) -> Iterator[Finding]:

@@ -11,6 +11,7 @@ from tofcorr.plausibility.alignment import TINY, distinct
 from tofcorr.plausibility.finding import (
     CAMERA,
     FEWEST_PIXELS,
+    SIGMAS,
     WORTH_A_WORD,
     Finding,
     doubtful,
@@ -75,8 +76,29 @@ def depth_values(look: Look) -> Iterator[Finding]:
         severity = "doubtful" if 2 * len(missing) > len(valid) else "note"
         said = f"Hardly any usable pixel is left in {in_words(frames)}"
         yield Finding(severity, f"{said}: no return, saturated, or masked out.", frames)
-    if len(values) >= FEWEST_PIXELS:
+    levels, count = np.unique(values, return_counts=True)
+    at_top, below = (look.stored == levels[-1]).any(1), count[-21:-1]
+    # Rounded distances repeat as well: of three that fall into 20 steps, one triple in 400 shares
+    # the last. Repeats of the farthest pose count once.
+    if len(np.unique(look.group[at_top])) > 2 < below.sum() and count[-1] >= 3 * below.mean():
+        frames = tuple(look.sampled[at_top].tolist())
+        said = f"{count[-1]} pixels of {in_words(frames)} hold exactly the largest distance"
+        yield doubtful(f"{said}, {levels[-1]:.4g} m: the range ends there; write NaN.", frames)
+    elif len(values) >= FEWEST_PIXELS:
         yield from _repeated_or_rounded(values)
+
+
+def repeats(look: Look) -> Iterator[Finding]:
+    """Do frames of one pose show the same distance, as those of other poses do?
+
+    Ten times what they differ by elsewhere, and more than errors of a camera, is no noise.
+    """
+    middle, group = np.nanmedian(look.scene.distance, axis=1), look.group[look.usable]
+    apart = np.array([np.ptp(middle[group == own]) for own in group])
+    typical = float(np.median(apart[apart > 0])) if apart.any() else 0.0
+    if frames := tuple(look.frames[apart > max(CAMERA, 10 * typical)].tolist()):
+        said = f"{in_words(frames).capitalize()} differ by {1e3 * apart.max():.0f} mm within a pose"
+        yield doubtful(f"{said}, others by {1e3 * typical:.1f} mm: leave them out.", frames)
 
 
 def _repeated_or_rounded(values: np.ndarray) -> Iterator[Finding]:
@@ -205,6 +227,46 @@ def amplitude(look: Look) -> Iterator[Finding]:
         said = f"{percent:.1f} % of the pixels have the largest amplitude, {values.max():.6g}"
         wrong = "they are saturated, their depth is wrong"
         yield doubtful(f"{said}: {wrong}; set saturation_amplitude in recording.yaml.")
+    else:
+        yield from _of_the_depth(look, look.amplitude[look.usable])
+
+
+def _of_the_depth(look: Look, amplitude: np.ndarray) -> Iterator[Finding]:
+    """Is it the light that measured the depth, with noise of its own?
+
+    That light falls with the square of the distance and with the cosine of incidence, beside
+    squares and the fall-off of a lens. The noise of a phase is independent of the amplitude's; an
+    amplitude divided by the square of the measured distance has twice its relative noise, with the
+    other sign. It is looked for where no edges of squares are seen.
+    """
+    scene, changing = look.scene, np.ptp(look.condition("integration_time")) > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bright, far = np.log(amplitude), np.log(np.abs(scene.cosine) / scene.distance**2)
+    used = scene.on_plane & np.isfinite(bright + far)
+    count = np.maximum(used.sum(1, keepdims=True), 1)
+    x, y = (np.where(used, one / count, 0.0).sum(1, keepdims=True) for one in (far, bright))
+    slope, error = _slope(x, y, used.any(1, keepdims=True))
+    if not changing and 3 * abs(slope - 1) > max(2, 3 * SIGMAS * error):
+        said = f"The amplitude falls with the distance to the power of {2 * slope:.1f}"
+        cause = f"light with that of 2 (standard error {2 * error:.1g})"
+        yield note(f"{said}, {cause}: is it another camera's, or has each frame its own exposure?")
+    relative = scene.off_by / scene.distance
+    bright, deep = (_rough(one, scene.rays, used) for one in (bright, relative))
+    used &= (np.square(bright).sum(1) < used.sum(1) / 100)[:, None]
+    slope, error = _slope(deep, bright, used)
+    if slope < -max(1.0, SIGMAS * error):
+        said = f"The amplitude has {slope:.2f} times the relative noise of the depth"
+        cause = "it was computed from the depth (-2: divided by its square); use the camera's own"
+        yield doubtful(f"{said} (standard error {error:.1g}): {cause}.")
+
+
+def _slope(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[float, float]:
+    """Return the slope of y over x, all (F, P), and its standard error by frames."""
+    x, y = (np.where(used, one - one[used].sum() / max(used.sum(), 1), 0.0) for one in (x, y))
+    square = max(float((x * x).sum()), TINY)
+    slope = float((x * y).sum()) / square
+    error = float(np.linalg.norm((x * (y - slope * x)).sum(1))) / square
+    return slope, error if used.any(1).sum() > 8 else math.inf  # Hardly known of fewer frames.
 
 
 def temperatures(look: Look) -> Iterator[Finding]:
@@ -267,9 +329,9 @@ def _brightness(look: Look, amplitude: np.ndarray) -> np.ndarray:
     That of its brightest tenth: nearly every view of a board shows a bright square.
     """
     scene, amplitude = look.scene, amplitude[look.usable]
-    cosine = np.abs(np.einsum("fpa,fa->fp", scene.rays, np.nan_to_num(scene.own_normal)))
+    cosine = np.abs(scene.cosine)
     used = scene.on_plane & np.isfinite(amplitude) & (cosine > 0)
-    seen = np.where(used, amplitude * scene.distance**2 / np.maximum(cosine, TINY), 0.0)
+    seen = np.where(used, amplitude * scene.distance**2 / np.where(used, cosine, 1.0), 0.0)
     tenth = used.sum(1) // 10
     level = np.sort(seen, axis=1)[:, ::-1][np.arange(len(seen)), tenth]
     return np.where(scene.known & (tenth > 0), np.log(np.maximum(level, TINY)), np.nan)
@@ -340,13 +402,18 @@ def _patterns(look: Look, chosen: np.ndarray) -> np.ndarray | None:
         return None
     residual = residual[:, complete]
     residual[np.isnan(residual).all(1)] = 0.0  # A frame without a plane says nothing.
-    rays = look.scene.rays[chosen[0], complete]
-    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
-    smooth = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
     cut = 3 * sigma_from_mad(np.nanmedian(np.abs(residual), axis=1, keepdims=True))
     kept = np.nan_to_num(np.clip(residual, -cut, cut))
-    basis = np.linalg.qr(smooth)[0]
-    return kept - (kept @ basis) @ basis.T
+    return _rough(kept, look.scene.rays[chosen[:1]][:, complete], np.ones((1, complete.sum())) > 0)
+
+
+def _rough(values: np.ndarray, rays: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return values (F, P) less a cubic over the image; zero where they are not used."""
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    powers = [x**i * y**j for i in range(4) for j in range(4 - i)]
+    smooth = np.stack(powers, axis=-1) * used[..., None]
+    kept = np.where(used, values, 0.0)[..., None]
+    return (kept - smooth @ (np.linalg.pinv(smooth) @ kept))[..., 0]
 
 
 def _moment(pattern: np.ndarray, fewest: int) -> int | None:
