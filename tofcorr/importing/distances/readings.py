@@ -140,12 +140,11 @@ def open_distances(
     targets = np.repeat(names, [len(table) for table, _ in tables])
     # Counted on from file to file of one wall.
     rows = [np.sum(targets[:k] == name) for k, name in enumerate(targets)]
-    usual, most = unit * float(np.median(scatter)), unit * float(scatter.max())
-    if most > max(20, 10 * usual):  # More than errors of a sensor, and no noise.
-        said = (
-            f"The readings of row {rows[scatter.argmax()]} of {targets[scatter.argmax()]} scatter"
-        )
-        warnings.append(f"{said} by {most:.0f} mm, of most by {usual:.0f} mm: leave it out.")
+    usual, worst = unit * float(np.median(scatter)), int(scatter.argmax())
+    if (most := unit * float(scatter[worst])) > max(20, 10 * usual):  # No noise, no sensor's error.
+        where = f"row {rows[worst]} of {targets[worst]}"
+        said = f"{where} scatter by {most:.0f} mm, of most by {usual:.0f} mm: leave it out."
+        warnings.append(f"The readings of {said}")
     return RobotImages(
         origin=origin,
         names=[f"{name} {row}" for name, row in zip(targets, rows, strict=True)],
