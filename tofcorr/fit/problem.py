@@ -25,7 +25,7 @@ from tofcorr.estimation.solvers import (
     initial_parameters,
     with_linear_part,
 )
-from tofcorr.estimation.uncertainty import Covariance, Observability
+from tofcorr.estimation.uncertainty import Covariance, Direction, Observability
 from tofcorr.fit.walls import FoundWalls
 from tofcorr.fit.weighting import PixelWeights
 from tofcorr.options import Options
@@ -355,6 +355,19 @@ class Fit(Core):
         mean, total = gram[2:-1:3, -1], gram[-1, -1]
         with_measured = gram[2, 2:-1:3] - mean[0] * mean / total
         return float(with_measured @ corrected / with_measured[0])
+
+    @property
+    def standard_errors(self) -> list[tuple[float, Direction]]:
+        """Standard error (metres or radians) and direction, of all of them, the weakest first.
+
+        By `hand_eye_covariance`, as in every table and export: what speaks of errors asks here.
+        """
+        matrix, vectors = self.covariance.matrix.clone(), self.observability.vectors
+        if self.solution.parameters.hand_eye_is_free:
+            matrix[:6, :6] = self.hand_eye_covariance
+        errors = (vectors * (matrix @ vectors)).sum(dim=0).clamp(min=0).sqrt()
+        found = zip(errors.tolist(), self.observability.directions, strict=True)
+        return sorted(found, key=lambda one: -one[0])
 
     @property
     def hand_eye_covariance(self) -> Tensor:

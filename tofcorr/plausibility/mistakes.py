@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tofcorr.estimation.robust import LEVEL, f_tail
 from tofcorr.plausibility.alignment import Alignment, Scene, align_with_free_walls
 from tofcorr.plausibility.finding import CAMERA, FAR_OFF, SPOILS
 from tofcorr.plausibility.look import Look
@@ -106,8 +107,18 @@ IN_IMAGES: dict[str, Mistake] = {
     "transposed": Mistake(
         "the images are transposed", "transpose them before writing", np.transpose
     ),
+    **{
+        f"turned {turns}": Mistake(
+            f"the images are turned {words}", _DRIVER, partial(np.rot90, k=turns)
+        )
+        for turns, words in {2: "by half a turn", 1: "to the right", 3: "to the left"}.items()
+    },
+    "transposed and turned": Mistake(
+        "the images are mirrored along a diagonal", _DRIVER, lambda image: np.rot90(image, 2).T
+    ),
 }
-"""The same in images (H, W), whatever their pixels hold. Each undoes itself."""
+"""The same in images (H, W), whatever their pixels hold: all symmetries of a square. Where a robot
+moves the camera, its hand-eye transform holds a mere turn."""
 IN_DEPTH: dict[str, Mistake] = {
     f"in {unit}": Mistake(f"the depth is in {unit}", "write metres", partial(np.multiply, factor))
     for unit, factor in (("feet", 0.3048), *_UNITS.items())
@@ -123,19 +134,26 @@ def best_explanations(look: Look) -> list[Explanation]:
     """Return the explanations that are about as good as the best and far better than none.
 
     They leave no more than errors of a camera, or the noise of its walls, and take off what spoils
-    a fit. Of several, the first listed that comes near the best is named: within four thirds.
+    a fit. What is compared is a share of the distances: a unit that makes all of them short makes
+    every misfit small. Of several, the first listed that comes near the best is named: within four
+    thirds; one that frees unknowns comes last.
     """
-    given = look.given
-    most = min(FAR_BETTER * given.badness, max(CAMERA, 4 * look.flatness))
+    given, tried = look.given, list(explanations(look))
+    # Of as many guesses none is that much better by chance; a frame tells three numbers, of which
+    # an alignment takes eight.
+    freedom = 3 * len(given.rms) - (8 if look.scene.moves else 2)
     better = [
         (cause, advice, found, frees)
-        for cause, advice, found, frees in explanations(look)
-        if found.badness <= most
+        for cause, advice, found, frees in tried
+        if found.badness <= max(CAMERA, 4 * look.noise)
+        and found.relative <= FAR_BETTER * given.relative
         and given.badness - found.badness > SPOILS
         and (not frees or found.misfit <= FAR_BETTER * given.misfit)
+        and len(tried) * f_tail((given.relative / found.relative) ** 2, freedom, freedom) < LEVEL
     ]
-    least = min((found.badness for *_, found, _ in better), default=0.0)
-    return [one for one in better if 3 * one[2].badness <= 4 * least]
+    least = min((found.relative for *_, found, _ in better), default=0.0)
+    near = [one for one in better if 3 * one[2].relative <= 4 * least]
+    return sorted(near, key=lambda one: one[3])
 
 
 def explanations(look: Look) -> Iterator[Explanation]:

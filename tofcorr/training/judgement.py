@@ -10,7 +10,7 @@ from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.sample import MaskOptions
-from tofcorr.plausibility.finding import FAR_OFF, Inspection, in_words
+from tofcorr.plausibility.finding import FAR_OFF, SPOILS, Inspection, in_words
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.support import Support, shortcomings, worst_axes
 
@@ -26,7 +26,8 @@ _VERDICTS: tuple[Verdict, ...] = (DO_NOT_USE, "usable", "good")
 _WEAK = 5e-3
 # Held-out over fitted error above which a model is too large; and held-out error over that of the
 # hand-eye alone from which the correction makes things worse, a twentieth being within the chance
-# of a split, or gains nothing. A camera without errors reaches the noise with the hand-eye alone.
+# of a split, or gains nothing. A camera without errors reaches the noise with the hand-eye alone:
+# the rest beyond the noise says that poses or planes are wrong.
 _OVERFITTED, _WORSE, _NO_GAIN = 1.5, 1.05, 0.95
 
 
@@ -72,6 +73,15 @@ def left_out_words(frames: Sequence[int]) -> list[str]:
     return [f"{which}: poses, planes or images disagree with all others."]
 
 
+def outlying_words(images: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return one sentence about the images that fit much worse than the others; none if none do."""
+    if not images:
+        return []
+    worst = ", ".join(f"{one['rms_mm']:.1f}" for one in images[:5])
+    which = in_words([one["frame"] for one in images]).capitalize()
+    return [f"{which}: the model fits much worse there than elsewhere, {worst} mm RMS."]
+
+
 def left_out_mapping(frames: Iterable[int], inspection: Inspection) -> list[dict[str, Any]]:
     """Return frames left out and by how much they disagree, the worst first: plain values."""
     chosen, outlying = set(frames), inspection.outlying.items()
@@ -94,10 +104,12 @@ def judge(
     """
     free = fit.solution.parameters.hand_eye_is_free
     with_intensity = fit.model.error.needs_amplitude()
-    said = [*_of_errors(fit, errors, 1e3 * inspection.look.noise), *_of_directions(fit)]
+    noise, noise_rms = 1e3 * inspection.look.noise, 1e3 * inspection.look.noise_rms
+    held_out = errors["after"]["test"]["rms"]
+    said = [*_of_errors(fit, errors, noise, noise_rms), *_of_directions(fit)]
     for serious, one in shortcomings(support, moves=free, with_intensity=with_intensity):
         said.append(("usable" if serious else "good", one))
-    if beyond := beyond_noise(errors["after"]["test"]["rms"], 1e3 * inspection.look.noise_rms):
+    if beyond := beyond_noise(held_out, noise_rms, moves=free):
         said.append(("usable", beyond))
     # From n images a standard error is known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
     if (images := len(fit.moments.gram)) < 10:
@@ -113,37 +125,56 @@ def judge(
     ]
     if inspection.headline:
         odd.append(("usable", inspection.headline))
-    known = f"the hand-eye transform is determined to {1e3 * _WEAK:g} mm and mrad"
-    if all(one.sigma <= _WEAK for one in fit.observability.directions):
-        known = "every direction is determined"
     first = dict(reversed([*odd, *said]))
-    first["good"] = f"{_measured(errors, 1e3 * inspection.look.noise)}, and {known}."
+    first["good"] = expected(fit, errors, noise)
     verdict: Verdict = min(first, key=_VERDICTS.index)
     return verdict, first[verdict], [sentence for _, sentence in said]
 
 
-def _measured(errors: Mapping[str, Any], noise: float) -> str:
-    """Return how far held-out frames are off, compared with the hand-eye alone and with noise."""
-    held_out, bare = (errors[stage]["test"]["rms"] for stage in ("after", "hand_eye_only"))
-    if held_out is None:
-        return "No frame was held out: the errors given are those of the fit itself"
-    compared = f"{bare:.1f} mm with the hand-eye alone"
-    compared += f", {noise:.1f} mm noise of a pixel" if math.isfinite(noise) else ""
-    return f"Held-out frames are off by {held_out:.1f} mm RMS ({compared})"
-
-
-def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tuple[Verdict, str]]:
-    """Yield what the errors say of a fit.
+def expected(fit: Fit, errors: Mapping[str, Any], noise: float) -> str:
+    """Return the error to expect in use: of held-out frames, and of the hand-eye transform.
 
     Args:
         fit: The fitted model.
         errors: The `error_mm` of the report.
         noise: Of a pixel, millimetres; NaN: unknown.
     """
+    measured, free = _measured(fit, errors, noise), fit.solution.parameters.hand_eye_is_free
+    return f"{measured}, and the hand-eye is known to {_known(fit)}." if free else f"{measured}."
+
+
+def _known(fit: Fit) -> str:
+    shift, turn = worst_axes(fit.hand_eye_covariance)
+    return f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad"
+
+
+def _measured(fit: Fit, errors: Mapping[str, Any], noise: float) -> str:
+    """Return how far held-out frames are off, with the hand-eye alone, and by noise."""
+    held_out, bare = (errors[stage]["test"]["rms"] for stage in ("after", "hand_eye_only"))
+    if held_out is None:
+        return "No frame was held out: the errors given are those of the fit itself"
+    free = fit.solution.parameters.hand_eye_is_free
+    compared = f"{bare:.1f} mm {'with the hand-eye alone' if free else 'without correction'}"
+    compared += f", {noise:.1f} mm noise of a pixel" if math.isfinite(noise) else ""
+    return f"Held-out frames are off by {held_out:.1f} mm RMS ({compared})"
+
+
+def _of_errors(
+    fit: Fit, errors: Mapping[str, Any], noise: float, noise_rms: float
+) -> Iterator[tuple[Verdict, str]]:
+    """Yield what the errors say of a fit.
+
+    Args:
+        fit: The fitted model.
+        errors: The `error_mm` of the report.
+        noise: Of a pixel, millimetres; NaN: unknown.
+        noise_rms: The same as a root mean square.
+    """
     halves = ("after", "train"), ("after", "test"), ("hand_eye_only", "test")
     found = [errors[stage][half]["rms"] for stage, half in halves]
     fitted, held_out, bare = (math.nan if one is None else one for one in found)
-    error, measured = fitted if math.isnan(held_out) else held_out, _measured(errors, noise)
+    error, measured = fitted if math.isnan(held_out) else held_out, _measured(fit, errors, noise)
+    free = fit.solution.parameters.hand_eye_is_free
     if fit.solution.stopped == "not_finite":
         smaller = "Choose a smaller model, or see `tofcorr inspect`."
         yield DO_NOT_USE, f"{fit.solution.message} {smaller}"
@@ -158,8 +189,13 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
         yield DO_NOT_USE, f"{left}: too few different frames."
     if held_out > _WORSE * bare:
         yield DO_NOT_USE, f"{measured}: the depth correction makes them worse."
-    elif held_out > _NO_GAIN * bare and held_out > 3 * noise:
-        yield DO_NOT_USE, f"{measured}: the correction gains nothing, so poses or planes are wrong."
+    elif held_out > _NO_GAIN * bare and (
+        held_out > 3 * noise
+        or (beyond_noise(held_out, noise_rms) and held_out > math.hypot(noise_rms, 1e3 * SPOILS))
+    ):
+        # Noise, as a root mean square, is held out as well: what is beyond it is not.
+        wrong = "poses or planes are wrong" if free else "planes are wrong"
+        yield DO_NOT_USE, f"{measured}: the correction gains nothing, so {wrong} or a term lacks."
     # No application bears 30 mm, the raw error of most cameras, or eight times the noise.
     if error > max(30, 8 * noise):
         off = f"Frames are off by {error:.0f} mm RMS after the fit"
@@ -170,7 +206,8 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
         own = f"much more than the {fitted:.1f} mm of the fit itself"
         yield "usable", f"{measured}, {own}: record more views, or choose a smaller model."
     elif bare < held_out <= _WORSE * bare:
-        yield "good", f"{measured}: the hand-eye transform is enough for this camera."
+        enough = "the hand-eye transform is enough for this camera" if free else "it needs none"
+        yield "good", f"{measured}: {enough}."
 
 
 def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
@@ -180,30 +217,31 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
         yield "usable" if max(fit.misfit.size) > _WEAK else "good", fit.misfit.lacking()
     if not solution.converged and solution.stopped != "not_finite":
         yield "usable", solution.message
+    shift, turn = worst_axes(fit.hand_eye_covariance) if free else (0.0, 0.0)
+    if max(shift, turn) > _WEAK:
+        yield (
+            "usable",
+            f"The hand-eye is known to {_known(fit)} only: record more tilts and distances.",
+        )
     wide, of_pose = 1e3 * PRIOR_SIGMA, "usable" if free else "good"
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
-    weak = [one for one in fit.observability.directions if one.sigma > _WEAK]
-    of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
-    others = [one for one in weak if not set(one.shares) <= curves]
-    if undetermined := [one.in_words() for one in others if one.is_undetermined]:
+    weak = [(error, one) for error, one in fit.standard_errors if error > _WEAK]
+    of_curves = [error for error, one in weak if len(one.shares) > 1 and {*one.shares} <= curves]
+    others = [(error, one) for error, one in weak if not {*one.shares} <= curves]
+    if undetermined := [one.in_words() for _, one in others if one.is_undetermined]:
         lacking = f"{'; '.join(undetermined)}: a prior of {wide:g} mm and {wide:g} mrad is used"
         yield of_pose, f"The images do not determine {lacking}. Record more tilts and distances."
-    if uncertain := [one for one in others if not one.is_undetermined]:
-        of_hand_eye = any(name.startswith(("t_", "w_")) for one in uncertain for name in one.shares)
-        words = "; ".join(f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in uncertain[:3])
+    if uncertain := [(error, one) for error, one in others if not one.is_undetermined]:
+        of_hand_eye = any(x.startswith(("t_", "w_")) for _, one in uncertain for x in one.shares)
+        words = "; ".join(f"{1e3 * error:.1f} of {one.in_words()}" for error, one in uncertain[:3])
         count = f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad)"
         yield of_pose if of_hand_eye else "good", f"{count}: {words}."
-    if free:
-        shift, turn = worst_axes(fit.hand_eye_covariance)
-        if max(shift, turn) > _WEAK:
-            size = f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only"
-            yield "usable", f"The hand-eye is known to {size}: record more tilts and distances."
     if of_curves:
         size = f"their standard deviations reach {1e3 * max(of_curves):.0f} mm"
         yield "good", f"Parts of the curves are set by the smoothing penalty, not by data: {size}."
 
 
-def beyond_noise(held_out: float | None, noise: float) -> str | None:
+def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) -> str | None:
     """Return one sentence about an error that neither the model nor noise explains; None: small.
 
     Poses of an ordinary robot scatter by less than 1.5 mm, and edges raise the noise by a tenth:
@@ -212,12 +250,14 @@ def beyond_noise(held_out: float | None, noise: float) -> str | None:
     Args:
         held_out: RMS error of held-out frames, millimetres; None: no frame was held out.
         noise: Noise of their pixels, root mean square, millimetres; NaN: unknown.
+        moves: Whether a robot moves the camera.
     """
     beyond = math.sqrt(max((held_out or 0.0) ** 2 - noise**2, 0.0))
     if not beyond > max(1.5, 0.6 * noise):
         return None
     off = f"Held-out frames are off by {beyond:.1f} mm beyond the noise of their pixels"
-    return f"{off}: poses scatter, or the model lacks a term; `tofcorr diagnose` tells which."
+    what = "poses" if moves else "planes"
+    return f"{off}: {what} scatter, or the model lacks a term; `tofcorr diagnose` tells which."
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -238,19 +278,33 @@ def report_text(report: Mapping[str, Any]) -> str:
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
     if advice := report["advice"]:
-        largest = f"{advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad)"
-        direction = report["observability"]["weakest"][0]["direction"]
-        lines.append(f"The largest standard error is {largest}, of {direction}. To lower it, add:")
+        weakest = report["observability"]["weakest"][0]
+        largest = f"{weakest['sigma_mm_or_mrad']:.2f} mm (or mrad), of {weakest['direction']}"
+        lines.append(f"The largest standard error is {largest}. To lower it, add:")
+        # Poses lower what the images do not determine, in proportion.
+        share = weakest["sigma_mm_or_mrad"] / advice["worst_sigma_mm_or_mrad"]
         lines += [
             f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
-            f"deg, rolled by {pose['roll_by_deg']:+.0f}: then {pose['worst_sigma_mm_or_mrad']:.2f}"
+            f"deg, rolled by {pose['roll_by_deg']:+.0f}: "
+            f"then {share * pose['worst_sigma_mm_or_mrad']:.2f}"
             for pose in advice["poses"]
         ]
     found = [warning for warning in report["warnings"] if warning != report["reason"]]
     lines += [f"Warning: {warning}" for warning in found[:5]]
     if len(found) > 5:
         lines.append(f"{len(found) - 5} more warnings are in report.json.")
-    return "\n".join([*lines, f"Verdict: {report['verdict']}. {report['reason']}"])
+    return "\n".join([*lines, verdict_text(report)])
+
+
+def verdict_text(report: Mapping[str, Any]) -> str:
+    """Return verdict, what decides it, and the error to expect in use.
+
+    Args:
+        report: The content of report.json; older ones lack `expected`.
+    """
+    expect = report.get("expected", "")
+    said = f"Verdict: {report['verdict']}. {report['reason']}"
+    return said if expect in said else f"{said} {expect}"
 
 
 def _hand_eye_lines(report: Mapping[str, Any]) -> Iterator[str]:

@@ -20,7 +20,13 @@ from tofcorr.pixels.passes import FrameErrors
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import Calibration, TrainingOptions
-from tofcorr.training.judgement import judge, left_out_mapping
+from tofcorr.training.judgement import (
+    expected,
+    judge,
+    left_out_mapping,
+    left_out_words,
+    outlying_words,
+)
 from tofcorr.training.support import Support
 from tofcorr.version import __version__
 
@@ -129,8 +135,10 @@ def training_report(
     hand_eye = solution.parameters.tool_from_camera
     support = Support(data, calibration.train, hand_eye)
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
+    left_out = left_out_mapping({*inspection.outlying} - {*calibration.frames}, inspection)
     verdict, reason, found = judge(fit, errors, support, inspection)
     rms = np.sqrt(after.squared / np.maximum(after.count, 1))
+    outlying = outlying_images(after.frames, rms)
     advice, pool = None, None
     if options.advice:
         pool = draw_pool(data, calibration.train, fit, np.random.default_rng(seed))
@@ -145,6 +153,7 @@ def training_report(
         "message": solution.message,
         "verdict": verdict,
         "reason": reason,
+        "expected": expected(fit, errors, 1e3 * inspection.look.noise),
         "headline": inspection.headline,
         "iterations": solution.iterations,
         "hand_eye": hand_eye_summary(fit, data.first.frame_names),
@@ -162,14 +171,19 @@ def training_report(
             "p_value": lacking.p_value,
             **lacking.to_mapping(hand_eye[:3, :3]),
         },
-        "left_out": left_out_mapping({*inspection.outlying} - {*calibration.frames}, inspection),
+        "left_out": left_out,
         "weights": None if fit.weights is None else fit.weights.to_mapping(),
         "walls": None if fit.walls is None else fit.walls.summary(),
-        "outlying_images": outlying_images(after.frames, rms),
+        "outlying_images": outlying,
         "observability": observability_summary(fit, support),
         "advice": advice,
         "plausibility": [one.to_mapping() for one in inspection.findings],
-        "warnings": [*found, *inspection.notes],
+        "warnings": [
+            *left_out_words([one["frame"] for one in left_out]),
+            *outlying_words(outlying),
+            *found,
+            *inspection.notes,
+        ],
     }
 
 
@@ -195,11 +209,11 @@ def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
         "weakest": [
             {
                 "direction": direction.in_words(),
-                "sigma_mm_or_mrad": 1e3 * direction.sigma,
+                "sigma_mm_or_mrad": 1e3 * error,
                 "free": direction.is_undetermined,
                 "components": direction.shares,
             }
-            for direction in fit.observability.directions[:5]
+            for error, direction in fit.standard_errors[:5]
         ],
         "confounded": [
             {"first": first, "second": second, "correlation": correlation}

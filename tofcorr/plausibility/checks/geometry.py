@@ -215,11 +215,14 @@ _CAMERA = {
 
 
 def _wrong_camera(found: dict[str, Estimate]) -> Finding | None:
-    """Judge K and distortion by estimates of their errors, and say what is most surely wrong."""
+    """Judge K and distortion by estimates of their errors, and say what is most surely wrong.
+
+    What would change a focal length by all of itself is another mistake, such as a mirrored image.
+    """
     surely = {
         name: one.size / one.size_error
         for name, (check, _) in _CAMERA.items()
-        if (one := found[name]).size > max(_LEAST[check], SIGMAS * one.size_error)
+        if 1 > (one := found[name]).size > max(_LEAST[check], SIGMAS * one.size_error)
     }
     if not surely:
         return None
@@ -338,6 +341,8 @@ def _unexplained(look: Look, excess: float) -> Finding:
     severity = "impossible" if excess > HOPELESS else "doubtful"
     said = f"{_misfit(look)}{others}, and no usual mistake explains it"
     cause = f"poses, planes or depth are of something else, or the poses scatter{hints}"
+    if not look.scene.moves:
+        cause = f"planes or depth are of something else, or the planes scatter{hints}"
     return Finding(severity, f"{said}: {cause}.", spoils=excess > SPOILS)
 
 
@@ -346,9 +351,10 @@ def _misfit(look: Look) -> str:
     turned = f" and {angle:.0f} degrees" if angle >= 2 else ""
     far = abs(given.constant) > LARGE_CONSTANT
     constant = f", with all distances {1e3 * given.constant:+.0f} mm off" if far else ""
-    lie = f"the points lie {_mm(given.misfit)}{turned} off"
+    lie = f"points lie {_mm(given.misfit)}{turned} off"
+    lie = f"After the best alignment of the camera the {lie}" if look.scene.moves else f"The {lie}"
     planes = "walls" if look.planes == "unknown" else "recorded planes"
-    return f"After the best alignment of the camera {lie} the {planes}{constant}"
+    return f"{lie} the {planes}{constant}"
 
 
 def _mm(metres: float) -> str:
@@ -358,13 +364,15 @@ def _mm(metres: float) -> str:
 def _scale(look: Look) -> Iterator[Finding]:
     """Do robot and camera agree on lengths?
 
-    An error of 15 % is another unit. A difference of the hand-eye's length of 2 mm is worth a note:
-    below, other errors are as large. A scale with a standard error above 0.5 % is not looked at.
+    Those of the robot count as true, see `ODD_SLOPE`. An error of 15 % is another unit. A
+    difference of the hand-eye's length of 2 mm is worth a note: below, other errors are as large. A
+    scale with a standard error above 0.5 % is not looked at.
     """
     given = look.given
     if 100 * abs(given.slope) > 15:
-        said = f"All distances are {100 * given.slope:+.0f} % off against the poses"
-        unit = "depth or poses are in another unit, or scaled"
+        lengths = "poses" if look.scene.moves else "planes"
+        said = f"All distances are {100 * given.slope:+.0f} % off against the {lengths}"
+        unit = f"depth or {lengths} are in another unit, or scaled"
         yield impossible(f"{said}: {unit}.", spoils=True, check="scale")
         return
     share, error = 0.0, math.inf
@@ -379,8 +387,11 @@ def _scale(look: Look) -> Iterator[Finding]:
     uncertain = f" (standard error {100 * error:.2g} %)" if math.isfinite(error) else ""
     longer, short = ("longer", "short") if share > 0 else ("shorter", "long")
     said = f"The camera's distances are {100 * abs(share):.1f} %{uncertain} {longer} than"
-    wrong = f"a fit makes the hand-eye translation {1e3 * length:.1f} mm too {short}"
-    said = f"{said} the robot's lengths, and nothing tells which are right; if the first, {wrong}."
+    if look.scene.moves:
+        wrong = f"a fit makes the hand-eye translation {1e3 * length:.1f} mm too {short}"
+        said = f"{said} the robot's lengths, which count as true: if they are not, {wrong}."
+    else:
+        said = f"{said} the planes say, which count as true: a wrong board size looks the same."
     yield Finding("ambiguous" if heads else "note", said, check="scale")
 
 
