@@ -75,7 +75,7 @@ def _warned(dataset: Dataset, result: Fit) -> str:
 def test_the_name_of_a_direction_fits_into_a_sentence(names: tuple[str, ...], words: str) -> None:
     """A verdict read "t_z against c0 (corr +1.00), with c1 is known to 27 only"."""
     shares, correlation = dict.fromkeys(names, 0.5), 1.0 if len(names) > 1 else None
-    direction = Direction(sigma=0.027, shares=shares, correlation=correlation)
+    direction = Direction(0.027, shares, correlation, is_undetermined=False)
     assert direction.in_words() == words
 
 

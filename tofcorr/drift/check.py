@@ -131,18 +131,15 @@ def check_drift(
         form_is_known=reference is not None,
         unlike=0.0 if known.views is None else share_unlike(sums.sums.views, known.views),
         unused=tuple(np.setdiff1d(np.arange(dataset.num_frames), used).tolist()),
-        headline=_headline(wall, offset, half_width, disagreement),
+        headline=_headline(offset, half_width, disagreement),
     )
 
 
-def _headline(
-    wall: Wall, offset: float, half_width: float, disagreement: float | None
-) -> str | None:
+def _headline(offset: float, half_width: float, disagreement: float | None) -> str | None:
     """Return what to say first of images that are not of one camera and one wall, or not of it."""
     if disagreement is not None:
         much = f"{disagreement:.1f} times as much as those of the calibration"
-        poses = "" if wall == "per_image" else "wrong poses, "  # Which then count.
-        return f"Doubtful frames: they disagree {much}: two cameras, {poses}or bent walls?"
+        return f"Doubtful frames: they disagree {much}: two cameras, bent walls, or wrong poses?"
     # Warming up makes as much as other errors of a camera.
     if abs(offset) <= max(CAMERA, half_width):
         return None

@@ -9,14 +9,9 @@ from tofcorr.plausibility.finding import in_words
 
 Verdict = Literal["holds", "drifted", "undecided"]
 
-_TAKEN = {
-    "per_image": "walls are flat",
-    "one": "poses are right and the wall is flat",
-    "recorded": "poses and planes are right",
-}
 _VERDICTS = {
     "holds": "The calibration holds.",
-    "drifted": "The calibration does not hold here: if {}, the camera has drifted; calibrate anew.",
+    "drifted": "The camera has drifted, if the wall is as --wall takes it: calibrate anew.",
     "undecided": "Undecided: these frames neither show a drift nor exclude one.",
 }
 
@@ -67,7 +62,7 @@ class DriftResult:
             how = f"A wall at an unknown place {bow}. Use a measured one, or one seen from poses."
         lines = [
             self.headline,
-            _VERDICTS[self.verdict].format(_TAKEN[self.wall]),
+            _VERDICTS[self.verdict],
             f"Its distances are {offset} mm off, compared with the calibration (positive: too far; "
             f"95 % interval {low} to {high} mm; threshold {1e3 * self.threshold:g} mm).",
             f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",

@@ -293,9 +293,9 @@ def assumptions(seen: MisfitPixels, fit: Fit) -> tuple[Shift, ...]:
     }
     # Poses and planes 1 % longer: the points in the tool frame should be farther from its origin.
     camera = fit.solution.parameters.tool_from_camera
-    place = camera[:3, :3].T @ camera[:3, 3]
-    from_tool = ((seen.linear.points + place) * seen.linear.normal).sum(dim=1)
-    errors["robot_scale"] = "robot's lengths 1 % longer", -from_tool / 100
+    from_tool = seen.linear.points + camera[:3, :3].T @ camera[:3, 3]
+    of_scale = -(from_tool * seen.linear.normal).sum(dim=1) / 100
+    errors["robot_scale"] = "robot's lengths 1 % longer", of_scale
     if not seen.walls_estimated:
         errors["plane_offset"] = ("d of all planes 1 mm larger", one / 1000)
         errors["plane_tilt"] = ("all planes turned by 0.1 deg", math.radians(1 / 10) * seen.on_wall)

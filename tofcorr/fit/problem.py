@@ -357,17 +357,17 @@ class Fit(Core):
         return float(with_measured @ corrected / with_measured[0])
 
     @property
-    def standard_errors(self) -> list[tuple[float, Direction]]:
-        """Standard error (metres or radians) and direction, of all of them, the weakest first.
+    def directions(self) -> list[Direction]:
+        """Every direction of `observability` with its standard error, the weakest first.
 
         By `hand_eye_covariance`, as in every table and export: what speaks of errors asks here.
         """
         matrix, vectors = self.covariance.matrix.clone(), self.observability.vectors
         if self.solution.parameters.hand_eye_is_free:
             matrix[:6, :6] = self.hand_eye_covariance
-        errors = (vectors * (matrix @ vectors)).sum(dim=0).clamp(min=0).sqrt()
-        found = zip(errors.tolist(), self.observability.directions, strict=True)
-        return sorted(found, key=lambda one: -one[0])
+        errors = (vectors * (matrix @ vectors)).sum(dim=0).clamp(min=0).sqrt().tolist()
+        both = zip(self.observability.directions, errors, strict=True)
+        return sorted((one._replace(sigma=k) for one, k in both), key=lambda one: -one.sigma)
 
     @property
     def hand_eye_covariance(self) -> Tensor:

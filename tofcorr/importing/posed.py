@@ -256,7 +256,7 @@ class PosedImport:
         for cause, advice, undo in listed if self._changes is None else listed[:4]:
             if np.ptp(undo(chosen.world_from_tool)[:, :3, 3], axis=0).max() >= CAMERA:
                 yield f"{cause}: {advice}.", self._misfit(chosen, undo)
-        cause, advice, mirrored = IN_IMAGES["mirrored"]
+        cause, advice, mirrored = IN_IMAGES["mirrored left to right"]
         yield f"{cause}: {advice}.", self._misfit(chosen, depth=mirrored)
         first = self._images.read(int(chosen.images[0])).depth
         for factor in (1 / 1000, 1 / 10, 10, 1000):

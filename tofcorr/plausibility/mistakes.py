@@ -65,7 +65,7 @@ _AXES = {
     "x and y exchanged": np.eye(4)[[1, 0, 2, 3]],
     "x and z exchanged": np.eye(4)[[2, 1, 0, 3]],
 }
-_DRIVER = "undo the driver's flip before writing"
+_DRIVER = "undo what the driver does before writing"
 _INVERSE = "the poses are tool_from_world, the inverse of what the format asks for"
 _ORDER = "the quaternions are stored as w, x, y, z"
 _TURNED = "the rotations are inverted and the translations are not"
@@ -102,20 +102,16 @@ IN_POSES: dict[str, Mistake] = {
 }
 """Mistakes in poses (N, 4, 4) by name, the likely ones first."""
 IN_IMAGES: dict[str, Mistake] = {
-    "mirrored": Mistake("the images are mirrored left to right", _DRIVER, np.fliplr),
-    "upside down": Mistake("the images are turned upside down", _DRIVER, np.flipud),
-    "transposed": Mistake(
-        "the images are transposed", "transpose them before writing", np.transpose
-    ),
-    **{
-        f"turned {turns}": Mistake(
-            f"the images are turned {words}", _DRIVER, partial(np.rot90, k=turns)
-        )
-        for turns, words in {2: "by half a turn", 1: "to the right", 3: "to the left"}.items()
-    },
-    "transposed and turned": Mistake(
-        "the images are mirrored along a diagonal", _DRIVER, lambda image: np.rot90(image, 2).T
-    ),
+    words: Mistake(f"the images are {words}", _DRIVER, undo)
+    for words, undo in (
+        ("mirrored left to right", np.fliplr),
+        ("turned upside down", np.flipud),
+        ("transposed", np.transpose),
+        ("turned by half a turn", partial(np.rot90, k=2)),
+        ("turned to the right", np.rot90),
+        ("turned to the left", partial(np.rot90, k=3)),
+        ("mirrored along a diagonal", lambda image: np.rot90(image, 2).T),
+    )
 }
 """The same in images (H, W), whatever their pixels hold: all symmetries of a square. Where a robot
 moves the camera, its hand-eye transform holds a mere turn."""
@@ -138,22 +134,21 @@ def best_explanations(look: Look) -> list[Explanation]:
     every misfit small. Of several, the first listed that comes near the best is named: within four
     thirds; one that frees unknowns comes last.
     """
-    given, tried = look.given, list(explanations(look))
     # Of as many guesses none is that much better by chance; a frame tells three numbers, of which
     # an alignment takes eight.
-    freedom = 3 * len(given.rms) - (8 if look.scene.moves else 2)
+    given, tried, freedom = look.given, list(explanations(look)), 3 * len(look.given.rms) - 8
     better = [
-        (cause, advice, found, frees)
-        for cause, advice, found, frees in tried
-        if found.badness <= max(CAMERA, 4 * look.noise)
+        one
+        for one in tried
+        if (found := one[2]).badness <= min(given.badness - SPOILS, max(CAMERA, 4 * look.noise))
         and found.relative <= FAR_BETTER * given.relative
-        and given.badness - found.badness > SPOILS
-        and (not frees or found.misfit <= FAR_BETTER * given.misfit)
+        and (not one[3] or found.misfit <= FAR_BETTER * given.misfit)
         and len(tried) * f_tail((given.relative / found.relative) ** 2, freedom, freedom) < LEVEL
     ]
-    least = min((found.relative for *_, found, _ in better), default=0.0)
-    near = [one for one in better if 3 * one[2].relative <= 4 * least]
-    return sorted(near, key=lambda one: one[3])
+    least = min((one[2].relative for one in better), default=0.0)
+    return sorted(
+        (one for one in better if 3 * one[2].relative <= 4 * least), key=lambda one: one[3]
+    )
 
 
 def explanations(look: Look) -> Iterator[Explanation]:

@@ -11,6 +11,7 @@ from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.sample import MaskOptions
 from tofcorr.plausibility.finding import FAR_OFF, SPOILS, Inspection, in_words
+from tofcorr.plausibility.look import Look
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.support import Support, shortcomings, worst_axes
 
@@ -27,7 +28,7 @@ _WEAK = 5e-3
 # Held-out over fitted error above which a model is too large; and held-out error over that of the
 # hand-eye alone from which the correction makes things worse, a twentieth being within the chance
 # of a split, or gains nothing. A camera without errors reaches the noise with the hand-eye alone:
-# the rest beyond the noise says that poses or planes are wrong.
+# what is beyond says that poses or planes are wrong.
 _OVERFITTED, _WORSE, _NO_GAIN = 1.5, 1.05, 0.95
 
 
@@ -75,11 +76,9 @@ def left_out_words(frames: Sequence[int]) -> list[str]:
 
 def outlying_words(images: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return one sentence about the images that fit much worse than the others; none if none do."""
-    if not images:
-        return []
+    named = in_words([one["frame"] for one in images] or [0]).capitalize()
     worst = ", ".join(f"{one['rms_mm']:.1f}" for one in images[:5])
-    which = in_words([one["frame"] for one in images]).capitalize()
-    return [f"{which}: the model fits much worse there than elsewhere, {worst} mm RMS."]
+    return [f"{named}: the fit is much worse than elsewhere, {worst} mm RMS."] if images else []
 
 
 def left_out_mapping(frames: Iterable[int], inspection: Inspection) -> list[dict[str, Any]]:
@@ -102,14 +101,13 @@ def judge(
         support: What the fitted frames cover.
         inspection: What was odd about the recordings; its noise of a pixel is the floor.
     """
-    free = fit.solution.parameters.hand_eye_is_free
+    free = _is_free(fit)
     with_intensity = fit.model.error.needs_amplitude()
-    noise, noise_rms = 1e3 * inspection.look.noise, 1e3 * inspection.look.noise_rms
-    held_out = errors["after"]["test"]["rms"]
-    said = [*_of_errors(fit, errors, noise, noise_rms), *_of_directions(fit)]
+    said = [*_of_errors(fit, errors, inspection.look), *_of_directions(fit)]
     for serious, one in shortcomings(support, moves=free, with_intensity=with_intensity):
         said.append(("usable" if serious else "good", one))
-    if beyond := beyond_noise(held_out, noise_rms, moves=free):
+    noise = 1e3 * inspection.look.noise_rms
+    if beyond := beyond_noise(errors["after"]["test"]["rms"], noise, moves=free):
         said.append(("usable", beyond))
     # From n images a standard error is known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
     if (images := len(fit.moments.gram)) < 10:
@@ -118,29 +116,27 @@ def judge(
         said.append(("good", fit.residual))
     if support.roll_deg is None:
         said.append(("good", "No robot moves: the hand-eye transform is held at the identity."))
-    odd: list[tuple[Verdict, str]] = [
-        (DO_NOT_USE, one.sentence)
-        for one in inspection.findings
-        if one.spoils or one.severity == "impossible"
-    ]
+    spoilt = [one for one in inspection.findings if one.spoils or one.severity == "impossible"]
+    odd: list[tuple[Verdict, str]] = [(DO_NOT_USE, one.sentence) for one in spoilt]
     if inspection.headline:
         odd.append(("usable", inspection.headline))
     first = dict(reversed([*odd, *said]))
-    first["good"] = expected(fit, errors, noise)
+    first["good"] = expected(fit, errors, inspection)
     verdict: Verdict = min(first, key=_VERDICTS.index)
     return verdict, first[verdict], [sentence for _, sentence in said]
 
 
-def expected(fit: Fit, errors: Mapping[str, Any], noise: float) -> str:
+def expected(fit: Fit, errors: Mapping[str, Any], inspection: Inspection) -> str:
     """Return the error to expect in use: of held-out frames, and of the hand-eye transform.
 
-    Args:
-        fit: The fitted model.
-        errors: The `error_mm` of the report.
-        noise: Of a pixel, millimetres; NaN: unknown.
+    Arguments are those of `judge`.
     """
-    measured, free = _measured(fit, errors, noise), fit.solution.parameters.hand_eye_is_free
-    return f"{measured}, and the hand-eye is known to {_known(fit)}." if free else f"{measured}."
+    known = f", and the hand-eye is known to {_known(fit)}." if _is_free(fit) else "."
+    return f"{_measured(fit, errors, inspection.look)}{known}"
+
+
+def _is_free(fit: Fit) -> bool:
+    return fit.solution.parameters.hand_eye_is_free
 
 
 def _known(fit: Fit) -> str:
@@ -148,33 +144,34 @@ def _known(fit: Fit) -> str:
     return f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad"
 
 
-def _measured(fit: Fit, errors: Mapping[str, Any], noise: float) -> str:
-    """Return how far held-out frames are off, with the hand-eye alone, and by noise."""
+def _measured(fit: Fit, errors: Mapping[str, Any], look: Look) -> str:
+    """Return how far held-out frames are off, compared with the hand-eye alone and with noise."""
     held_out, bare = (errors[stage]["test"]["rms"] for stage in ("after", "hand_eye_only"))
     if held_out is None:
         return "No frame was held out: the errors given are those of the fit itself"
-    free = fit.solution.parameters.hand_eye_is_free
-    compared = f"{bare:.1f} mm {'with the hand-eye alone' if free else 'without correction'}"
-    compared += f", {noise:.1f} mm noise of a pixel" if math.isfinite(noise) else ""
+    alone = "with the hand-eye alone" if _is_free(fit) else "without correction"
+    compared = f"{bare:.1f} mm {alone}"
+    compared += f", {1e3 * look.noise:.1f} mm noise of a pixel" if look.noise > 0 else ""
     return f"Held-out frames are off by {held_out:.1f} mm RMS ({compared})"
 
 
-def _of_errors(
-    fit: Fit, errors: Mapping[str, Any], noise: float, noise_rms: float
-) -> Iterator[tuple[Verdict, str]]:
+def _of_errors(fit: Fit, errors: Mapping[str, Any], look: Look) -> Iterator[tuple[Verdict, str]]:
     """Yield what the errors say of a fit.
 
     Args:
         fit: The fitted model.
         errors: The `error_mm` of the report.
-        noise: Of a pixel, millimetres; NaN: unknown.
-        noise_rms: The same as a root mean square.
+        look: What the recordings look like.
     """
+    noise, measured = 1e3 * look.noise, _measured(fit, errors, look)
     halves = ("after", "train"), ("after", "test"), ("hand_eye_only", "test")
     found = [errors[stage][half]["rms"] for stage, half in halves]
     fitted, held_out, bare = (math.nan if one is None else one for one in found)
-    error, measured = fitted if math.isnan(held_out) else held_out, _measured(fit, errors, noise)
-    free = fit.solution.parameters.hand_eye_is_free
+    # Of all pixels to planes of their own frames, which no pose and no recorded plane changes.
+    own = look.scene.off_by[look.scene.known]
+    flat = 1e3 * float(np.sqrt(np.nanmean(np.square(own)))) if own.size else math.nan
+    least = min(3 * flat, math.hypot(flat, 1e3 * SPOILS))
+    error = fitted if math.isnan(held_out) else held_out
     if fit.solution.stopped == "not_finite":
         smaller = "Choose a smaller model, or see `tofcorr inspect`."
         yield DO_NOT_USE, f"{fit.solution.message} {smaller}"
@@ -189,13 +186,9 @@ def _of_errors(
         yield DO_NOT_USE, f"{left}: too few different frames."
     if held_out > _WORSE * bare:
         yield DO_NOT_USE, f"{measured}: the depth correction makes them worse."
-    elif held_out > _NO_GAIN * bare and (
-        held_out > 3 * noise
-        or (beyond_noise(held_out, noise_rms) and held_out > math.hypot(noise_rms, 1e3 * SPOILS))
-    ):
-        # Noise, as a root mean square, is held out as well: what is beyond it is not.
-        wrong = "poses or planes are wrong" if free else "planes are wrong"
-        yield DO_NOT_USE, f"{measured}: the correction gains nothing, so {wrong} or a term lacks."
+    elif held_out > max(_NO_GAIN * bare, least) and beyond_noise(held_out, flat):
+        why = f"nothing is gained. Frames are flat to {flat:.1f} mm: poses or planes are wrong"
+        yield DO_NOT_USE, f"{measured}: {why}."
     # No application bears 30 mm, the raw error of most cameras, or eight times the noise.
     if error > max(30, 8 * noise):
         off = f"Frames are off by {error:.0f} mm RMS after the fit"
@@ -206,36 +199,33 @@ def _of_errors(
         own = f"much more than the {fitted:.1f} mm of the fit itself"
         yield "usable", f"{measured}, {own}: record more views, or choose a smaller model."
     elif bare < held_out <= _WORSE * bare:
-        enough = "the hand-eye transform is enough for this camera" if free else "it needs none"
-        yield "good", f"{measured}: {enough}."
+        yield "good", f"{measured}: the depth correction gains nothing."
 
 
 def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
     """Yield what a fit lacks, and in what it is uncertain: the three weakest directions by name."""
-    solution, free = fit.solution, fit.solution.parameters.hand_eye_is_free
+    solution, free = fit.solution, _is_free(fit)
     if fit.misfit is not None:
         yield "usable" if max(fit.misfit.size) > _WEAK else "good", fit.misfit.lacking()
     if not solution.converged and solution.stopped != "not_finite":
         yield "usable", solution.message
-    shift, turn = worst_axes(fit.hand_eye_covariance) if free else (0.0, 0.0)
-    if max(shift, turn) > _WEAK:
+    if free and max(worst_axes(fit.hand_eye_covariance)) > _WEAK:
         yield (
             "usable",
             f"The hand-eye is known to {_known(fit)} only: record more tilts and distances.",
         )
     wide, of_pose = 1e3 * PRIOR_SIGMA, "usable" if free else "good"
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
-    weak = [(error, one) for error, one in fit.standard_errors if error > _WEAK]
-    of_curves = [error for error, one in weak if len(one.shares) > 1 and {*one.shares} <= curves]
-    others = [(error, one) for error, one in weak if not {*one.shares} <= curves]
-    if undetermined := [one.in_words() for _, one in others if one.is_undetermined]:
+    weak = [one for one in fit.directions if one.sigma > _WEAK]
+    of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
+    others = [one for one in weak if not set(one.shares) <= curves]
+    if undetermined := [one.in_words() for one in others if one.is_undetermined]:
         lacking = f"{'; '.join(undetermined)}: a prior of {wide:g} mm and {wide:g} mrad is used"
         yield of_pose, f"The images do not determine {lacking}. Record more tilts and distances."
-    if uncertain := [(error, one) for error, one in others if not one.is_undetermined]:
-        of_hand_eye = any(x.startswith(("t_", "w_")) for _, one in uncertain for x in one.shares)
-        words = "; ".join(f"{1e3 * error:.1f} of {one.in_words()}" for error, one in uncertain[:3])
+    if uncertain := [one for one in others if not one.is_undetermined]:
+        words = "; ".join(f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in uncertain[:3])
         count = f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad)"
-        yield of_pose if of_hand_eye else "good", f"{count}: {words}."
+        yield "good", f"{count}: {words}."
     if of_curves:
         size = f"their standard deviations reach {1e3 * max(of_curves):.0f} mm"
         yield "good", f"Parts of the curves are set by the smoothing penalty, not by data: {size}."
@@ -256,8 +246,8 @@ def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) ->
     if not beyond > max(1.5, 0.6 * noise):
         return None
     off = f"Held-out frames are off by {beyond:.1f} mm beyond the noise of their pixels"
-    what = "poses" if moves else "planes"
-    return f"{off}: {what} scatter, or the model lacks a term; `tofcorr diagnose` tells which."
+    off = f"{off}: {'poses' if moves else 'planes'} scatter, or the model lacks a term"
+    return f"{off}; `tofcorr diagnose` tells which."
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -278,17 +268,17 @@ def report_text(report: Mapping[str, Any]) -> str:
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
     if advice := report["advice"]:
-        weakest = report["observability"]["weakest"][0]
+        weakest, expects = report["observability"]["weakest"][0], advice["worst_sigma_mm_or_mrad"]
         largest = f"{weakest['sigma_mm_or_mrad']:.2f} mm (or mrad), of {weakest['direction']}"
         lines.append(f"The largest standard error is {largest}. To lower it, add:")
-        # Poses lower what the images do not determine, in proportion.
-        share = weakest["sigma_mm_or_mrad"] / advice["worst_sigma_mm_or_mrad"]
         lines += [
             f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
-            f"deg, rolled by {pose['roll_by_deg']:+.0f}: "
-            f"then {share * pose['worst_sigma_mm_or_mrad']:.2f}"
+            f"deg, rolled by {pose['roll_by_deg']:+.0f}: lower by "
+            f"{100 - 100 * pose['worst_sigma_mm_or_mrad'] / expects:.0f} %"
             for pose in advice["poses"]
         ]
+    lines += left_out_words([one["frame"] for one in report["left_out"]])
+    lines += outlying_words(report["outlying_images"])
     found = [warning for warning in report["warnings"] if warning != report["reason"]]
     lines += [f"Warning: {warning}" for warning in found[:5]]
     if len(found) > 5:
@@ -302,9 +292,8 @@ def verdict_text(report: Mapping[str, Any]) -> str:
     Args:
         report: The content of report.json; older ones lack `expected`.
     """
-    expect = report.get("expected", "")
-    said = f"Verdict: {report['verdict']}. {report['reason']}"
-    return said if expect in said else f"{said} {expect}"
+    said, expects = f"Verdict: {report['verdict']}. {report['reason']}", report.get("expected", "")
+    return said if expects in said else f"{said} {expects}"
 
 
 def _hand_eye_lines(report: Mapping[str, Any]) -> Iterator[str]:

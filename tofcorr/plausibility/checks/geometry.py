@@ -17,7 +17,7 @@ from tofcorr.geometry.rays import (
     unambiguous_range,
     wrapped,
 )
-from tofcorr.plausibility.alignment import walls_of
+from tofcorr.plausibility.alignment import TINY, walls_of
 from tofcorr.plausibility.finding import (
     CAMERA,
     FAR_OFF,
@@ -78,10 +78,8 @@ def garbage(look: Look) -> Iterator[Finding]:
         what = f"most by {_range_in_words(frequency)}, so they show a target beyond it"
     advice = "mask them (mask.npy, or `mask: ransac` in the configuration)"
     if bent or dominated:  # See `training.left_out`.
-        advice = (
-            "`tofcorr train`, `evaluate` and `select` leave them out, unless their configuration "
-            "says which pixels count; mask.npy does so for every command"
-        )
+        advice = "unless their configuration says which pixels count; mask.npy does so for all"
+        advice = f"`tofcorr train`, `evaluate` and `select` leave them out, {advice}"
     said = f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane"
     yield Finding("doubtful" if bent else "note", f"{said} of their frame: {what}; {advice}.")
 
@@ -340,9 +338,8 @@ def _unexplained(look: Look, excess: float) -> Finding:
     others = f", {far} of {len(look.rms)} frames more than {_mm(HOPELESS)}" if far else ""
     severity = "impossible" if excess > HOPELESS else "doubtful"
     said = f"{_misfit(look)}{others}, and no usual mistake explains it"
-    cause = f"poses, planes or depth are of something else, or the poses scatter{hints}"
-    if not look.scene.moves:
-        cause = f"planes or depth are of something else, or the planes scatter{hints}"
+    what = "poses, planes or depth" if look.scene.moves else "planes or depth"
+    cause = f"{what} are of something else, or scatter{hints}"
     return Finding(severity, f"{said}: {cause}.", spoils=excess > SPOILS)
 
 
@@ -370,9 +367,8 @@ def _scale(look: Look) -> Iterator[Finding]:
     """
     given = look.given
     if 100 * abs(given.slope) > 15:
-        lengths = "poses" if look.scene.moves else "planes"
-        said = f"All distances are {100 * given.slope:+.0f} % off against the {lengths}"
-        unit = f"depth or {lengths} are in another unit, or scaled"
+        said = f"All distances are {100 * given.slope:+.0f} % off against poses and planes"
+        unit = "one of them is in another unit, or scaled"
         yield impossible(f"{said}: {unit}.", spoils=True, check="scale")
         return
     share, error = 0.0, math.inf
@@ -381,17 +377,21 @@ def _scale(look: Look) -> Iterator[Finding]:
     if 1000 * error > 5:
         share, error = given.slope, math.inf
     length = abs(share) * float(math.hypot(*given.hand_eye[:3, 3]))
-    heads = abs(given.slope) > ODD_SLOPE
+    # The alignment's slope is held to about half by its prior, and does not mix with errors by the
+    # amplitude, which follows the distance on a white wall: both must say so.
+    heads = min(abs(share), 2 * abs(given.slope)) > ODD_SLOPE
     if not heads and not (1000 * length > 2 and abs(share) > SIGMAS * error):
         return
     uncertain = f" (standard error {100 * error:.2g} %)" if math.isfinite(error) else ""
     longer, short = ("longer", "short") if share > 0 else ("shorter", "long")
     said = f"The camera's distances are {100 * abs(share):.1f} %{uncertain} {longer} than"
+    what, wrong = "planes", "a wrong board size looks the same"
     if look.scene.moves:
-        wrong = f"a fit makes the hand-eye translation {1e3 * length:.1f} mm too {short}"
-        said = f"{said} the robot's lengths, which count as true: if they are not, {wrong}."
-    else:
-        said = f"{said} the planes say, which count as true: a wrong board size looks the same."
+        what, wrong = (
+            "robot",
+            f"if not, the hand-eye translation is {1e3 * length:.1f} mm too {short}",
+        )
+    said = f"{said} those of the {what}, which count as true; {wrong}."
     yield Finding("ambiguous" if heads else "note", said, check="scale")
 
 
@@ -411,12 +411,17 @@ def outlying_frames(look: Look) -> dict[int, float]:
 
     A frame disagrees if its misfit is five times the median's, and what no error of a camera makes;
     twice that where these cannot be taken off first. More than three in ten are no single ones: the
-    alignment is robust to so many. It takes three frames, so that one of six can disagree.
+    alignment is robust to so many. It takes three frames, so that one of six can disagree. A single
+    ray has the noise of its amplitude, of which the typical frame has little.
     """
     if look.as_given is None or len(look.rms) < 6:
         return {}
     rms, limit = look.rms, (2 if look.shape is None else 1) * CAMERA
-    off = np.flatnonzero(rms > max(5 * float(np.median(rms)), limit))
+    expected = np.full(len(rms), max(5 * float(np.median(rms)), limit))
+    if look.amplitude is not None and not look.scene.known.any():
+        bright = np.nanmax(look.amplitude[look.usable], axis=1)
+        expected *= np.maximum(np.median(bright) / np.maximum(bright, TINY), 1)
+    off = np.flatnonzero(rms > expected)
     if 10 * len(off) > 3 * len(rms):
         return {}
     return {int(look.frames[k]): float(rms[k]) for k in off[np.argsort(-rms[off])]}

@@ -250,10 +250,10 @@ def exposure(look: Look) -> Iterator[Finding]:
         return
     level, contrast = _brightness(look, look.amplitude)
     seen = np.flatnonzero(np.isfinite(level))
-    typical = np.sort(level[seen])[len(seen) // 2] if len(seen) else 0.0
-    if len(odd := seen[np.abs(level[seen] - typical) > np.log(_TWO_UNITS)]):
-        frames, much = tuple(look.frames[odd].tolist()), np.exp(np.median(level[odd]) - typical)
-        said = f"{in_words(frames).capitalize()} see their targets {much:.3g} times as bright"
+    off = level[seen] - np.sort(level[seen])[len(seen) // 2 : len(seen) // 2 + 1]
+    if len(odd := seen[np.abs(off) > np.log(_TWO_UNITS)]):
+        frames, most = tuple(look.frames[odd].tolist()), np.exp(off[np.abs(off).argmax()])
+        said = f"{in_words(frames).capitalize()} see their targets up to {most:.3g} times as bright"
         yield doubtful(f"{said} as the others do: amplitudes in two units; write one.", frames)
         return
     times, targets = look.condition("integration_time"), look.data.targets[look.frames]
@@ -285,16 +285,13 @@ def _brightness(look: Look, amplitude: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     scene, amplitude = look.scene, amplitude[look.usable]
     cosine = np.abs(np.einsum("fpa,fa->fp", scene.rays, np.nan_to_num(scene.own_normal)))
-    used = scene.on_plane & np.isfinite(amplitude) & (cosine > 1 / 100)
+    used = scene.on_plane & np.isfinite(amplitude) & (100 * cosine > 1)
     seen = amplitude * scene.distance**2 / np.where(used, cosine, 1.0)
-    seen = np.sort(np.where(used, seen, np.inf), axis=1)
-    count, frame = used.sum(1), np.arange(len(seen))
-    dark, bright = (
-        np.log(np.maximum(seen[frame, place], TINY))
-        for place in (count // 10, (9 * count - 1) // 10)
-    )
-    known = scene.known & (count >= 10) & (bright > np.log(TINY))
-    return np.where(known, bright, np.nan), np.where(known, bright - dark, np.nan)
+    seen = np.sort(np.where(used, seen, np.nan), axis=1)  # NaN comes last.
+    count, each, tenth = used.sum(1), np.arange(len(seen)), used.sum(1) // 10
+    dark, bright = (np.log(np.maximum(seen[each, k], TINY)) for k in (tenth, count - 1 - tenth))
+    unknown = ~scene.known | (tenth < 1) | (bright <= np.log(TINY))
+    return np.where(unknown, np.nan, bright), np.where(unknown, np.nan, bright - dark)
 
 
 def _two_groups(score: np.ndarray) -> tuple[np.ndarray, float, float] | None:
