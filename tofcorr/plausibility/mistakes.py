@@ -65,7 +65,7 @@ _AXES = {
     "x and y exchanged": np.eye(4)[[1, 0, 2, 3]],
     "x and z exchanged": np.eye(4)[[2, 1, 0, 3]],
 }
-_DRIVER = "undo what the driver does before writing"
+_DRIVER = "undo that before writing"
 _INVERSE = "the poses are tool_from_world, the inverse of what the format asks for"
 _ORDER = "the quaternions are stored as w, x, y, z"
 _TURNED = "the rotations are inverted and the translations are not"
@@ -107,10 +107,10 @@ IN_IMAGES: dict[str, Mistake] = {
         ("mirrored left to right", np.fliplr),
         ("turned upside down", np.flipud),
         ("transposed", np.transpose),
-        ("turned by half a turn", partial(np.rot90, k=2)),
-        ("turned to the right", np.rot90),
-        ("turned to the left", partial(np.rot90, k=3)),
         ("mirrored along a diagonal", lambda image: np.rot90(image, 2).T),
+        ("turned to the right", np.rot90),
+        ("turned by half a turn", partial(np.rot90, k=2)),
+        ("turned to the left", partial(np.rot90, k=3)),
     )
 }
 """The same in images (H, W), whatever their pixels hold: all symmetries of a square. Where a robot

@@ -348,8 +348,8 @@ def _misfit(look: Look) -> str:
     turned = f" and {angle:.0f} degrees" if angle >= 2 else ""
     far = abs(given.constant) > LARGE_CONSTANT
     constant = f", with all distances {1e3 * given.constant:+.0f} mm off" if far else ""
-    lie = f"points lie {_mm(given.misfit)}{turned} off"
-    lie = f"After the best alignment of the camera the {lie}" if look.scene.moves else f"The {lie}"
+    aligned = "After the best alignment of the camera the" if look.scene.moves else "The"
+    lie = f"{aligned} points lie {_mm(given.misfit)}{turned} off"
     planes = "walls" if look.planes == "unknown" else "recorded planes"
     return f"{lie} the {planes}{constant}"
 
@@ -377,9 +377,7 @@ def _scale(look: Look) -> Iterator[Finding]:
     if 1000 * error > 5:
         share, error = given.slope, math.inf
     length = abs(share) * float(math.hypot(*given.hand_eye[:3, 3]))
-    # The alignment's slope is held to about half by its prior, and does not mix with errors by the
-    # amplitude, which follows the distance on a white wall: both must say so.
-    heads = min(abs(share), 2 * abs(given.slope)) > ODD_SLOPE
+    heads = abs(share) > ODD_SLOPE
     if not heads and not (1000 * length > 2 and abs(share) > SIGMAS * error):
         return
     uncertain = f" (standard error {100 * error:.2g} %)" if math.isfinite(error) else ""
@@ -387,10 +385,7 @@ def _scale(look: Look) -> Iterator[Finding]:
     said = f"The camera's distances are {100 * abs(share):.1f} %{uncertain} {longer} than"
     what, wrong = "planes", "a wrong board size looks the same"
     if look.scene.moves:
-        what, wrong = (
-            "robot",
-            f"if not, the hand-eye translation is {1e3 * length:.1f} mm too {short}",
-        )
+        what, wrong = "robot", f"if not, the hand-eye is {1e3 * length:.1f} mm too {short}"
     said = f"{said} those of the {what}, which count as true; {wrong}."
     yield Finding("ambiguous" if heads else "note", said, check="scale")
 
