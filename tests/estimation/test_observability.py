@@ -79,7 +79,7 @@ def test_the_name_of_a_direction_fits_into_a_sentence(names: tuple[str, ...], wo
     assert direction.in_words() == words
 
 
-@pytest.mark.parametrize(("left", "said"), [(1.02, "is enough"), (1.2, "makes them worse")])
+@pytest.mark.parametrize(("left", "said"), [(1.02, "gains nothing"), (1.2, "makes them worse")])
 def test_only_a_correction_that_clearly_does_harm_is_advised_against(
     walls: dict[str, Dataset], fits: FitOf, left: float, said: str
 ) -> None:

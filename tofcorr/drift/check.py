@@ -112,7 +112,8 @@ def check_drift(
     used = list(through(sums.read(), "checking", total=dataset.num_frames))
     if not used:
         said = f"no image has {FEWEST_PIXELS} usable pixels on a wall within the calibrated ranges"
-        raise CalibrationDataError(f"{dataset.first.path}: {said}; record a wall there.")
+        advice = "record a wall at these distances and amplitudes, in the same units"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
     offset, half_width, disagreement = sums.estimate()
     low, high = offset - half_width, offset + half_width
     flatness = math.sqrt(np.mean([one.flatness**2 for one in sums.images]))
