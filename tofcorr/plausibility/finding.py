@@ -86,8 +86,8 @@ impossible, doubtful, note = (
 def in_words(frames: tuple[int, ...] | list[int], most: int = 5) -> str:
     """Return frame numbers as text: `frames 3, 4 and 7`, or `frames 3, 4, ... (12 in all)`."""
     names = [str(frame) for frame in frames]
-    if len(names) == 1:
-        return f"frame {names[0]}"
+    if len(names) < 2:
+        return f"frame {''.join(names) or 'none'}"
     if len(names) <= most:
         return f"frames {', '.join(names[:-1])} and {names[-1]}"
     return f"frames {', '.join(names[:most])}, ... ({len(names)} in all)"

@@ -67,17 +67,15 @@ def frames_left_out(inspection: Inspection, training: Iterable[np.ndarray]) -> t
 
 def left_out_words(frames: Sequence[int]) -> list[str]:
     """Return one sentence about frames left out; none if there is none."""
-    if not frames:
-        return []
-    verb = "is" if len(frames) == 1 else "are"
-    which = f"{in_words(tuple(frames)).capitalize()} {verb} left out of all fits and errors"
-    return [f"{which}: poses, planes or images disagree with all others."]
+    which = f"{in_words([*frames]).capitalize()} {'is' if len(frames) == 1 else 'are'} left out of"
+    said = f"{which} all fits and errors: poses, planes or images disagree with all others."
+    return [said] if frames else []
 
 
 def outlying_words(images: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return one sentence about the images that fit much worse than the others; none if none do."""
-    named = in_words([one["frame"] for one in images] or [0]).capitalize()
     worst = ", ".join(f"{one['rms_mm']:.1f}" for one in images[:5])
+    named = in_words([one["frame"] for one in images]).capitalize()
     return [f"{named}: the fit is much worse than elsewhere, {worst} mm RMS."] if images else []
 
 
