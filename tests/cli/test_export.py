@@ -55,5 +55,7 @@ def test_a_run_that_is_not_to_be_used_is_exported_only_if_it_was_forced(
     assert "its verdict is `do not use`: The wall is bent. Train with" in told
     assert not out.exists()
     (tmp_path / "corrector.ts").touch()  # As `tofcorr train --force` leaves it.
-    assert program(*export).code == 0
+    code, said, _ = program(*export)
+    assert code == 0
+    assert "Verdict: do not use. The wall is bent." in said
     assert out.exists()

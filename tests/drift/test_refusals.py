@@ -60,10 +60,12 @@ def test_frames_of_two_cameras_are_headed_by_it(
     few = walls(11).first
     depth = np.array(few.depth)
     depth[::2] += 0.03
+    depth[1] = np.nan
     mixed = Dataset((replace(few, depth=depth),))
     found = check_drift(state, mixed, "recorded", reference=reference)
     assert "two cameras" in present(found.headline)
     assert repr(found).startswith("Doubtful frames")
+    assert "Not used, with too few usable pixels: frame 1." in repr(found)
 
 
 # Depth in feet was once measured as 260 mm [150, 360] too far.

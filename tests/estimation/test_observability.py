@@ -71,11 +71,11 @@ def warned(walls: dict[str, Dataset], fits: FitOf) -> Callable[[str], str]:
 def test_the_name_of_a_direction_fits_into_a_sentence(names: tuple[str, ...], words: str) -> None:
     """A verdict read "t_z against c0 (corr +1.00), with c1 is known to 27 only"."""
     shares, correlation = dict.fromkeys(names, 0.5), 1.0 if len(names) > 1 else None
-    direction = Direction(sigma=0.027, shares=shares, correlation=correlation)
+    direction = Direction(0.027, shares, correlation, is_undetermined=False)
     assert direction.in_words() == words
 
 
-@pytest.mark.parametrize(("left", "said"), [(1.02, "is enough"), (1.2, "makes them worse")])
+@pytest.mark.parametrize(("left", "said"), [(1.02, "gains nothing"), (1.2, "makes them worse")])
 def test_only_a_correction_that_clearly_does_harm_is_advised_against(
     walls: dict[str, Dataset], fits: FitOf, left: float, said: str
 ) -> None:

@@ -74,7 +74,7 @@ def test_evaluate_and_select_leave_out_the_frames_that_a_training_leaves_out(
     error = half["error_mm"]["mean_abs_mm"]["E0"]["mean"]
     assert error == pytest.approx(trained["error_mm"]["after"]["test"]["mean_abs"], rel=1e-6)
     assert selected.decisive.errors["E0"].mean < 1.5 * error
-    for result in (evaluated, selected):
+    for result in (training, evaluated, selected):
         assert "Frame 3 is left out of all fits and errors" in repr(result)
 
 

@@ -13,6 +13,7 @@ import tofcorr
 from tofcorr.estimation.solvers import Stopped
 from tofcorr.fit.problem import Fit
 from tofcorr.training.judgement import beyond_noise, judge
+from tofcorr.training.report import hand_eye_errors
 from tofcorr.training.support import Support
 
 
@@ -50,11 +51,17 @@ def test_an_error_that_the_model_lacks_is_no_good_run(tmp_path: Path) -> None:
     assert (np.abs(1e3 * off) <= report["hand_eye"]["translation_ci95_mm"]).all()
 
 
-def judged(trained: Trained, fit: Fit) -> tuple[str, str]:
+def judged(trained: Trained, fit: Fit, noise: float | None = None, **rms: float) -> tuple[str, str]:
+    """Judge a fit; with another noise of a pixel and other errors, millimetres, if given."""
     train, hand_eye = trained.result.calibration.train, fit.solution.parameters.tool_from_camera
-    support, found = Support(trained.data, train, hand_eye), trained.report()
+    support, errors = Support(trained.data, train, hand_eye), trained.report()["error_mm"]
     inspection = tofcorr.inspect(trained.recording)
-    return judge(fit, found["error_mm"], support, inspection)[:2]
+    if noise is not None:
+        look = inspection.look
+        look.noise = look.noise_rms = noise / 1e3
+        look.scene.off_by[:] = noise / 1e3
+        errors = {k: {half: {"rms": rms[k]} for half in errors[k]} for k in rms}
+    return judge(fit, errors, support, inspection)[:2]
 
 
 @pytest.mark.parametrize(
@@ -69,13 +76,37 @@ def test_a_fit_that_was_rolled_back_from_nan_is_not_to_be_used(
     assert judged(trained, ended)[0] == expected
 
 
-def test_a_good_run_knows_the_hand_eye_by_its_own_standard_errors(trained: Trained) -> None:
-    """A run whose poses scattered, with a standard error of 11 mm, said that it was determined."""
+def scattered(fit: Fit, error: float) -> Fit:
+    """Return a fit whose t_z has another standard error, metres, beside its own."""
+    matrix = fit.covariance.matrix.clone()
+    matrix[2, 2] += error**2
+    return replace(fit, covariance=replace(fit.covariance, matrix=matrix))
+
+
+def test_every_standard_error_is_of_one_matrix(trained: Trained) -> None:
+    """A run with 11 mm said that all was determined; a table t_z ± 39 mm, its sentence 18 mm."""
     fit = trained.result.fit
     assert judged(trained, fit)[0] == "good"
-    matrix = fit.covariance.matrix.clone()
-    matrix[2, 2] += 11e-3**2
-    scattered = replace(fit, covariance=replace(fit.covariance, matrix=matrix))
-    verdict, reason = judged(trained, scattered)
+    wide = scattered(fit, 39e-3)
+    verdict, reason = judged(trained, wide)
     assert verdict == "usable"
-    assert "known to 11." in reason
+    assert "known to 39." in reason
+    assert max(1e3 * hand_eye_errors(wide)[0]) == pytest.approx(39, rel=0.1)
+    # Directions are orthonormal: their variances add up to those of the unknowns.
+    variance = wide.covariance.matrix[6:, 6:].trace() + wide.hand_eye_covariance.trace()
+    assert sum(one.sigma**2 for one in wide.directions) == pytest.approx(float(variance))
+    told = trained.report()["observability"]["weakest"][0]["sigma_mm_or_mrad"]
+    assert told == pytest.approx(1e3 * fit.directions[0].sigma)
+
+
+@pytest.mark.parametrize(
+    ("noise", "held_out", "expected"),
+    [(7.0, 20.1, "do not use"), (20.0, 20.1, "usable"), (7.0, 9.0, "usable")],
+)
+def test_a_run_that_gains_nothing_is_not_to_be_used_unless_noise_explains_it(
+    trained: Trained, noise: float, held_out: float, expected: str
+) -> None:
+    """It was `usable` with 20.1 mm, and 20.9 mm with the hand-eye alone."""
+    fit = scattered(trained.result.fit, 11e-3)
+    verdict, reason = judged(trained, fit, noise, after=held_out, hand_eye_only=20.9)
+    assert (verdict, "nothing is gained" in reason) == (expected, expected == "do not use")

@@ -120,20 +120,25 @@ def export_command(run: Path, name: str, out: Path, device: str) -> None:
     if device != "cpu" and not (FORMATS[name].for_device and torch.cuda.is_available()):
         compiled = " and ".join(one.name for one in FORMATS.values() if one.for_device)
         raise ConfigError(f"--device {device}: only for {compiled}, on a machine that has it.")
-    _refuse_useless(run)
+    verdict = _verdict(run)
     state = load_calibration(run / STATE_FILE)
     export(name, DepthCorrector.from_state(state).to(device), out, state)
-    click.echo(f"{out}: the calibration {state.name} of {run} as {name}.")
+    click.echo(f"{out}: the calibration {state.name} of {run} as {name}. {verdict}".rstrip())
 
 
-def _refuse_useless(run: Path) -> None:
-    """Refuse a run that `tofcorr train` gave no corrector.ts, for the reason in its report."""
-    from tofcorr.training.judgement import DO_NOT_USE
+def _verdict(run: Path) -> str:
+    """Return what the report of a run says of it; nothing without one.
+
+    Raises:
+        CalibrationDataError: `tofcorr train` gave it no corrector.ts: it is not to be used.
+    """
+    from tofcorr.training.judgement import DO_NOT_USE, verdict_text
 
     file = run / "report.json"
-    if (run / "corrector.ts").exists() or not file.is_file():
-        return
+    if not file.is_file():
+        return ""
     report = json.loads(file.read_text(encoding="utf-8"))
-    if report["verdict"] == DO_NOT_USE:
+    if report["verdict"] == DO_NOT_USE and not (run / "corrector.ts").exists():
         said = f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']}"
         raise CalibrationDataError(f"{said} Train with --force, if so.")
+    return verdict_text(report)

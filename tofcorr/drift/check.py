@@ -109,9 +109,11 @@ def check_drift(
     if not dataset.has_amplitude:
         known = known.model_copy(update={"noise": None})
     sums = OffsetSums(state, dataset, wall, known)
-    if not list(through(sums.read(), "checking", total=dataset.num_frames)):
+    used = list(through(sums.read(), "checking", total=dataset.num_frames))
+    if not used:
         said = f"no image has {FEWEST_PIXELS} usable pixels on a wall within the calibrated ranges"
-        raise CalibrationDataError(f"{dataset.first.path}: {said}; record a wall there.")
+        advice = "record a wall at these distances and amplitudes, in the same units"
+        raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
     offset, half_width, disagreement = sums.estimate()
     low, high = offset - half_width, offset + half_width
     flatness = math.sqrt(np.mean([one.flatness**2 for one in sums.images]))
@@ -129,6 +131,7 @@ def check_drift(
         outside=1 - sums.calibrated / max(sums.on_wall, 1),
         form_is_known=reference is not None,
         unlike=0.0 if known.views is None else share_unlike(sums.sums.views, known.views),
+        unused=tuple(np.setdiff1d(np.arange(dataset.num_frames), used).tolist()),
         headline=_headline(offset, half_width, disagreement),
     )
 
@@ -137,7 +140,7 @@ def _headline(offset: float, half_width: float, disagreement: float | None) -> s
     """Return what to say first of images that are not of one camera and one wall, or not of it."""
     if disagreement is not None:
         much = f"{disagreement:.1f} times as much as those of the calibration"
-        return f"Doubtful frames: they disagree {much}: two cameras, wrong poses, or bent walls?"
+        return f"Doubtful frames: they disagree {much}: two cameras, bent walls, or wrong poses?"
     # Warming up makes as much as other errors of a camera.
     if abs(offset) <= max(CAMERA, half_width):
         return None

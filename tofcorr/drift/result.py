@@ -5,12 +5,13 @@ from typing import Any, Literal
 
 from tofcorr.digits import known, known_interval
 from tofcorr.drift.offset import ImageDrift, Wall
+from tofcorr.plausibility.finding import in_words
 
 Verdict = Literal["holds", "drifted", "undecided"]
 
 _VERDICTS = {
     "holds": "The calibration holds.",
-    "drifted": "The camera has drifted: calibrate anew.",
+    "drifted": "The camera has drifted, if the wall is as --wall takes it: calibrate anew.",
     "undecided": "Undecided: these frames neither show a drift nor exclude one.",
 }
 
@@ -34,6 +35,7 @@ class DriftResult:
             interval takes it as right.
         headline: What makes the frames doubtful, one sentence; None: nothing.
         unlike: Share of the images whose view of the wall is unlike any that was calibrated.
+        unused: Numbers of the frames with too few usable pixels.
     """
 
     verdict: Verdict
@@ -47,6 +49,7 @@ class DriftResult:
     form_is_known: bool = True
     headline: str | None = None
     unlike: float = 0.0
+    unused: tuple[int, ...] = ()
 
     def __repr__(self) -> str:
         """Return the verdict and its numbers in a few sentences."""
@@ -63,6 +66,7 @@ class DriftResult:
             f"Its distances are {offset} mm off, compared with the calibration (positive: too far; "
             f"95 % interval {low} to {high} mm; threshold {1e3 * self.threshold:g} mm).",
             f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",
+            self.unused and f"Not used, with too few usable pixels: {in_words(self.unused)}.",
             # Some are expected: the ranges are the central 99.8 % of the training pixels.
             self.outside > 1 / 10
             and f"{100 * self.outside:.0f} % of the pixels, outside the ranges, were not used.",
@@ -90,6 +94,7 @@ class DriftResult:
             "flatness_mm": 1e3 * self.flatness,
             "outside_calibrated_range": self.outside,
             "unlike_calibrated_views": self.unlike,
+            "unused_frames": list(self.unused),
             "images": [
                 {"frame": frame, "flatness_mm": 1e3 * flatness, "pixels": pixels}
                 for frame, flatness, pixels in self.images

@@ -127,16 +127,13 @@ class Direction(NamedTuple):
             undetermined.
         shares: The unknowns of the largest components, largest first, with their components.
         correlation: Of the two unknowns of the largest components; None: it is one unknown.
+        is_undetermined: Whether the images say less about it than a prior of 100 mm and 100 mrad.
     """
 
     sigma: float
     shares: dict[str, float]
     correlation: float | None
-
-    @property
-    def is_undetermined(self) -> bool:
-        """Whether the images say less about it than a prior of 100 mm and 100 mrad."""
-        return self.sigma**2 > PRIOR_SIGMA**2 / 2  # Half of the variance is then the prior's.
+    is_undetermined: bool
 
     def in_words(self) -> str:
         """Return the direction's name, such as `c0 and t_z together (corr +0.99)`."""
@@ -214,7 +211,9 @@ def observability(
         shares = named_components(vectors[:, k], names)
         first = [names.index(name) for name in list(shares)[:2]]
         both = float(correlation[first[0], first[1]]) if len(first) > 1 else None
-        return Direction(float(variances[k]) ** 0.5, shares, both)
+        # Half of the variance is then the prior's.
+        undetermined = 2 * float(variances[k]) > PRIOR_SIGMA**2
+        return Direction(float(variances[k]) ** 0.5, shares, both, undetermined)
 
     return Observability(
         [direction(k) for k in range(len(names))], pairs, posterior, vectors, precision, variance
@@ -269,3 +268,13 @@ def prior_on_undetermined(found: Observability, guess: Parameters) -> Prior | No
     factor = found.vectors[:, rows].T.contiguous() / PRIOR_SIGMA
     names = [found.directions[k].in_words() for k in rows]
     return Prior(guess, factor, found.variance, names)
+
+
+def worst_sigma(covariance: Tensor) -> float:
+    """Return the largest standard deviation of any direction, metres or radians."""
+    return float(torch.linalg.eigvalsh(covariance)[-1].clamp(min=0).sqrt())
+
+
+def worst_axes(covariance: Tensor) -> tuple[float, float]:
+    """Return those of the translation (m) and of the rotation (rad) of a hand-eye transform."""
+    return worst_sigma(covariance[:3, :3]), worst_sigma(covariance[3:6, 3:6])

@@ -274,7 +274,7 @@ def _shifts(seen: MisfitPixels, fit: Fit, tried: Probes, beside: Probes) -> list
 
 
 def assumptions(seen: MisfitPixels, fit: Fit) -> tuple[Shift, ...]:
-    """Return what errors of the intrinsics and of measured planes would do.
+    """Return what errors of the intrinsics, of measured planes and of the robot's lengths would do.
 
     Args:
         seen: Some pixels beside the fitted model.
@@ -295,6 +295,11 @@ def assumptions(seen: MisfitPixels, fit: Fit) -> tuple[Shift, ...]:
     }
     # A single ray is where the hand-eye transform puts it, whatever the lens.
     errors = {} if fit.domain.height * fit.domain.width == 1 else lens
+    # Poses and planes 1 % longer: the points in the tool frame should be farther from its origin.
+    camera = fit.solution.parameters.tool_from_camera
+    from_tool = seen.linear.points + camera[:3, :3].T @ camera[:3, 3]
+    of_scale = -(from_tool * seen.linear.normal).sum(dim=1) / 100
+    errors["robot_scale"] = "robot's lengths 1 % longer", of_scale
     if not seen.walls_estimated:
         errors["plane_offset"] = ("d of all planes 1 mm larger", one / 1000)
         errors["plane_tilt"] = ("all planes turned by 0.1 deg", math.radians(1 / 10) * seen.on_wall)

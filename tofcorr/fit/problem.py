@@ -14,7 +14,13 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import Design
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, Prior
+from tofcorr.estimation.moments import (
+    HAND_EYE_SYMBOLS,
+    ImageMoments,
+    MomentObjective,
+    Parameters,
+    Prior,
+)
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.planes import Walls
 from tofcorr.estimation.robust import RobustLoss
@@ -25,7 +31,7 @@ from tofcorr.estimation.solvers import (
     initial_parameters,
     with_linear_part,
 )
-from tofcorr.estimation.uncertainty import Covariance, Observability
+from tofcorr.estimation.uncertainty import Covariance, Direction, Observability, worst_axes
 from tofcorr.fit.walls import FoundWalls
 from tofcorr.fit.weighting import PixelWeights
 from tofcorr.options import Options
@@ -341,15 +347,13 @@ class Fit(Core):
     misfit: Shift | None = None
     assumptions: tuple[Shift, ...] = ()
 
-    @property
-    def unseen(self) -> list[int]:
-        """Numbers of the directions that a sensor of one ray shows from no pose.
+    def is_unseen(self, one: Direction) -> bool:
+        """Return whether a sensor of one ray shows a direction from no pose.
 
         A turn about the ray changes no distance, and a shift along it is a constant error.
         """
         along = {"t_z", "w_z", "c0"} if self.domain.height * self.domain.width == 1 else set()
-        every = enumerate(self.observability.directions)
-        return [k for k, one in every if one.is_undetermined and set(one.shares) <= along]
+        return one.is_undetermined and set(one.shares) <= along
 
     @property
     def gain(self) -> float:
@@ -367,6 +371,19 @@ class Fit(Core):
         return float(with_measured @ corrected / with_measured[0])
 
     @property
+    def directions(self) -> list[Direction]:
+        """Every direction of `observability` with its standard error, the weakest first.
+
+        By `hand_eye_covariance`, as in every table and export: what speaks of errors asks here.
+        """
+        matrix, vectors = self.covariance.matrix.clone(), self.observability.vectors
+        if self.solution.parameters.hand_eye_is_free:
+            matrix[:6, :6] = self.hand_eye_covariance
+        errors = (vectors * (matrix @ vectors)).sum(dim=0).clamp(min=0).sqrt().tolist()
+        both = zip(self.observability.directions, errors, strict=True)
+        return sorted((one._replace(sigma=k) for one, k in both), key=lambda one: -one.sigma)
+
+    @property
     def hand_eye_covariance(self) -> Tensor:
         """Mean square error of the hand-eye transform, shape (6, 6).
 
@@ -377,3 +394,11 @@ class Fit(Core):
         for one in (self.noise_shift, self.misfit):
             matrix = matrix if one is None else matrix + torch.outer(one.left, one.left)
         return matrix
+
+    @property
+    def hand_eye_errors(self) -> tuple[float, float]:
+        """Largest standard errors of shift and turn that poses can show, metres and radians."""
+        hidden = [one.shares for one in self.observability.directions if self.is_unseen(one)]
+        seen = [float(all(name not in one for one in hidden)) for name in HAND_EYE_SYMBOLS]
+        shown = torch.tensor(seen, dtype=torch.float64)
+        return worst_axes(self.hand_eye_covariance * shown[:, None] * shown)

@@ -235,22 +235,25 @@ class PosedImport:
         if before <= most or self._source.targets is not None:
             return []
         left = {}
-        for said, misfit in self._mistakes_undone(chosen):
-            left[said] = misfit
-            if misfit <= FAR_BETTER * most:
+        for said, misfit, unit in self._mistakes_undone(chosen):
+            # Distances that are shorter have smaller misfits: what counts is their share of them.
+            left[said] = misfit / (1 if given is None else unit), misfit
+            if left[said][0] <= FAR_BETTER * most:
                 break
         best = min(left, key=left.__getitem__)
-        if left[best] <= FAR_BETTER * before:
+        if left[best][0] <= FAR_BETTER * before:
             said = f"{origin}: Walls are off by {before:.0f} mm as given"
-            raise CalibrationDataError(f"{said}, and by {left[best]:.0f} mm if {best}")
+            raise CalibrationDataError(f"{said}, and by {left[best][1]:.0f} mm if {best}")
         if given is None:
             return []
         seeing = f"{len(np.unique(given.image))} of {len(chosen.images)} images show a wall"
         off = f"planes are off by {before:.0f} mm, up to {most:.0f} are expected"
         return [f"{seeing}, and {off}. Do images and poses belong together?"]
 
-    def _mistakes_undone(self, chosen: Chosen) -> Iterator[tuple[str, float]]:
-        """Yield each usual mistake, with advice, and the misfit that it leaves when undone.
+    def _mistakes_undone(self, chosen: Chosen) -> Iterator[tuple[str, float, float]]:
+        """Yield each usual mistake, with advice, the misfit that it leaves when undone, its factor.
+
+        The factor, 1 at most, is by how much distances are shorter then.
 
         A unit is not tried in which the tool moves less, or the camera sees less far, than errors
         of a camera: any planes then coincide.
@@ -258,19 +261,20 @@ class PosedImport:
         listed = [IN_POSES[name] for name in _OF_POSES]
         for cause, advice, undo in listed if self._changes is None else listed[:4]:
             if np.ptp(undo(chosen.world_from_tool)[:, :3, 3], axis=0).max() >= CAMERA:
-                yield f"{cause}: {advice}.", self._misfit(chosen, undo)
-        cause, advice, mirrored = IN_IMAGES["mirrored"]
-        yield f"{cause}: {advice}.", self._misfit(chosen, depth=mirrored)
+                yield f"{cause}: {advice}.", self._misfit(chosen, undo), 1.0
+        cause, advice, mirrored = IN_IMAGES["mirrored left to right"]
+        yield f"{cause}: {advice}.", self._misfit(chosen, depth=mirrored), 1.0
         first = self._images.read(int(chosen.images[0])).depth
         for factor in (1 / 1000, 1 / 10, 10, 1000):
             said = f"all distances are multiplied by {factor:g}: is --depth-unit-mm right?"
             if factor * np.ma.median(np.ma.masked_invalid(first)) >= FAR_OFF:
-                yield said, self._misfit(chosen, depth=lambda metres, k=factor: k * metres)
+                left = self._misfit(chosen, depth=lambda metres, k=factor: k * metres)
+                yield said, left, min(factor, 1.0)
         for late in far_lags(self._track, *self._changes) if self._changes else ():
             said = f"images are {abs(late):.1f} s {'late' if late > 0 else 'early'}"
             with suppress(CalibrationDataError):
                 left = self._misfit(self._choose(Lag(seconds=late)))
-                yield f"{said}: add --time-offset-s {-late:.1f}.", left
+                yield f"{said}: add --time-offset-s {-late:.1f}.", left, 1.0
 
     def _misfit(
         self,

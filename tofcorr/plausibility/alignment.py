@@ -163,6 +163,7 @@ class Alignment:
         slope: Error in proportion to the distance, without unit.
         rms: Root mean square distance of each frame's points to its plane, shape (F,), metres.
         angle: Between a frame's own plane and the recorded one, shape (F,), radians; NaN: unknown.
+        distance: The median one of the points, metres.
     """
 
     hand_eye: np.ndarray
@@ -170,6 +171,7 @@ class Alignment:
     slope: float
     rms: np.ndarray
     angle: np.ndarray
+    distance: float
 
     @property
     def misfit(self) -> float:
@@ -183,6 +185,12 @@ class Alignment:
         Points of another surface may lie parallel to the target: then only the constant shows it.
         """
         return self.misfit + max(abs(self.constant) - LARGE_CONSTANT, 0.0) / 10
+
+    @property
+    def relative(self) -> float:
+        """Misfit, and a tenth of constant and slope, as shares of the distance: in any unit."""
+        off = self.misfit + abs(self.constant) / 10
+        return max(off, LEAST_RESIDUAL) / self.distance + abs(self.slope) / 10
 
     @property
     def typical_angle(self) -> float:
@@ -203,7 +211,8 @@ def _judged(scene: Scene, moments: ImageMoments, at: Parameters) -> Alignment:
     cosine = (scene.own_normal * normal).sum(1).clip(-1, 1)
     angle = np.where(scene.known, np.arccos(cosine), np.nan)
     constant, slope = at.coefficients.tolist()
-    return Alignment(at.tool_from_camera.numpy(), constant, slope, rms, angle)
+    distance = float(np.nanmedian(scene.distance))
+    return Alignment(at.tool_from_camera.numpy(), constant, slope, rms, angle, distance)
 
 
 def align(scene: Scene, walls: Walls | None = None) -> Alignment:

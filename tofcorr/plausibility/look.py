@@ -83,13 +83,16 @@ def _off_neighbours(
 def _noise_of(differences: np.ndarray) -> tuple[float, float]:
     """Return a pixel's noise by second differences of neighbours, metres: robust, and as an RMS.
 
-    Where they differ by more than errors of a camera, one of them is garbage.
+    Where they differ by more than errors of a camera, and ten times as much as usual, one of them
+    is garbage: a dark pixel has ten times the noise.
     """
-    differences = differences[np.abs(differences) < LARGE_CONSTANT]
+    differences = np.abs(differences[np.isfinite(differences)])
     if not len(differences):
         return np.nan, np.nan
+    usual = float(np.median(differences))
+    differences = differences[differences < max(LARGE_CONSTANT, 10 * usual)]
     # A second difference of independent values has six times their variance.
-    noise = sigma_from_mad(float(np.median(np.abs(differences)))) / 6**0.5
+    noise = sigma_from_mad(float(np.median(differences))) / 6**0.5
     return noise, float((np.mean(differences**2) / 6) ** 0.5)
 
 

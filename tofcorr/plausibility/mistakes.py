@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tofcorr.estimation.robust import LEVEL, f_tail
 from tofcorr.plausibility.alignment import Alignment, Scene, align_with_free_walls
 from tofcorr.plausibility.finding import CAMERA, FAR_OFF, SPOILS
 from tofcorr.plausibility.look import Look
@@ -64,7 +65,7 @@ _AXES = {
     "x and y exchanged": np.eye(4)[[1, 0, 2, 3]],
     "x and z exchanged": np.eye(4)[[2, 1, 0, 3]],
 }
-_DRIVER = "undo the driver's flip before writing"
+_DRIVER = "undo that before writing"
 _INVERSE = "the poses are tool_from_world, the inverse of what the format asks for"
 _ORDER = "the quaternions are stored as w, x, y, z"
 _TURNED = "the rotations are inverted and the translations are not"
@@ -101,13 +102,19 @@ IN_POSES: dict[str, Mistake] = {
 }
 """Mistakes in poses (N, 4, 4) by name, the likely ones first."""
 IN_IMAGES: dict[str, Mistake] = {
-    "mirrored": Mistake("the images are mirrored left to right", _DRIVER, np.fliplr),
-    "upside down": Mistake("the images are turned upside down", _DRIVER, np.flipud),
-    "transposed": Mistake(
-        "the images are transposed", "transpose them before writing", np.transpose
-    ),
+    words: Mistake(f"the images are {words}", _DRIVER, undo)
+    for words, undo in (
+        ("mirrored left to right", np.fliplr),
+        ("turned upside down", np.flipud),
+        ("transposed", np.transpose),
+        ("mirrored along a diagonal", lambda image: np.rot90(image, 2).T),
+        ("turned to the right", np.rot90),
+        ("turned by half a turn", partial(np.rot90, k=2)),
+        ("turned to the left", partial(np.rot90, k=3)),
+    )
 }
-"""The same in images (H, W), whatever their pixels hold. Each undoes itself."""
+"""The same in images (H, W), whatever their pixels hold: all symmetries of a square. Where a robot
+moves the camera, its hand-eye transform holds a mere turn."""
 IN_DEPTH: dict[str, Mistake] = {
     f"in {unit}": Mistake(f"the depth is in {unit}", "write metres", partial(np.multiply, factor))
     for unit, factor in (("feet", 0.3048), *_UNITS.items())
@@ -123,19 +130,25 @@ def best_explanations(look: Look) -> list[Explanation]:
     """Return the explanations that are about as good as the best and far better than none.
 
     They leave no more than errors of a camera, or the noise of its walls, and take off what spoils
-    a fit. Of several, the first listed that comes near the best is named: within four thirds.
+    a fit. What is compared is a share of the distances: a unit that makes all of them short makes
+    every misfit small. Of several, the first listed that comes near the best is named: within four
+    thirds; one that frees unknowns comes last.
     """
-    given = look.given
-    most = min(FAR_BETTER * given.badness, max(CAMERA, 4 * look.flatness))
+    # Of as many guesses none is that much better by chance; a frame tells three numbers, of which
+    # an alignment takes eight.
+    given, tried, freedom = look.given, list(explanations(look)), 3 * len(look.given.rms) - 8
     better = [
-        (cause, advice, found, frees)
-        for cause, advice, found, frees in explanations(look)
-        if found.badness <= most
-        and given.badness - found.badness > SPOILS
-        and (not frees or found.misfit <= FAR_BETTER * given.misfit)
+        one
+        for one in tried
+        if (found := one[2]).badness <= min(given.badness - SPOILS, max(CAMERA, 4 * look.noise))
+        and found.relative <= FAR_BETTER * given.relative
+        and (not one[3] or found.misfit <= FAR_BETTER * given.misfit)
+        and len(tried) * f_tail((given.relative / found.relative) ** 2, freedom, freedom) < LEVEL
     ]
-    least = min((found.badness for *_, found, _ in better), default=0.0)
-    return [one for one in better if 3 * one[2].badness <= 4 * least]
+    least = min((one[2].relative for one in better), default=0.0)
+    return sorted(
+        (one for one in better if 3 * one[2].relative <= 4 * least), key=lambda one: one[3]
+    )
 
 
 def explanations(look: Look) -> Iterator[Explanation]:

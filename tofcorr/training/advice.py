@@ -22,7 +22,12 @@ from tofcorr.errors import ConfigError
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
-from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance
+from tofcorr.estimation.uncertainty import (
+    PRIOR_SIGMA,
+    posterior_covariance,
+    worst_axes,
+    worst_sigma,
+)
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
@@ -31,8 +36,6 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.support import (
     ENOUGH_REFLECTIVITY,
     sample_reflectivity,
-    worst_axes,
-    worst_sigma,
 )
 
 # Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
@@ -351,7 +354,7 @@ def advise(
         moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
     added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
     # What no pose shows is not what further poses are for.
-    shown = [k for k in range(len(added[0])) if k not in fit.unseen]
+    shown = [k for k, one in enumerate(fit.observability.directions) if not fit.is_unseen(one)]
     basis = fit.observability.vectors[:, shown]
     precision, added = (basis.T @ each @ basis for each in (fit.observability.precision, added))
     order, covariances = choose_views(precision, added, number)
@@ -366,8 +369,9 @@ def advise(
         }
         for k, sigma in zip(order, worst[1:], strict=True)
     ]
-    direction = fit.observability.directions[shown[0]].in_words()
-    return order, {"direction": direction, "worst_sigma_mm_or_mrad": worst[0], "poses": poses}
+    weakest = next(one for one in fit.directions if not fit.is_unseen(one))
+    now = {"direction": weakest.in_words(), "sigma_mm_or_mrad": 1e3 * weakest.sigma}
+    return order, {**now, "worst_sigma_mm_or_mrad": worst[0], "poses": poses}
 
 
 def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[list[int], Tensor]:

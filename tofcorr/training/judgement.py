@@ -5,16 +5,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-import torch
 
-from tofcorr.estimation.moments import HAND_EYE_SYMBOLS
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.sample import MaskOptions
-from tofcorr.plausibility.finding import FAR_OFF, Inspection, in_words
+from tofcorr.plausibility.finding import FAR_OFF, SPOILS, Inspection, in_words
+from tofcorr.plausibility.look import Look
 from tofcorr.training.calibration import TrainingOptions
-from tofcorr.training.support import Support, shortcomings, worst_axes
+from tofcorr.training.support import Support, shortcomings
 
 Training = TypeVar("Training", bound=TrainingOptions)
 Verdict = Literal["good", "usable", "do not use"]
@@ -28,7 +27,8 @@ _VERDICTS: tuple[Verdict, ...] = (DO_NOT_USE, "usable", "good")
 _WEAK = 5e-3
 # Held-out over fitted error above which a model is too large; and held-out error over that of the
 # hand-eye alone from which the correction makes things worse, a twentieth being within the chance
-# of a split, or gains nothing. A camera without errors reaches the noise with the hand-eye alone.
+# of a split, or gains nothing. A camera without errors reaches the noise with the hand-eye alone:
+# what is beyond says that poses or planes are wrong.
 _OVERFITTED, _WORSE, _NO_GAIN = 1.5, 1.05, 0.95
 
 
@@ -67,11 +67,16 @@ def frames_left_out(inspection: Inspection, training: Iterable[np.ndarray]) -> t
 
 def left_out_words(frames: Sequence[int]) -> list[str]:
     """Return one sentence about frames left out; none if there is none."""
-    if not frames:
-        return []
-    verb = "is" if len(frames) == 1 else "are"
-    which = f"{in_words(tuple(frames)).capitalize()} {verb} left out of all fits and errors"
-    return [f"{which}: poses, planes or images disagree with all others."]
+    which = f"{in_words([*frames]).capitalize()} {'is' if len(frames) == 1 else 'are'} left out of"
+    said = f"{which} all fits and errors: poses, planes or images disagree with all others."
+    return [said] if frames else []
+
+
+def outlying_words(images: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return one sentence about the images that fit much worse than the others; none if none do."""
+    worst = ", ".join(f"{one['rms_mm']:.1f}" for one in images[:5])
+    named = in_words([one["frame"] for one in images]).capitalize()
+    return [f"{named}: the fit is much worse than elsewhere, {worst} mm RMS."] if images else []
 
 
 def left_out_mapping(frames: Iterable[int], inspection: Inspection) -> list[dict[str, Any]]:
@@ -94,12 +99,13 @@ def judge(
         support: What the fitted frames cover.
         inspection: What was odd about the recordings; its noise of a pixel is the floor.
     """
-    free = fit.solution.parameters.hand_eye_is_free
+    free = _is_free(fit)
     with_intensity = fit.model.error.needs_amplitude()
-    said = [*_of_errors(fit, errors, 1e3 * inspection.look.noise), *_of_directions(fit)]
+    said = [*_of_errors(fit, errors, inspection.look), *_of_directions(fit)]
     for serious, one in shortcomings(support, moves=free, with_intensity=with_intensity):
         said.append(("usable" if serious else "good", one))
-    if beyond := beyond_noise(errors["after"]["test"]["rms"], 1e3 * inspection.look.noise_rms):
+    noise = 1e3 * inspection.look.noise_rms
+    if beyond := beyond_noise(errors["after"]["test"]["rms"], noise, moves=free):
         said.append(("usable", beyond))
     # From n images a standard error is known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
     if (images := len(fit.moments.gram)) < 10:
@@ -108,45 +114,62 @@ def judge(
         said.append(("good", fit.residual))
     if support.roll_deg is None:
         said.append(("good", "No robot moves: the hand-eye transform is held at the identity."))
-    odd: list[tuple[Verdict, str]] = [
-        (DO_NOT_USE, one.sentence)
-        for one in inspection.findings
-        if one.spoils or one.severity == "impossible"
-    ]
+    spoilt = [one for one in inspection.findings if one.spoils or one.severity == "impossible"]
+    odd: list[tuple[Verdict, str]] = [(DO_NOT_USE, one.sentence) for one in spoilt]
     if inspection.headline:
         odd.append(("usable", inspection.headline))
-    known = f"the hand-eye transform is determined to {1e3 * _WEAK:g} mm and mrad"
-    if all(one.sigma <= _WEAK for one in fit.observability.directions):
-        known = "every direction is determined"
-    known += ", but for what one ray does not show" if fit.unseen else ""
     first = dict(reversed([*odd, *said]))
-    first["good"] = f"{_measured(errors, 1e3 * inspection.look.noise)}, and {known}."
+    first["good"] = expected(fit, errors, inspection)
     verdict: Verdict = min(first, key=_VERDICTS.index)
     return verdict, first[verdict], [sentence for _, sentence in said]
 
 
-def _measured(errors: Mapping[str, Any], noise: float) -> str:
+def expected(fit: Fit, errors: Mapping[str, Any], inspection: Inspection) -> str:
+    """Return the error to expect in use: of held-out frames, and of the hand-eye transform.
+
+    Arguments are those of `judge`.
+    """
+    known = f", and the hand-eye is known to {_known(fit)}." if _is_free(fit) else "."
+    return f"{_measured(fit, errors, inspection.look)}{known}"
+
+
+def _is_free(fit: Fit) -> bool:
+    return fit.solution.parameters.hand_eye_is_free
+
+
+def _known(fit: Fit) -> str:
+    shift, turn = fit.hand_eye_errors
+    return f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad"
+
+
+def _measured(fit: Fit, errors: Mapping[str, Any], look: Look) -> str:
     """Return how far held-out frames are off, compared with the hand-eye alone and with noise."""
     held_out, bare = (errors[stage]["test"]["rms"] for stage in ("after", "hand_eye_only"))
     if held_out is None:
         return "No frame was held out: the errors given are those of the fit itself"
-    compared = f"{bare:.1f} mm with the hand-eye alone"
-    compared += f", {noise:.1f} mm noise of a pixel" if math.isfinite(noise) else ""
+    alone = "with the hand-eye alone" if _is_free(fit) else "without correction"
+    compared = f"{bare:.1f} mm {alone}"
+    compared += f", {1e3 * look.noise:.1f} mm noise of a pixel" if look.noise > 0 else ""
     return f"Held-out frames are off by {held_out:.1f} mm RMS ({compared})"
 
 
-def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tuple[Verdict, str]]:
+def _of_errors(fit: Fit, errors: Mapping[str, Any], look: Look) -> Iterator[tuple[Verdict, str]]:
     """Yield what the errors say of a fit.
 
     Args:
         fit: The fitted model.
         errors: The `error_mm` of the report.
-        noise: Of a pixel, millimetres; NaN: unknown.
+        look: What the recordings look like.
     """
+    noise, measured = 1e3 * look.noise, _measured(fit, errors, look)
     halves = ("after", "train"), ("after", "test"), ("hand_eye_only", "test")
     found = [errors[stage][half]["rms"] for stage, half in halves]
     fitted, held_out, bare = (math.nan if one is None else one for one in found)
-    error, measured = fitted if math.isnan(held_out) else held_out, _measured(errors, noise)
+    # Of all pixels to planes of their own frames, which no pose and no recorded plane changes.
+    own = look.scene.off_by[look.scene.known]
+    flat = 1e3 * float(np.sqrt(np.nanmean(np.square(own)))) if own.size else math.nan
+    least = min(3 * flat, math.hypot(flat, 1e3 * SPOILS))
+    error = fitted if math.isnan(held_out) else held_out
     if fit.solution.stopped == "not_finite":
         smaller = "Choose a smaller model, or see `tofcorr inspect`."
         yield DO_NOT_USE, f"{fit.solution.message} {smaller}"
@@ -161,8 +184,9 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
         yield DO_NOT_USE, f"{left}: too few different frames."
     if held_out > _WORSE * bare:
         yield DO_NOT_USE, f"{measured}: the depth correction makes them worse."
-    elif held_out > _NO_GAIN * bare and held_out > 3 * noise:
-        yield DO_NOT_USE, f"{measured}: the correction gains nothing, so poses or planes are wrong."
+    elif held_out > max(_NO_GAIN * bare, least) and beyond_noise(held_out, flat):
+        why = f"nothing is gained. Frames are flat to {flat:.1f} mm: poses or planes are wrong"
+        yield DO_NOT_USE, f"{measured}: {why}."
     # No application bears 30 mm, the raw error of most cameras, or eight times the noise.
     if error > max(30, 8 * noise):
         off = f"Frames are off by {error:.0f} mm RMS after the fit"
@@ -173,46 +197,42 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], noise: float) -> Iterator[tu
         own = f"much more than the {fitted:.1f} mm of the fit itself"
         yield "usable", f"{measured}, {own}: record more views, or choose a smaller model."
     elif bare < held_out <= _WORSE * bare:
-        yield "good", f"{measured}: the hand-eye transform is enough for this camera."
+        yield "good", f"{measured}: the depth correction gains nothing."
 
 
 def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
     """Yield what a fit lacks, and in what it is uncertain: the three weakest directions by name."""
-    solution, free = fit.solution, fit.solution.parameters.hand_eye_is_free
+    solution, free = fit.solution, _is_free(fit)
     if fit.misfit is not None:
         yield "usable" if max(fit.misfit.size) > _WEAK else "good", fit.misfit.lacking()
     if not solution.converged and solution.stopped != "not_finite":
         yield "usable", solution.message
+    if free and max(fit.hand_eye_errors) > _WEAK:
+        yield (
+            "usable",
+            f"The hand-eye is known to {_known(fit)} only: record more tilts and distances.",
+        )
     wide, of_pose = 1e3 * PRIOR_SIGMA, "usable" if free else "good"
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
-    every, unseen = fit.observability.directions, fit.unseen
-    weak = [one for k, one in enumerate(every) if one.sigma > _WEAK and k not in unseen]
+    weak = [one for one in fit.directions if one.sigma > _WEAK and not fit.is_unseen(one)]
     of_curves = [one.sigma for one in weak if len(one.shares) > 1 and set(one.shares) <= curves]
     others = [one for one in weak if not set(one.shares) <= curves]
     held = f"a prior of {wide:g} mm and {wide:g} mrad is used"
     if undetermined := [one.in_words() for one in others if one.is_undetermined]:
         lacking = f"{'; '.join(undetermined)}: {held}"
         yield of_pose, f"The images do not determine {lacking}. Record more tilts and distances."
-    if hidden := [every[k].in_words() for k in unseen]:
+    if hidden := [one.in_words() for one in fit.directions if fit.is_unseen(one)]:
         yield "good", f"From no pose does one ray show {'; '.join(hidden)}: {held}."
     if uncertain := [one for one in others if not one.is_undetermined]:
-        of_hand_eye = any(name.startswith(("t_", "w_")) for one in uncertain for name in one.shares)
         words = "; ".join(f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in uncertain[:3])
         count = f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad)"
-        yield of_pose if of_hand_eye else "good", f"{count}: {words}."
-    if free:
-        unknown = {name for k in unseen for name in every[k].shares}
-        seen = torch.tensor([float(name not in unknown) for name in HAND_EYE_SYMBOLS])
-        shift, turn = worst_axes(fit.hand_eye_covariance * seen[:, None] * seen)
-        if max(shift, turn) > _WEAK:
-            size = f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only"
-            yield "usable", f"The hand-eye is known to {size}: record more tilts and distances."
+        yield "good", f"{count}: {words}."
     if of_curves:
         size = f"their standard deviations reach {1e3 * max(of_curves):.0f} mm"
         yield "good", f"Parts of the curves are set by the smoothing penalty, not by data: {size}."
 
 
-def beyond_noise(held_out: float | None, noise: float) -> str | None:
+def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) -> str | None:
     """Return one sentence about an error that neither the model nor noise explains; None: small.
 
     Poses of an ordinary robot scatter by less than 1.5 mm, and edges raise the noise by a tenth:
@@ -221,12 +241,14 @@ def beyond_noise(held_out: float | None, noise: float) -> str | None:
     Args:
         held_out: RMS error of held-out frames, millimetres; None: no frame was held out.
         noise: Noise of their pixels, root mean square, millimetres; NaN: unknown.
+        moves: Whether a robot moves the camera.
     """
     beyond = math.sqrt(max((held_out or 0.0) ** 2 - noise**2, 0.0))
     if not beyond > max(1.5, 0.6 * noise):
         return None
     off = f"Held-out frames are off by {beyond:.1f} mm beyond the noise of their pixels"
-    return f"{off}: poses scatter, or the model lacks a term; `tofcorr diagnose` tells which."
+    off = f"{off}: {'poses' if moves else 'planes'} scatter, or the model lacks a term"
+    return f"{off}; `tofcorr diagnose` tells which."
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -247,19 +269,32 @@ def report_text(report: Mapping[str, Any]) -> str:
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
     if advice := report["advice"]:
-        largest = f"{advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad)"
-        lines.append(f"The largest standard error is {largest}, of {advice['direction']}.")
-        lines[-1] += " To lower it, add:"
+        largest = f"{advice['sigma_mm_or_mrad']:.2f} mm (or mrad), of {advice['direction']}"
+        expects = advice["worst_sigma_mm_or_mrad"]
+        lines.append(f"The largest standard error is {largest}. To lower it, add:")
         lines += [
             f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
-            f"deg, rolled by {pose['roll_by_deg']:+.0f}: then {pose['worst_sigma_mm_or_mrad']:.2f}"
+            f"deg, rolled by {pose['roll_by_deg']:+.0f}: lower by "
+            f"{100 - 100 * pose['worst_sigma_mm_or_mrad'] / expects:.0f} %"
             for pose in advice["poses"]
         ]
+    lines += left_out_words([one["frame"] for one in report["left_out"]])
+    lines += outlying_words(report["outlying_images"])
     found = [warning for warning in report["warnings"] if warning != report["reason"]]
     lines += [f"Warning: {warning}" for warning in found[:5]]
     if len(found) > 5:
         lines.append(f"{len(found) - 5} more warnings are in report.json.")
-    return "\n".join([*lines, f"Verdict: {report['verdict']}. {report['reason']}"])
+    return "\n".join([*lines, verdict_text(report)])
+
+
+def verdict_text(report: Mapping[str, Any]) -> str:
+    """Return verdict, what decides it, and the error to expect in use.
+
+    Args:
+        report: The content of report.json; older ones lack `expected`.
+    """
+    said, expects = f"Verdict: {report['verdict']}. {report['reason']}", report.get("expected", "")
+    return said if expects in said else f"{said} {expects}"
 
 
 def _hand_eye_lines(report: Mapping[str, Any]) -> Iterator[str]:

@@ -20,7 +20,7 @@ from tofcorr.pixels.passes import FrameErrors
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import Calibration, TrainingOptions
-from tofcorr.training.judgement import judge, left_out_mapping
+from tofcorr.training.judgement import expected, judge, left_out_mapping
 from tofcorr.training.support import Support
 from tofcorr.version import __version__
 
@@ -131,11 +131,8 @@ def training_report(
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
     verdict, reason, found = judge(fit, errors, support, inspection)
     rms = np.sqrt(after.squared / np.maximum(after.count, 1))
-    advice, pool = None, None
-    if options.advice:
-        pool = draw_pool(data, calibration.train, fit, np.random.default_rng(seed))
-    if pool is not None:
-        _, advice = advise(data, pool, fit, options.advice)
+    random = np.random.default_rng(seed)
+    pool = draw_pool(data, calibration.train, fit, random) if options.advice else None
     return {
         "format": "tofcorr-report",
         "version": 1,
@@ -145,6 +142,7 @@ def training_report(
         "message": solution.message,
         "verdict": verdict,
         "reason": reason,
+        "expected": expected(fit, errors, inspection),
         "headline": inspection.headline,
         "iterations": solution.iterations,
         "hand_eye": hand_eye_summary(fit, data.first.frame_names),
@@ -154,9 +152,8 @@ def training_report(
             {"name": one.cause, "error": one.words, **one.to_mapping(hand_eye[:3, :3])}
             for one in fit.assumptions
         ],
-        "misfit": None
-        if (lacking := fit.misfit) is None
-        else {
+        "misfit": (lacking := fit.misfit)
+        and {
             "probe": lacking.cause,
             "residuals": lacking.words,
             "p_value": lacking.p_value,
@@ -167,7 +164,7 @@ def training_report(
         "walls": None if fit.walls is None else fit.walls.summary(),
         "outlying_images": outlying_images(after.frames, rms),
         "observability": observability_summary(fit, support),
-        "advice": advice,
+        "advice": None if pool is None else advise(data, pool, fit, options.advice)[1],
         "plausibility": [one.to_mapping() for one in inspection.findings],
         "warnings": [*found, *inspection.notes],
     }
@@ -177,13 +174,12 @@ def error_summary(
     errors: Mapping[str, FrameErrors], train: np.ndarray, test: np.ndarray
 ) -> dict[str, Any]:
     """Return mean absolute and RMS error of each stage on both halves; null on an empty half."""
+    halves = {"train": train, "test": test}.items()
+    kinds = {"mean_abs": FrameErrors.mean_abs_mm, "rms": FrameErrors.rms_mm}.items()
     return {
         stage: {
-            half: {
-                "mean_abs": number_or_none(measured.mean_abs_mm(frames)),
-                "rms": number_or_none(measured.rms_mm(frames)),
-            }
-            for half, frames in (("train", train), ("test", test))
+            half: {kind: number_or_none(of(measured, own)) for kind, of in kinds}
+            for half, own in halves
         }
         for stage, measured in errors.items()
     }
@@ -199,7 +195,7 @@ def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
                 "free": direction.is_undetermined,
                 "components": direction.shares,
             }
-            for direction in fit.observability.directions[:5]
+            for direction in fit.directions[:5]
         ],
         "confounded": [
             {"first": first, "second": second, "correlation": correlation}
@@ -265,7 +261,7 @@ def coefficient_summary(fit: Fit) -> dict[str, Any]:
         shifted.append(error.paper_coefficients())
     error.set_coefficient_vector(best.coefficients)
 
-    def standard_error(group: str, symbol: str) -> float | None:
+    def error_of(group: str, symbol: str) -> float | None:
         """Return the jackknife's standard error; None if a value is unknown."""
         known = np.array([one[group].get(symbol, np.nan) for one in shifted])
         variance = (len(known) - 1) * np.mean(np.square(known - known.mean()))
@@ -273,10 +269,7 @@ def coefficient_summary(fit: Fit) -> dict[str, Any]:
 
     return {
         group: {
-            symbol: {
-                "value": number_or_none(value),
-                "standard_error": standard_error(group, symbol),
-            }
+            symbol: {"value": number_or_none(value), "standard_error": error_of(group, symbol)}
             for symbol, value in named.items()
         }
         for group, named in values.items()

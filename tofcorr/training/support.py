@@ -97,16 +97,6 @@ def shortcomings(
         yield False, f"The target has one reflectivity {needed}: add a checkerboard or a grey wall."
 
 
-def worst_sigma(covariance: Tensor) -> float:
-    """Return the largest standard deviation of any direction, metres or radians."""
-    return float(torch.linalg.eigvalsh(covariance)[-1].clamp(min=0).sqrt())
-
-
-def worst_axes(covariance: Tensor) -> tuple[float, float]:
-    """Return those of the translation (m) and of the rotation (rad) of a hand-eye transform."""
-    return worst_sigma(covariance[:3, :3]), worst_sigma(covariance[3:6, 3:6])
-
-
 def _roll(world_from_camera: Tensor, normal_world: Tensor) -> Tensor:
     """Return the angle of the camera's x axis in the wall, from a fixed direction of the world."""
     steepest = normal_world.abs().mean(dim=0).argmin()

@@ -38,8 +38,8 @@ def require_parity(correct: Correct, state: CalibrationState, tolerance: float =
     """Refuse an export that does not agree with the float64 model on probing frames.
 
     Raises:
-        ExportError: Depths differ by more than `tolerance` metres, or pixels in validity or in
-            whether they are NaN.
+        ExportError: Depths differ by more than `tolerance` metres, beyond 1 m by more than that
+            share of them, or pixels in validity or in whether they are NaN.
     """
     reference, frames = state.correction(), probe_frames(state)
     depth, amplitude = (frame.double() for frame in frames)
@@ -53,10 +53,12 @@ def require_parity(correct: Correct, state: CalibrationState, tolerance: float =
     lost = corrected.isfinite() != expected.isfinite()
     mistaken = int((lost | ((valid != expected_valid) & ~on_edge)).sum())
     # What is missing on both sides does not differ; what is missing on one was counted.
-    largest = float((corrected.double() - expected).abs().nan_to_num(0.0, 0.0).max())
-    if largest > tolerance or mistaken:
-        said = f"by {largest:.1e} m ({tolerance:.0e} m allowed), and {mistaken} pixels in validity"
-        raise ExportError(f"The export differs from the float64 model {said}; nothing was written.")
+    apart, allowed = (corrected.double() - expected).abs(), tolerance * expected.abs().clamp(min=1)
+    if bool((apart > allowed).any()) or mistaken:
+        largest = float(apart.nan_to_num(0.0, 0.0).max())
+        said = f"by {largest:.1e} m ({tolerance:.0e} allowed), and {mistaken} pixels in validity"
+        why = "Are its amplitudes in one unit (`tofcorr inspect`)? Nothing was written."
+        raise ExportError(f"The export differs from the float64 model {said}. {why}")
 
 
 def _around(

@@ -17,7 +17,7 @@ from tofcorr.geometry.rays import (
     unambiguous_range,
     wrapped,
 )
-from tofcorr.plausibility.alignment import walls_of
+from tofcorr.plausibility.alignment import TINY, walls_of
 from tofcorr.plausibility.finding import (
     CAMERA,
     FAR_OFF,
@@ -209,11 +209,14 @@ _CAMERA = {
 
 
 def _wrong_camera(found: dict[str, Estimate]) -> Finding | None:
-    """Judge K and distortion by estimates of their errors, and say what is most surely wrong."""
+    """Judge K and distortion by estimates of their errors, and say what is most surely wrong.
+
+    What would change a focal length by all of itself is another mistake, such as a mirrored image.
+    """
     surely = {
         name: one.size / one.size_error
         for name, (check, _) in _CAMERA.items()
-        if (one := found[name]).size > max(_LEAST[check], SIGMAS * one.size_error)
+        if 1 > (one := found[name]).size > max(_LEAST[check], SIGMAS * one.size_error)
     }
     if not surely:
         return None
@@ -350,7 +353,8 @@ def _unexplained(look: Look, excess: float) -> Finding:
     others = f", {far} of {len(look.rms)} frames more than {_mm(HOPELESS)}" if far else ""
     severity = "impossible" if excess > HOPELESS else "doubtful"
     said = f"{_misfit(look)}{others}, and no usual mistake explains it"
-    cause = f"poses, planes or depth are of something else, or the poses scatter{hints}"
+    what = "poses, planes or depth" if look.scene.moves else "planes or depth"
+    cause = f"{what} are of something else, or scatter{hints}"
     return Finding(severity, f"{said}: {cause}.", spoils=excess > SPOILS)
 
 
@@ -359,9 +363,10 @@ def _misfit(look: Look) -> str:
     turned = f" and {angle:.0f} degrees" if angle >= 2 else ""
     far = abs(given.constant) > LARGE_CONSTANT
     constant = f", with all distances {1e3 * given.constant:+.0f} mm off" if far else ""
-    lie = f"the points lie {_mm(given.misfit)}{turned} off"
+    aligned = "After the best alignment of the camera the" if look.scene.moves else "The"
+    lie = f"{aligned} points lie {_mm(given.misfit)}{turned} off"
     planes = "walls" if look.planes == "unknown" else "recorded planes"
-    return f"After the best alignment of the camera {lie} the {planes}{constant}"
+    return f"{lie} the {planes}{constant}"
 
 
 def _mm(metres: float) -> str:
@@ -371,13 +376,14 @@ def _mm(metres: float) -> str:
 def _scale(look: Look) -> Iterator[Finding]:
     """Do robot and camera agree on lengths?
 
-    An error of 15 % is another unit. A difference of the hand-eye's length of 2 mm is worth a note:
-    below, other errors are as large. A scale with a standard error above 0.5 % is not looked at.
+    Those of the robot count as true, see `ODD_SLOPE`. An error of 15 % is another unit. A
+    difference of the hand-eye's length of 2 mm is worth a note: below, other errors are as large. A
+    scale with a standard error above 0.5 % is not looked at.
     """
     given = look.given
     if 100 * abs(given.slope) > 15:
-        said = f"All distances are {100 * given.slope:+.0f} % off against the poses"
-        unit = "depth or poses are in another unit, or scaled"
+        said = f"All distances are {100 * given.slope:+.0f} % off against poses and planes"
+        unit = "one of them is in another unit, or scaled"
         yield impossible(f"{said}: {unit}.", spoils=True, check="scale")
         return
     share, error = 0.0, math.inf
@@ -386,14 +392,16 @@ def _scale(look: Look) -> Iterator[Finding]:
     if 1000 * error > 5:
         share, error = given.slope, math.inf
     length = abs(share) * float(math.hypot(*given.hand_eye[:3, 3]))
-    heads = abs(given.slope) > ODD_SLOPE
+    heads = abs(share) > ODD_SLOPE
     if not heads and not (1000 * length > 2 and abs(share) > SIGMAS * error):
         return
     uncertain = f" (standard error {100 * error:.2g} %)" if math.isfinite(error) else ""
     longer, short = ("longer", "short") if share > 0 else ("shorter", "long")
     said = f"The camera's distances are {100 * abs(share):.1f} %{uncertain} {longer} than"
-    wrong = f"a fit makes the hand-eye translation {1e3 * length:.1f} mm too {short}"
-    said = f"{said} the robot's lengths, and nothing tells which are right; if the first, {wrong}."
+    what, wrong = "planes", "a wrong board size looks the same"
+    if look.scene.moves:
+        what, wrong = "robot", f"if not, the hand-eye is {1e3 * length:.1f} mm too {short}"
+    said = f"{said} those of the {what}, which count as true; {wrong}."
     yield Finding("ambiguous" if heads else "note", said, check="scale")
 
 
@@ -413,12 +421,17 @@ def outlying_frames(look: Look) -> dict[int, float]:
 
     A frame disagrees if its misfit is five times the median's, and what no error of a camera makes;
     twice that where these cannot be taken off first. More than three in ten are no single ones: the
-    alignment is robust to so many. It takes three frames, so that one of six can disagree.
+    alignment is robust to so many. It takes three frames, so that one of six can disagree. A single
+    ray has the noise of its amplitude, of which the typical frame has little.
     """
     if look.as_given is None or len(look.rms) < 6:
         return {}
     rms, limit = look.rms, (2 if look.shape is None else 1) * CAMERA
-    off = np.flatnonzero(rms > max(5 * float(np.median(rms)), limit))
+    expected = np.full(len(rms), max(5 * float(np.median(rms)), limit))
+    if look.amplitude is not None and not look.scene.known.any():
+        bright = np.nanmax(look.amplitude[look.usable], axis=1)
+        expected *= np.maximum(np.median(bright) / np.maximum(bright, TINY), 1)
+    off = np.flatnonzero(rms > expected)
     if 10 * len(off) > 3 * len(rms):
         return {}
     return {int(look.frames[k]): float(rms[k]) for k in off[np.argsort(-rms[off])]}

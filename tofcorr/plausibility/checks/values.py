@@ -30,13 +30,13 @@ def units(look: Look) -> Iterator[Finding]:
     """Are depth and poses in metres?
 
     Few cameras are 20 m from a wall, none is 100 m or less than 5 mm from it, and no arm reaches 50
-    m. Depth from 400 on counts as millimetres, below as centimetres: 0.4 or 4 m.
+    m. Up to 2000, which are 2 or 20 m, depth may be in millimetres or in centimetres.
     """
     values = look.stored[np.isfinite(look.stored)]
     median = float(np.median(values)) if len(values) else 1.0
     far = f"The median distance is {median:.4g} m"
     if median > 100:
-        unit = "millimetres" if median > 400 else "centimetres"
+        unit = "millimetres" if median > 2000 else "millimetres or centimetres"
         said = f"seems to be in {unit}, or to hold amplitudes"
         yield impossible(f"{far}: depth.npy {said}; write metres.")
     elif 1000 * median < 5:
@@ -294,20 +294,36 @@ def lens(look: Look) -> Iterator[Finding]:
         yield doubtful(f"{said}. {advice}.")
 
 
+# Frames differ by so much in brightness only if their amplitudes are in two units: the brightest
+# surface returns thirty times the light of the darkest, and exposures go from 1 to 10.
+_TWO_UNITS = 300
+
+
 def exposure(look: Look) -> Iterator[Finding]:
-    """Do the frames have one exposure, where none was recorded?
+    """Are the amplitudes in one unit, and do the frames have one exposure, where none was recorded?
 
     Compared is how bright each frame sees its target, distance and tilt taken off. Two exposures of
     at least three frames each differ by a stop or more, and by eight times the spread within them,
     as logarithms; it was 20 times. At half of the frames an independent exposure is another one
     than before, at a quarter it must be: targets that only share a name come one after another.
+    Of a target with dark and bright parts only frames that show both are compared.
     """
-    times = look.condition("integration_time")
-    if look.amplitude is None or (np.isfinite(times).all() and np.ptp(times) > 0):
+    if look.amplitude is None:
         return
-    level, targets = _brightness(look, look.amplitude), look.data.targets[look.frames]
+    level, contrast = _brightness(look, look.amplitude)
+    seen = np.flatnonzero(np.isfinite(level))
+    off = level[seen] - np.sort(level[seen])[len(seen) // 2 : len(seen) // 2 + 1]
+    if len(odd := seen[np.abs(off) > np.log(_TWO_UNITS)]):
+        frames, most = tuple(look.frames[odd].tolist()), np.exp(off[np.abs(off).argmax()])
+        said = f"{in_words(frames).capitalize()} see their targets up to {most:.3g} times as bright"
+        yield doubtful(f"{said} as the others do: amplitudes in two units; write one.", frames)
+        return
+    times, targets = look.condition("integration_time"), look.data.targets[look.frames]
+    if np.isfinite(times).all() and np.ptp(times) > 0:
+        return
     for name in np.unique(targets):
         own = np.flatnonzero((targets == name) & np.isfinite(level))
+        own = own[2 * contrast[own] >= contrast[own].max(initial=0.0)]
         groups = _two_groups(level[own]) if len(own) >= 10 else None
         if groups is None:
             continue
@@ -323,18 +339,21 @@ def exposure(look: Look) -> Iterator[Finding]:
             return
 
 
-def _brightness(look: Look, amplitude: np.ndarray) -> np.ndarray:
-    """Return the logarithm of how bright each frame is at 1 m and head on, shape (N,).
+def _brightness(look: Look, amplitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how bright each frame is at 1 m and head on, and its contrast, shape (N,) each.
 
-    That of its brightest tenth: nearly every view of a board shows a bright square.
+    Both as logarithms: of its brightest tenth, as nearly every view of a board shows a bright
+    square, and of that over its darkest tenth.
     """
     scene, amplitude = look.scene, amplitude[look.usable]
     cosine = np.abs(scene.cosine)
-    used = scene.on_plane & np.isfinite(amplitude) & (cosine > 0)
-    seen = np.where(used, amplitude * scene.distance**2 / np.where(used, cosine, 1.0), 0.0)
-    tenth = used.sum(1) // 10
-    level = np.sort(seen, axis=1)[:, ::-1][np.arange(len(seen)), tenth]
-    return np.where(scene.known & (tenth > 0), np.log(np.maximum(level, TINY)), np.nan)
+    used = scene.on_plane & np.isfinite(amplitude) & (100 * cosine > 1)
+    seen = amplitude * scene.distance**2 / np.where(used, cosine, 1.0)
+    seen = np.sort(np.where(used, seen, np.nan), axis=1)  # NaN comes last.
+    count, each, tenth = used.sum(1), np.arange(len(seen)), used.sum(1) // 10
+    dark, bright = (np.log(np.maximum(seen[each, k], TINY)) for k in (tenth, count - 1 - tenth))
+    unknown = ~scene.known | (tenth < 1) | (bright <= np.log(TINY))
+    return np.where(unknown, np.nan, bright), np.where(unknown, np.nan, bright - dark)
 
 
 def _two_groups(score: np.ndarray) -> tuple[np.ndarray, float, float] | None:
