@@ -15,8 +15,8 @@ COLUMNS = torch.arange(7, dtype=torch.float64)[None, :]
 
 def trained(generator: torch.Generator, domain: Domain = DOMAIN) -> ResidualNetwork:
     network = ResidualNetwork(ResidualNetworkOptions(bound_mm=15.0), domain)
-    size = network.weight_vector().shape
-    network.set_weight_vector(3 * torch.randn(size, generator=generator, dtype=torch.float64))
+    with torch.no_grad():
+        network.weights.copy_(0.02 * torch.randn(len(network.weights), generator=generator))
     return network
 
 
@@ -46,6 +46,27 @@ def test_it_fades_to_zero_outside_the_calibrated_ranges(generator: torch.Generat
     distance = torch.linspace(2.9, 3.2, 3001, dtype=torch.float64)[:, None, None]
     found = network(distance, torch.full_like(distance, 100.0), ROWS, COLUMNS)
     assert float(found.detach().diff(dim=0).abs().max()) < 1e-4
+
+
+def test_it_is_zero_a_radius_away_from_all_that_it_has_seen_and_smooth_on_the_way(
+    generator: torch.Generator,
+) -> None:
+    network = trained(generator)
+    distance = 1.5 + 0.05 * torch.randn(500, generator=generator).double().clamp(-2, 2)
+    rows, columns = (torch.full_like(distance, one) for one in (1.0, 2.0))
+    seen = network.scaled(distance, 100 * torch.ones_like(distance), rows, columns)
+    network.look_at(seen)
+    with torch.no_grad():
+        network.weights.mul_(0.1)  # Below the bound, which has an edge.
+    assert all((seen == place).all(dim=1).any() for place in network.places)
+    # Three standard deviations of half a decimetre beyond the farthest one that was seen.
+    edge = float(distance.max() + 3 * distance.std())
+    path = torch.linspace(1.5, 2.0, 10001, dtype=torch.float64)
+    found = network(path, torch.full_like(path, 100.0), *(one[:1] for one in (rows, columns)))
+    assert found[path < 1.6].abs().max() > 0.001
+    assert not found[path >= edge].any()
+    slope = found.detach().diff() / path.diff()
+    assert float(slope.diff().abs().max()) < 0.03 * float(slope.abs().max())
 
 
 def test_it_scripts_identically_and_needs_no_amplitude(generator: torch.Generator) -> None:

@@ -132,7 +132,7 @@ def test_a_network_that_was_dropped_adds_nothing_and_exports(
     dropped = any("was dropped" in text for text in report.warnings)
     network = module.error_model.residual
     assert network is not None
-    assert dropped == (not bool(network.last.weight.any()))
+    assert dropped == (not bool(network.weights.any()))
     module.export("torchscript", tmp_path / "corrector.ts")
     corrected, _ = torch.jit.load(str(tmp_path / "corrector.ts"))(*some(wall))
     torch.testing.assert_close(module(*some(wall)), corrected, rtol=0, atol=1e-6, equal_nan=True)
