@@ -39,7 +39,7 @@ def fitted(dataset: Dataset, terms: list[dict], **options: object) -> Fit:
 
 
 def held_out(dataset: Dataset, found: Fit) -> float:
-    return frame_errors(dataset, {"model": found.model})["model"].rms_mm(TEST)
+    return frame_errors(dataset, {"model": found.model})["model"]["to_plane"].rms_mm(TEST)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def test_joint_training_lowers_the_loss_of_the_sample_further(wavy: Dataset) -> 
     apart = fitted(wavy, CORE, residual=short | {"joint": False})
     joint = fitted(wavy, CORE, residual=short)
     errors = frame_errors(wavy, {"apart": apart.model, "joint": joint.model})
-    assert errors["joint"].rms_mm(TRAIN) < errors["apart"].rms_mm(TRAIN)
+    assert errors["joint"]["to_plane"].rms_mm(TRAIN) < errors["apart"]["to_plane"].rms_mm(TRAIN)
     moved = joint.solution.parameters.coefficients - apart.solution.parameters.coefficients
     assert moved.abs().max() > 0
 

@@ -30,6 +30,9 @@ REQUIRED_COLUMNS = ("frame", *NUMBERS, "target")
 """Columns that every recording has, in the order in which they are written."""
 COLUMN_OF = {"pose_id": "pose_id", **{each.name: each.column for each in OPTIONAL_CONDITIONS}}
 """Columns that a recording may lack, by the attribute of `FrameTable` that holds them."""
+_PLANE, _UPPER = (*NORMAL, "d"), np.triu_indices(4)
+PLANE_COVARIANCE = [f"{_PLANE[i]}_{_PLANE[j]}" for i, j in zip(*_UPPER, strict=True)]
+"""Columns of the covariance of (nx, ny, nz, d): all ten, or none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,6 +45,8 @@ class FrameRow(Conditions[Value]):
         offset: d of that plane, metres.
         target: `white`, `checkerboard` or another name.
         pose_id: Frames with the same id were taken without moving; None if unknown.
+        plane_covariance: Of (nx, ny, nz, d), shape (4, 4), without unit and metres: what is not
+            known of the plane, independent of that of other poses; None: unknown, taken as zero.
     """
 
     world_from_tool: np.ndarray
@@ -49,15 +54,16 @@ class FrameRow(Conditions[Value]):
     offset: Value
     target: Any
     pose_id: Any = None
+    plane_covariance: Any = None
 
 
 class FrameTable(FrameRow[np.ndarray]):
     """The rows of `frames.csv` as arrays, one entry per frame; units as in `FrameRow`.
 
-    A condition has shape (N,), and so have offsets, and targets and pose ids as text; poses have
-    shape (N, 4, 4), normals (N, 3), of exactly unit length. An optional column that the file lacks
-    is None. An empty cell in an optional column is NaN (the empty text in `pose_id`): unknown,
-    never zero.
+    A condition has shape (N,), and so have offsets, and targets and pose ids as text; poses and
+    covariances have shape (N, 4, 4), normals (N, 3), of exactly unit length. An optional column
+    that the file lacks is None. An empty cell in an optional column is NaN (the empty text in
+    `pose_id`): unknown, never zero.
     """
 
     def __len__(self) -> int:
@@ -123,12 +129,30 @@ def read_table(path: Path) -> FrameTable:
         offset=number["d"] / length,
         target=np.array(cells["target"]),
         pose_id=np.array(cells["pose_id"]) if "pose_id" in cells else None,
+        plane_covariance=_plane_covariance(cells, path),
         **{
             each.name: each.si_per_unit * _numbers(cells, each.column, path, each)
             for each in OPTIONAL_CONDITIONS
             if each.column in cells
         },
     )
+
+
+def _plane_covariance(cells: dict[str, list[str]], path: Path) -> np.ndarray | None:
+    """Return the covariances (N, 4, 4); None where the file has none of their columns."""
+    if not {*PLANE_COVARIANCE} & {*cells}:
+        return None
+    if missing := [name for name in PLANE_COVARIANCE if name not in cells]:
+        raise CalibrationDataError(f"{path}: column {_names(missing)} of a covariance is missing.")
+    found = np.zeros((len(cells["frame"]), 4, 4))
+    numbers = np.stack([_numbers(cells, name, path) for name in PLANE_COVARIANCE], axis=1)
+    found[:, *_UPPER] = found[:, *_UPPER[::-1]] = numbers
+    least = np.linalg.eigvalsh(found)
+    # What is zero is rounded to the digits of the largest.
+    for frame in np.flatnonzero(least[:, 0] < -UNIT_LENGTH_TOLERANCE * least[:, -1])[:1]:
+        said = "has a negative variance, and no covariance has"
+        raise CalibrationDataError(f"{path}: frame {frame}: nx_nx to d_d: the matrix {said}.")
+    return found
 
 
 def rigid_transforms(
@@ -170,10 +194,15 @@ def table_text(rows: Iterable[FrameRow]) -> str:
     kept = {name: cells for name, cells in optional.items() if any(c is not None for c in cells)}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept)])
+    of_planes = [row.plane_covariance for row in rows if row.plane_covariance is not None]
+    if of_planes and len(of_planes) < len(rows):
+        raise CalibrationDataError("A plane_covariance is given of some rows, not of all.")
+    names = PLANE_COVARIANCE if of_planes else []
+    writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept), *names])
     for frame, row in enumerate(rows):
         # The csv module writes None as an empty cell: unknown.
         more = [cells[frame] for cells in kept.values()]
+        more += [] if not of_planes else map(float, np.asarray(of_planes[frame])[_UPPER])
         writer.writerow([frame, *_required_cells(row), row.target, *more])
     return text.getvalue()
 

@@ -1,5 +1,6 @@
 """A small network that learns the error that remains after the terms, where it has seen it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -19,11 +20,14 @@ class ResidualNetworkOptions(DescribedOptions):
     Attributes:
         width: Neurons: how many places the network learns about.
         bound_mm: The network never adds more than this.
+        radius: How far a place is felt, in half-widths of the ranges of distance, log amplitude,
+            rows and columns; a fit may stretch it. On views of a Kinect v2, 1.5 and 2 err as much.
         seed: Seed of the places at the start; a fit puts them where it has seen pixels.
     """
 
     width: PositiveInt = Field(default=256, le=1024)
     bound_mm: PositiveFloat = 20.0
+    radius: PositiveFloat = 1.5
     seed: NonNegativeInt = 0
 
     def structure(self) -> dict[str, Any]:
@@ -39,7 +43,7 @@ class ResidualNetwork(DescribedModule):
     .. math:: R = \Big[ f(D) f(I) \sum_k w_k\, \phi(|s (x - x_k)|) \Big]_{-b}^{b}, \qquad
         \phi(d) = (1 - d)_+^5 (5 d + 1)
 
-    with :math:`x = (D, \ln I, r, c)`, all on the scale of their ranges, and the reciprocal radii s.
+    with :math:`x = (D, \ln I, r, c)`, all on the scale of their ranges, and reciprocal radii s.
     Wendland's function (1995) is positive definite in five dimensions and zero from 1 on: at a
     radius from every place :math:`x_k`, where the network has learnt nothing, it adds nothing.
     The fades f do the same outside the calibrated ranges. Untrained weights w are zero, so that
@@ -79,7 +83,8 @@ class ResidualNetwork(DescribedModule):
         generator = torch.Generator().manual_seed(options.seed)
         places = 2 * torch.rand(options.width, 4, generator=generator, dtype=torch.float64) - 1
         self.places = nn.Parameter(places)
-        self.per_radius = nn.Parameter(torch.ones(4, dtype=torch.float64))
+        per_radius = torch.full((4,), 1 / options.radius, dtype=torch.float64)
+        self.per_radius = nn.Parameter(per_radius)
         self.weights = nn.Parameter(torch.zeros(options.width, dtype=torch.float64))
 
     def description(self) -> dict[str, Any]:
@@ -96,7 +101,7 @@ class ResidualNetwork(DescribedModule):
         for first in range(0, self.width, 16):
             near = self.functions(inputs, self.places[first : first + 16])
             total = total + (near * self.weights[first : first + 16]).sum(dim=-1)
-        return total.clamp(-self.bound, self.bound)
+        return (self.fade(inputs) * total).clamp(-self.bound, self.bound)
 
     def scaled(
         self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
@@ -115,27 +120,22 @@ class ResidualNetwork(DescribedModule):
         apart = (inputs[..., None, :] - places) * self.per_radius
         distance = torch.linalg.vector_norm(apart, dim=-1)
         left = (1.0 - distance).clamp(min=0.0)
-        fade = self.fade(inputs[..., :2]).prod(dim=-1, keepdim=True)
-        return fade * left.square().square() * left * (5.0 * distance + 1.0)
+        return left.square().square() * left * (5.0 * distance + 1.0)
 
-    def fade(self, scaled: Tensor) -> Tensor:
-        """Return 1 on [-1, 1], 0 beyond the fading zone, and a smooth step between."""
-        left = ((1.0 + self.margin - scaled.abs()) / self.margin).clamp(0.0, 1.0)
-        return left * left * (3.0 - 2.0 * left)
+    def fade(self, inputs: Tensor) -> Tensor:
+        """Return 1 in the calibrated ranges, 0 beyond the fading zone, and smooth steps between."""
+        left = ((1.0 + self.margin - inputs[..., :2].abs()) / self.margin).clamp(0.0, 1.0)
+        return (left * left * (3.0 - 2.0 * left)).prod(dim=-1)
 
     @torch.no_grad()
-    def look_at(self, inputs: Tensor) -> None:
-        """Put the places where pixels were seen, far from each other, and choose the radii.
-
-        A radius is three standard deviations of its input: the function has fallen to a tenth
-        within one and a half. Chosen on views of a Kinect v2, where two or four err as much.
+    def look_at(self, inputs: Tensor, stretch: Sequence[float]) -> None:
+        """Put the places where pixels were seen, each as far as can be from those before it.
 
         Args:
             inputs: What `scaled` returns of the pixels, shape (M, 4).
+            stretch: How many times longer the radius is along each input.
         """
-        deviation = inputs.std(dim=0)
-        # An input that was always the same tells nothing.
-        self.per_radius.copy_(torch.where(deviation > 0, 1 / (3 * deviation), 0.0).nan_to_num())
+        self.per_radius /= torch.tensor(stretch)
         apart = torch.full_like(inputs[:, 0], torch.inf)
         for place in self.places:
             place.copy_(inputs[int(apart.argmax())])

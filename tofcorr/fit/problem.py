@@ -64,7 +64,7 @@ class ResidualOptions(Options):
         iterations: Most Gauss-Newton steps of the fit together with hand-eye and coefficients.
         weight_decay: Weight of the network's energy in a loss that is the mean squared residual.
             The default is between what is best for views between others (1.5e-4) and for runs of
-            views unlike all others (1e-3), on views of a Kinect v2.
+            views unlike all others (5e-4), on views of a Kinect v2.
         joint: Whether an estimated hand-eye transform is fitted once more together with the
             network, and the coefficients with it. Without this, errors that the core cannot
             describe bias it.
@@ -91,7 +91,8 @@ class FitOptions(Options):
         hand_eye: Whether the hand-eye transform is estimated, and where its estimate starts.
         solver: The optimiser.
         weights: The weight of each pixel.
-        planes: `known`: the recorded planes are used as they are; `unknown`: every wall (frames of
+        planes: `known`: the recorded planes are right, within their covariance if frames.csv has
+            one; `unknown`: every wall (frames of
             one target and one recorded plane) is estimated, from the recorded plane as a start;
             `auto`: `unknown` where `recording.yaml` says `planes: estimated`, else `known`.
         free_directions: How to treat a direction that the images do not determine: `prior` holds

@@ -128,6 +128,17 @@ class Dataset:
         every = [getattr(recording.frames, name) for recording in self.recordings]
         return torch.from_numpy(np.concatenate(every))
 
+    def plane_covariance(self) -> Float[Tensor, "N 4 4"] | None:
+        """Return the covariances of (n, d) in the tool frame; None unless all recordings have them.
+
+        Planes that were estimated have none: what is not known of them is all of them.
+        """
+        known = all(one.frames.plane_covariance is not None for one in self.recordings)
+        if not known or self.planes_are_estimated:
+            return None
+        pose = self.column("world_from_tool")
+        return pose.mT @ self.column("plane_covariance") @ pose
+
     @property
     def targets(self) -> np.ndarray:
         """Each frame's target, shape (N,), text."""

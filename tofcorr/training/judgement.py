@@ -235,6 +235,14 @@ def report_text(report: Mapping[str, Any]) -> str:
         errors = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
         text = ["-" if one is None else f"{one:.2f}" for one in errors]
         lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
+    halves = report["views_mm"]
+    held_out = halves["test" if halves["test"]["rms_z"] is not None else "train"]
+    if held_out["rms_z"] is not None:
+        lines.append(
+            "of which along z, RMS: {between_views:.2f} between views (offset and tilts of whole "
+            "images), {within_views:.2f} within them; {within_prior:.2f} in place of {rms_z:.2f} "
+            "with each plane estimated again within its covariance".format(**held_out)
+        )
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
     if advice := report["advice"]:
