@@ -55,7 +55,7 @@ def test_it_is_zero_a_radius_away_from_all_that_it_has_seen_and_smooth_on_the_wa
     distance = 1.2 + 0.05 * torch.randn(500, generator=generator).double().clamp(-2, 2)
     rows, columns = (torch.full_like(distance, one) for one in (1.0, 2.0))
     seen = network.scaled(distance, 100 * torch.ones_like(distance), rows, columns)
-    network.look_at(seen, (1, 1, 4, 4))
+    network.look_at(seen)
     with torch.no_grad():
         network.weights.mul_(0.02)  # Below the bound, which has an edge.
     assert all((seen == place).all(dim=1).any() for place in network.places)

@@ -29,6 +29,14 @@ from tofcorr.training.figures import save_figure
 from tofcorr.training.report import number_or_none
 from tofcorr.version import __version__
 
+# Of the RMS error in z: offset and tilts of whole images, which no model of a pixel sees; the rest;
+# and all of it with each held-out plane estimated again within its covariance, if it has one.
+_VIEWS = {
+    "z, between views": "between_views_mm",
+    "z, within views": "within_views_mm",
+    "z, planes in their covariance": "within_prior_mm",
+}
+
 
 @dataclass(frozen=True, repr=False)
 class EvaluationResult:
@@ -167,12 +175,13 @@ class EvaluationResult:
 
     def tables(self) -> list[Table]:
         """Return the tables of the protocols that the options ask for."""
-        found = [self._half_table(), self._views_table()]
+        found = [self._half_table()]
         if self.options.folds:
             found += [self._folds_table(), self._tests_table("folds", "mean_abs_mm")]
         if self.options.repeats.number:
             found.append(self._repeats_table("rms_mm", "distance to the plane"))
             found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
+            found += [self._repeats_table(own, f"error, {name}") for name, own in _VIEWS.items()]
             found.append(self._tests_table("repeats", "rms_mm"))
         return found
 
@@ -187,6 +196,9 @@ class EvaluationResult:
             images = ", ".join(f"{count} {target}" for target, count in one.targets.items())
             cells = [f"{mean[name][0]:.2f} ({rms[name][0]:.2f})" for name in self.options.columns]
             rows.append([f"{one.name} ({images})", *cells])
+            for name, metric in _VIEWS.items():
+                own = one.values["half"][metric]
+                rows.append([f"  {name}", *(f"{own[k][0]:.2f}" for k in self.options.columns)])
         held_out = f"{100 * self.options.test_fraction:.0f} % of the poses held out"
         title = f"Table 1. Mean absolute error per pixel (RMS), mm, on {held_out}"
         note = "'hand-eye only': hand-eye refitted, no depth correction."
@@ -216,25 +228,6 @@ class EvaluationResult:
             rows,
             "Mean ± standard deviation; the interval allows for the overlap of the splits.",
         )
-
-    def _views_table(self) -> Table:
-        rows, protocol = [], "repeats" if self.options.repeats.number else "half"
-        kinds = {
-            "all": "rms_z_mm",
-            "  between views": "between_views_mm",
-            "  within views": "within_views_mm",
-            "planes within their covariance": "within_prior_mm",
-        }
-        for one in self.sets:
-            for name, metric in kinds.items():
-                found = [one.values[protocol][metric][column] for column in self.options.columns]
-                rows.append(
-                    [f"{one.name}: {name}", *(f"{mean:.2f}" for mean in map(np.mean, found))]
-                )
-        note = "Between views: offset and tilts of whole images, which no model of a pixel sees."
-        again = "Last: each held-out plane estimated again within its covariance, if it has one."
-        title = "Held-out RMS error of the z depth, mm, between views and within them"
-        return self._table(title, rows, f"{note} {again}")
 
     def _tests_table(self, protocol: str, metric: str) -> Table:
         rows, dof = [], 0

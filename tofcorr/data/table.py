@@ -103,7 +103,9 @@ def read_table(path: Path) -> FrameTable:
             and frame.
     """
     cells = _read_cells(path)
-    missing = [name for name in REQUIRED_COLUMNS if name not in cells]
+    has_covariance = PLANE_COVARIANCE[0] in cells
+    needed = [*REQUIRED_COLUMNS, *(PLANE_COVARIANCE if has_covariance else ())]
+    missing = [name for name in needed if name not in cells]
     if missing:
         raise CalibrationDataError(f"{path}: column {_names(missing)} is missing.")
     if not cells["frame"]:
@@ -129,7 +131,7 @@ def read_table(path: Path) -> FrameTable:
         offset=number["d"] / length,
         target=np.array(cells["target"]),
         pose_id=np.array(cells["pose_id"]) if "pose_id" in cells else None,
-        plane_covariance=_plane_covariance(cells, path),
+        plane_covariance=_plane_covariance(cells, path) if has_covariance else None,
         **{
             each.name: each.si_per_unit * _numbers(cells, each.column, path, each)
             for each in OPTIONAL_CONDITIONS
@@ -138,20 +140,16 @@ def read_table(path: Path) -> FrameTable:
     )
 
 
-def _plane_covariance(cells: dict[str, list[str]], path: Path) -> np.ndarray | None:
-    """Return the covariances (N, 4, 4); None where the file has none of their columns."""
-    if not {*PLANE_COVARIANCE} & {*cells}:
-        return None
-    if missing := [name for name in PLANE_COVARIANCE if name not in cells]:
-        raise CalibrationDataError(f"{path}: column {_names(missing)} of a covariance is missing.")
-    found = np.zeros((len(cells["frame"]), 4, 4))
+def _plane_covariance(cells: dict[str, list[str]], path: Path) -> np.ndarray:
+    """Return the covariances, shape (N, 4, 4)."""
     numbers = np.stack([_numbers(cells, name, path) for name in PLANE_COVARIANCE], axis=1)
+    found = np.zeros((len(numbers), 4, 4))
     found[:, *_UPPER] = found[:, *_UPPER[::-1]] = numbers
     least = np.linalg.eigvalsh(found)
     # What is zero is rounded to the digits of the largest.
     for frame in np.flatnonzero(least[:, 0] < -UNIT_LENGTH_TOLERANCE * least[:, -1])[:1]:
-        said = "has a negative variance, and no covariance has"
-        raise CalibrationDataError(f"{path}: frame {frame}: nx_nx to d_d: the matrix {said}.")
+        said = "nx_nx to d_d are no covariance: a variance is negative"
+        raise CalibrationDataError(f"{path}: frame {frame}: {said}.")
     return found
 
 
@@ -194,15 +192,14 @@ def table_text(rows: Iterable[FrameRow]) -> str:
     kept = {name: cells for name, cells in optional.items() if any(c is not None for c in cells)}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    of_planes = [row.plane_covariance for row in rows if row.plane_covariance is not None]
-    if of_planes and len(of_planes) < len(rows):
-        raise CalibrationDataError("A plane_covariance is given of some rows, not of all.")
-    names = PLANE_COVARIANCE if of_planes else []
+    # Of some planes alone nothing can be weighed.
+    known = all(row.plane_covariance is not None for row in rows)
+    names = PLANE_COVARIANCE if known else []
     writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept), *names])
     for frame, row in enumerate(rows):
         # The csv module writes None as an empty cell: unknown.
         more = [cells[frame] for cells in kept.values()]
-        more += [] if not of_planes else map(float, np.asarray(of_planes[frame])[_UPPER])
+        more += row.plane_covariance[_UPPER].tolist() if known else []
         writer.writerow([frame, *_required_cells(row), row.target, *more])
     return text.getvalue()
 

@@ -52,6 +52,7 @@ class ResidualNetwork(DescribedModule):
     Args:
         options: Width and bound.
         domain: The ranges scale the inputs; without amplitudes the network does not read them.
+        stretch: How many times longer the radius is along each input.
 
     Shape:
         - Input: `(*)` radial distances in metres, amplitudes in the camera's units, rows and
@@ -63,7 +64,9 @@ class ResidualNetwork(DescribedModule):
     half_width: Tensor
     floor: Tensor
 
-    def __init__(self, options: ResidualNetworkOptions, domain: Domain) -> None:
+    def __init__(
+        self, options: ResidualNetworkOptions, domain: Domain, stretch: Sequence[float] = (1,) * 4
+    ) -> None:
         super().__init__()
         self.options = options
         self.uses_amplitude: bool = domain.amplitude is not None
@@ -83,8 +86,8 @@ class ResidualNetwork(DescribedModule):
         generator = torch.Generator().manual_seed(options.seed)
         places = 2 * torch.rand(options.width, 4, generator=generator, dtype=torch.float64) - 1
         self.places = nn.Parameter(places)
-        per_radius = torch.full((4,), 1 / options.radius, dtype=torch.float64)
-        self.per_radius = nn.Parameter(per_radius)
+        radii = options.radius * torch.tensor(stretch, dtype=torch.float64)
+        self.per_radius = nn.Parameter(1 / radii)
         self.weights = nn.Parameter(torch.zeros(options.width, dtype=torch.float64))
 
     def description(self) -> dict[str, Any]:
@@ -128,14 +131,12 @@ class ResidualNetwork(DescribedModule):
         return (left * left * (3.0 - 2.0 * left)).prod(dim=-1)
 
     @torch.no_grad()
-    def look_at(self, inputs: Tensor, stretch: Sequence[float]) -> None:
+    def look_at(self, inputs: Tensor) -> None:
         """Put the places where pixels were seen, each as far as can be from those before it.
 
         Args:
             inputs: What `scaled` returns of the pixels, shape (M, 4).
-            stretch: How many times longer the radius is along each input.
         """
-        self.per_radius /= torch.tensor(stretch)
         apart = torch.full_like(inputs[:, 0], torch.inf)
         for place in self.places:
             place.copy_(inputs[int(apart.argmax())])

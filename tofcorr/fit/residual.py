@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.estimation.linear import ROUNDING, solved
@@ -44,13 +43,15 @@ def fit_residual(
         The decision in one sentence; the network, fitted to all images, None if it was dropped;
         hand-eye and coefficients that go with it.
     """
-    frames, domain = np.sort(problem.frames), problem.domain
+    frames = np.sort(problem.frames)
     sample = draw_pixels(problem.dataset, frames, options.pixels, options.network.seed)
-    pose = torch.from_numpy(
-        np.unique(problem.dataset.pose_groups()[frames], return_inverse=True)[1]
-    )
+    groups = problem.dataset.pose_groups()[frames]
+    pose = torch.from_numpy(np.unique(groups, return_inverse=True)[1])
     number = int(pose.max()) + 1
     folds = min(options.folds, number)
+
+    def untrained(stretch: Sequence[float]) -> ResidualNetwork:
+        return ResidualNetwork(options.network, problem.domain, stretch)
 
     def held_out(stretch: Sequence[float]) -> Tensor:
         """Return mean absolute and squared error of each pose, without and with a network."""
@@ -59,13 +60,13 @@ def fit_residual(
             test = pose * folds // number == fold
             here = test[sample.frame]
             refitted, unseen = _without(core, test), sample.of(here)
-            trained = _train(refitted, error, sample.of(~here), domain, options, stretch)
+            trained = _train(refitted, error, sample.of(~here), untrained(stretch), options)
+            of = pose[unseen.frame]
+            seen = torch.bincount(of, minlength=number)
             for row, (network, best) in enumerate([(None, refitted.solution.parameters), trained]):
                 off = _distance_to_plane(error, unseen, best, network)
-                of = pose[unseen.frame]
-                for one in of.unique().tolist():
-                    own = off[of == one]
-                    found[row, :, one] = torch.stack([own.abs().mean(), own.square().mean()])
+                sums = [torch.bincount(of, one, number) for one in (off.abs(), off.square())]
+                found[row, :, seen > 0] = (torch.stack(sums) / seen)[:, seen > 0]
         return found[:, :, found[0, 0].isfinite()]
 
     tried = [held_out(stretch) for stretch in _STRETCHES]
@@ -76,7 +77,7 @@ def fit_residual(
     p_value = min(1.0, len(tried) * gate(*tried[chosen]))
     network, best = None, core.solution.parameters
     if options.keep == "always" or p_value < LEVEL:
-        network, best = _train(core, error, sample, domain, options, _STRETCHES[chosen])
+        network, best = _train(core, error, sample, untrained(_STRETCHES[chosen]), options)
     (mean, square), (its_mean, its_square) = tried[chosen].mean(dim=2).tolist()
     kept = f"The residual network was {'dropped' if network is None else 'kept'}: held-out runs of"
     words = (
@@ -128,12 +129,7 @@ def _distance_to_plane(
 
 @torch.no_grad()
 def _train(
-    core: Core,
-    error: ErrorModel,
-    sample: FramePixels,
-    domain: Domain,
-    options: ResidualOptions,
-    stretch: Sequence[float],
+    core: Core, error: ErrorModel, seen: FramePixels, network: ResidualNetwork, how: ResidualOptions
 ) -> tuple[ResidualNetwork, Parameters]:
     """Fit a network, and the unknowns with it where the options and the hand-eye ask for that.
 
@@ -141,20 +137,19 @@ def _train(
     no function of a pixel. Without one the core stays as it is: beside the network it would lean
     on it, and be wrong where the network has seen nothing.
     """
-    network, best = ResidualNetwork(options.network, domain), core.solution.parameters
-    inputs = network.scaled(*sample.pixels[:4])
-    network.look_at(inputs, stretch)
+    best, inputs = core.solution.parameters, network.scaled(*seen.pixels[:4])
+    network.look_at(inputs)
     functions = network.fade(inputs)[:, None] * network.functions(inputs, network.places)
     # The energy of the function: the square of its norm where Wendland's is the kernel.
-    penalty = options.weight_decay * network.functions(network.places, network.places)
-    size = best.size if options.joint and best.hand_eye_is_free else 0
-    columns, total = error.columns_at(sample.pixels), total_weight(core.moments)
-    for _ in range(options.iterations):
-        cosine = sample.cosine(best.tool_from_camera)
-        left = _distance_to_plane(error, sample, best, None)
-        normal = sample.normal_tool @ best.tool_from_camera[:3, :3]
-        found = best.coefficients @ columns + error.pattern_at(sample.pixels)
-        points = sample.ray * (sample.pixels.radial_distance - found)[:, None]
+    penalty = how.weight_decay * network.functions(network.places, network.places)
+    size = best.size if how.joint and best.hand_eye_is_free else 0
+    columns, total = error.columns_at(seen.pixels), total_weight(core.moments)
+    for _ in range(how.iterations):
+        cosine = seen.cosine(best.tool_from_camera)
+        left = _distance_to_plane(error, seen, best, None)
+        normal = seen.normal_tool @ best.tool_from_camera[:3, :3]
+        found = best.coefficients @ columns + error.pattern_at(seen.pixels)
+        points = seen.ray * (seen.pixels.radial_distance - found)[:, None]
         turned = torch.linalg.cross(points, normal)
         moves = torch.cat([normal, turned, -cosine[:, None] * columns.T], dim=1)[:, :size]
         slope = torch.cat([moves, -cosine[:, None] * functions], dim=1)

@@ -134,10 +134,8 @@ class Dataset:
         Planes that were estimated have none: what is not known of them is all of them.
         """
         known = all(one.frames.plane_covariance is not None for one in self.recordings)
-        if not known or self.planes_are_estimated:
-            return None
-        pose = self.column("world_from_tool")
-        return pose.mT @ self.column("plane_covariance") @ pose
+        pose, used = self.column("world_from_tool"), known and not self.planes_are_estimated
+        return pose.mT @ self.column("plane_covariance") @ pose if used else None
 
     @property
     def targets(self) -> np.ndarray:

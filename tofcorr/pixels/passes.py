@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -153,18 +153,19 @@ class FrameErrors:
         return float(sums[inside].sum() / count) if count else math.nan
 
 
-def views_mm(
-    errors: Mapping[str, FrameErrors], frames: np.ndarray | None = None
-) -> dict[str, float]:
+ErrorsByKind = Mapping[str, FrameErrors]
+"""Of one model, by the names of `KINDS`."""
+
+
+def views_mm(errors: ErrorsByKind, frames: np.ndarray | None = None) -> dict[str, float]:
     """Return RMS errors in z, mm: all, between views, within them, and with planes in their prior.
 
     The part between views is offset and tilts of whole images.
     """
-    kinds = "in_z", "within_views", "within_prior"
-    whole, within, again = (errors[kind].rms_mm(frames) for kind in kinds)
-    between = math.sqrt(max(whole**2 - within**2, 0.0))
-    names = "rms_z", "between_views", "within_views", "within_prior"
-    return dict(zip(names, (whole, between, within, again), strict=True))
+    all_of_it, within, again = (errors[kind].rms_mm(frames) for kind in KINDS[2:])
+    between = math.sqrt(np.maximum(all_of_it**2 - within**2, 0.0))
+    found = {"rms_z": all_of_it, "between_views": between}
+    return found | {"within_views": within, "within_prior": again}
 
 
 @dataclass(frozen=True)
@@ -189,11 +190,11 @@ def frame_errors(
     dataset: Dataset,
     models: Mapping[str, CalibrationModel],
     device: str = "cpu",
-    variance: float = 0.0,
-) -> dict[str, dict[str, FrameErrors]]:
-    """Return the errors by kind that models leave on all frames; `variance` as of `FittedModel`."""
+    scale: float = 0.0,
+) -> dict[str, ErrorsByKind]:
+    """Return the errors by kind that models leave on all frames; scale: `FittedModel.variance`."""
     every = np.arange(dataset.num_frames)
-    fitted = [FittedModel(one, every, variance=variance) for one in models.values()]
+    fitted = [FittedModel(one, every, variance=scale) for one in models.values()]
     return dict(zip(models, held_out_errors(dataset, fitted, device), strict=True))
 
 
@@ -214,10 +215,9 @@ def held_out_errors(
     """
     rays = dataset.ray_directions().reshape(-1, 3).to(device)
     # The caller's models stay where they are.
-    models = [deepcopy(one.model).to(device) for one in fitted]
-    planes, covariance = [_planes_in_tool(one.planes or dataset) for one in fitted], None
-    if not any(one.planes for one in fitted):
-        covariance = dataset.plane_covariance()
+    models = [replace(one, model=deepcopy(one.model).to(device)) for one in fitted]
+    planes = [_planes_in_tool(one.planes or dataset) for one in fitted]
+    covariance = None if any(one.planes for one in fitted) else dataset.plane_covariance()
     frames = [set(one.held_out.tolist()) for one in fitted]
     sums: list[dict[int, Tensor]] = [{} for _ in fitted]
     wanted = np.unique(np.concatenate([one.held_out for one in fitted]))
@@ -226,11 +226,10 @@ def held_out_errors(
             used = batch.valid[k].reshape(-1).nonzero()[:, 0]
             pixels = pixels_of_image(batch, k, used)
             known = None if covariance is None else covariance[frame].to(device)
-            each = zip(models, frames, planes, sums, fitted, strict=True)
-            for model, own, plane, found, one in each:
+            for model, own, plane, found in zip(models, frames, planes, sums, strict=True):
                 if frame in own:
-                    here = plane[frame].to(device), known, one.variance
-                    found[frame] = _error_sums(model, pixels, rays[used], *here)
+                    there = plane[frame].to(device), known
+                    found[frame] = _error_sums(model, pixels, rays[used], *there)
     shares = everyones(sums)
     return [
         _by_kind({k: v for own in one for k, v in own.items()}) for one in zip(*shares, strict=True)
@@ -246,14 +245,10 @@ def _planes_in_tool(dataset: Dataset) -> Tensor:
 
 @torch.no_grad()
 def _error_sums(
-    model: CalibrationModel,
-    pixels: Pixels,
-    rays: Tensor,
-    plane: Tensor,
-    covariance: Tensor | None,
-    variance: float,
+    one: FittedModel, pixels: Pixels, rays: Tensor, plane: Tensor, covariance: Tensor | None
 ) -> Tensor:
     """Return |error| and error^2 of every kind, summed, and the number of pixels: (11,)."""
+    model = one.model
     corrected = pixels.radial_distance - model.error.error_at(pixels)
     plane_in_camera = plane.to(corrected) @ model.hand_eye()
     cosine = rays @ plane_in_camera[:3]
@@ -263,9 +258,9 @@ def _error_sums(
     moves = torch.nn.functional.pad(points, (0, 1), value=1.0) @ plane_moves(normal).mT
     gram, slope = moves.mT @ moves, moves.mT @ to_plane
     within, again = to_plane - moves @ (torch.linalg.pinv(gram, hermitian=True) @ slope), to_plane
-    if covariance is not None and variance:
+    if covariance is not None and one.variance:
         in_camera = model.hand_eye().mT @ covariance.to(corrected) @ model.hand_eye()
-        precision = variance * plane_precision(normal, in_camera)
+        precision = one.variance * plane_precision(normal, in_camera)
         again = to_plane - moves @ torch.linalg.solve(gram + precision, slope)
     along = rays[:, 2] / cosine
     kinds = [to_plane, to_plane / cosine, to_plane * along, within * along, again * along]
@@ -276,8 +271,7 @@ def _error_sums(
 
 def _by_kind(sums: dict[int, Tensor]) -> dict[str, FrameErrors]:
     frames = np.array(sorted(sums), dtype=np.int64)
-    nothing = np.zeros((2 * len(KINDS) + 1, 0))
-    rows = torch.stack([sums[k] for k in sorted(sums)], dim=1).numpy() if sums else nothing
+    rows = np.array([sums[k].numpy() for k in sorted(sums)]).reshape(-1, 2 * len(KINDS) + 1).T
     return {
         kind: FrameErrors(frames, rows[2 * k], rows[2 * k + 1], rows[-1])
         for k, kind in enumerate(KINDS)

@@ -220,6 +220,12 @@ def beyond_noise(held_out: float | None, noise: float) -> str | None:
     return f"{off}: poses scatter, or the model lacks a term; `tofcorr diagnose` tells which."
 
 
+_VIEWS = (
+    "{:<8} RMS along z {rms_z}: {between_views} between views (offset and tilts of whole images), "
+    "{within_views} within them; {within_prior} with each plane estimated within its covariance"
+)
+
+
 def report_text(report: Mapping[str, Any]) -> str:
     """Return errors, hand-eye translation, advice and warnings, a line each.
 
@@ -235,14 +241,11 @@ def report_text(report: Mapping[str, Any]) -> str:
         errors = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
         text = ["-" if one is None else f"{one:.2f}" for one in errors]
         lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
-    halves = report["views_mm"]
-    held_out = halves["test" if halves["test"]["rms_z"] is not None else "train"]
-    if held_out["rms_z"] is not None:
-        lines.append(
-            "of which along z, RMS: {between_views:.2f} between views (offset and tilts of whole "
-            "images), {within_views:.2f} within them; {within_prior:.2f} in place of {rms_z:.2f} "
-            "with each plane estimated again within its covariance".format(**held_out)
-        )
+    for half, words in (("train", "train"), ("test", "held out")):
+        own = {
+            k: "-" if one is None else f"{one:.2f}" for k, one in report["views_mm"][half].items()
+        }
+        lines.append(_VIEWS.format(words, **own))
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
     if advice := report["advice"]:
