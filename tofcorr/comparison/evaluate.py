@@ -183,7 +183,23 @@ class EvaluationResult:
             found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
             found += [self._repeats_table(own, f"error, {name}") for name, own in _VIEWS.items()]
             found.append(self._tests_table("repeats", "rms_mm"))
+        found.append(self._views_table())
         return found
+
+    def _views_table(self) -> Table:
+        parts = [
+            (one, name, one.values["half"][of]) for one in self.sets for name, of in _VIEWS.items()
+        ]
+        rows = [
+            [f"{one.name}: {name}", *(f"{own[k][0]:.2f}" for k in self.options.columns)]
+            for one, name, own in parts
+        ]
+        note = (
+            "Between views: offset and tilts of whole images, which no model of a pixel corrects."
+        )
+        return self._table(
+            "Parts of the RMS error of the z depth, mm, on the half held out", rows, note
+        )
 
     def _table(self, title: str, rows: list[list[str]], note: str) -> Table:
         seed = f" Seed {self.options.seed}." if "seed" not in note else ""
@@ -196,9 +212,6 @@ class EvaluationResult:
             images = ", ".join(f"{count} {target}" for target, count in one.targets.items())
             cells = [f"{mean[name][0]:.2f} ({rms[name][0]:.2f})" for name in self.options.columns]
             rows.append([f"{one.name} ({images})", *cells])
-            for name, metric in _VIEWS.items():
-                own = one.values["half"][metric]
-                rows.append([f"  {name}", *(f"{own[k][0]:.2f}" for k in self.options.columns)])
         held_out = f"{100 * self.options.test_fraction:.0f} % of the poses held out"
         title = f"Table 1. Mean absolute error per pixel (RMS), mm, on {held_out}"
         note = "'hand-eye only': hand-eye refitted, no depth correction."

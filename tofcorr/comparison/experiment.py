@@ -23,13 +23,7 @@ from tofcorr.fit.fitting import fit, hand_eye_alone
 from tofcorr.fit.problem import FitOptions, Problem, build_model, refuse_missing_inputs
 from tofcorr.fit.walls import FoundWalls, recorded_walls, walls_alone, with_every_wall
 from tofcorr.pixels.dataset import Dataset, covered_domain, hand_eye_is_free, recorded_hand_eye
-from tofcorr.pixels.passes import (
-    FittedModel,
-    FrameErrors,
-    held_out_errors,
-    image_moments,
-    views_mm,
-)
+from tofcorr.pixels.passes import FittedModel, FrameErrors, held_out_errors, image_moments, views_mm
 from tofcorr.pixels.sample import MaskOptions, usable_pixels
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import through
