@@ -96,14 +96,13 @@ def gate(without: Tensor, with_network: Tensor) -> float:
         without: Mean absolute and mean squared error of each held-out pose, shape (2, G).
         with_network: The same with the network.
     """
-    p_values, number = [0.0], without.shape[1]
-    for gain in (without - with_network).numpy():
-        if number < 3 or not gain.any():
-            return 1.0
-        with np.errstate(divide="ignore"):
-            statistic = gain.mean() / (gain.std(ddof=1) / number**0.5)
-        p_values.append(student_tail(float(statistic), number - 1))
-    return max(p_values)
+    gains = (without - with_network).numpy()
+    number = gains.shape[1]
+    if number < 3 or not gains.any(axis=1).all():
+        return 1.0
+    with np.errstate(divide="ignore"):
+        statistics = gains.mean(axis=1) / (gains.std(axis=1, ddof=1) / number**0.5)
+    return max(student_tail(float(one), number - 1) for one in statistics)
 
 
 def _without(core: Core, images: Tensor) -> Core:

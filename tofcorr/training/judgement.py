@@ -221,8 +221,8 @@ def beyond_noise(held_out: float | None, noise: float) -> str | None:
 
 
 _VIEWS = (
-    "{:<8} RMS along z {rms_z}: {between_views} between views (offset and tilts of whole images), "
-    "{within_views} within them; {within_prior} with each plane estimated within its covariance"
+    "{:<8} RMS along z {rms_z:.2f}: {between_views:.2f} between views (offset and tilts of whole "
+    "images), {within_views:.2f} within; {within_prior:.2f} with planes within their covariance"
 )
 
 
@@ -241,11 +241,9 @@ def report_text(report: Mapping[str, Any]) -> str:
         errors = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
         text = ["-" if one is None else f"{one:.2f}" for one in errors]
         lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
-    for half, words in (("train", "train"), ("test", "held out")):
-        own = {
-            k: "-" if one is None else f"{one:.2f}" for k, one in report["views_mm"][half].items()
-        }
-        lines.append(_VIEWS.format(words, **own))
+    for half, own in report["views_mm"].items():
+        if own["rms_z"] is not None:
+            lines.append(_VIEWS.format(half.replace("test", "held out"), **own))
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
     if advice := report["advice"]:
