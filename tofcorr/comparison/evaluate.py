@@ -31,11 +31,7 @@ from tofcorr.version import __version__
 
 # Of the RMS error in z: offset and tilts of whole images, which no model of a pixel sees; the rest;
 # and all of it with each held-out plane estimated again within its covariance, if it has one.
-_VIEWS = {
-    "z, between views": "between_views_mm",
-    "z, within views": "within_views_mm",
-    "z, planes in their covariance": "within_prior_mm",
-}
+_VIEWS = "between_views_mm", "within_views_mm", "within_prior_mm"
 
 
 @dataclass(frozen=True, repr=False)
@@ -181,25 +177,19 @@ class EvaluationResult:
         if self.options.repeats.number:
             found.append(self._repeats_table("rms_mm", "distance to the plane"))
             found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
-            found += [self._repeats_table(own, f"error, {name}") for name, own in _VIEWS.items()]
+            found += [self._repeats_table(of, f"error in z {_in_words(of)}") for of in _VIEWS]
             found.append(self._tests_table("repeats", "rms_mm"))
         found.append(self._views_table())
         return found
 
     def _views_table(self) -> Table:
-        parts = [
-            (one, name, one.values["half"][of]) for one in self.sets for name, of in _VIEWS.items()
-        ]
-        rows = [
-            [f"{one.name}: {name}", *(f"{own[k][0]:.2f}" for k in self.options.columns)]
-            for one, name, own in parts
-        ]
+        columns, each = self.options.columns, [(one, of) for one in self.sets for of in _VIEWS]
+        found = [(f"{one.name}: {_in_words(of)}", one.values["half"][of]) for one, of in each]
+        rows = [[name, *(f"{own[column][0]:.2f}" for column in columns)] for name, own in found]
         note = (
             "Between views: offset and tilts of whole images, which no model of a pixel corrects."
         )
-        return self._table(
-            "Parts of the RMS error of the z depth, mm, on the half held out", rows, note
-        )
+        return self._table("Parts of the half's RMS error of the z depth, mm", rows, note)
 
     def _table(self, title: str, rows: list[list[str]], note: str) -> Table:
         seed = f" Seed {self.options.seed}." if "seed" not in note else ""
@@ -327,6 +317,10 @@ def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
         for first, second in pairs(columns)
         if first == models[0] or columns.index(second) == columns.index(first) + 1
     ]
+
+
+def _in_words(metric: str) -> str:
+    return metric.removesuffix("_mm").replace("_", " ")
 
 
 def _interval(found: Estimate) -> str:

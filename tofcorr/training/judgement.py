@@ -241,11 +241,11 @@ def report_text(report: Mapping[str, Any]) -> str:
         errors = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
         text = ["-" if one is None else f"{one:.2f}" for one in errors]
         lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
+    if report["hand_eye"]["estimated"]:
+        lines += _hand_eye_lines(report)
     for half, own in report["views_mm"].items():
         if own["rms_z"] is not None:
             lines.append(_VIEWS.format(half.replace("test", "held out"), **own))
-    if report["hand_eye"]["estimated"]:
-        lines += _hand_eye_lines(report)
     if advice := report["advice"]:
         largest = f"{advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad)"
         direction = report["observability"]["weakest"][0]["direction"]
