@@ -73,8 +73,8 @@ def fit_residual(
     chosen = min(range(len(tried)), key=lambda k: float(tried[k][1, 1].mean()))
     if not gate(tried[0][1], tried[chosen][1]) < LEVEL:
         chosen = 0
-    # The probability of the best of those that were tried (Bonferroni).
-    p_value = min(1.0, len(tried) * gate(*tried[chosen]))
+    # The first is no choice; of another the probability is that of the best tried (Bonferroni).
+    p_value = min(1.0, (len(tried) if chosen else 1) * gate(*tried[chosen]))
     network, best = None, core.solution.parameters
     if options.keep == "always" or p_value < LEVEL:
         network, best = _train(core, error, sample, untrained(_STRETCHES[chosen]), options)
