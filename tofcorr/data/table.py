@@ -30,9 +30,20 @@ REQUIRED_COLUMNS = ("frame", *NUMBERS, "target")
 """Columns that every recording has, in the order in which they are written."""
 COLUMN_OF = {"pose_id": "pose_id", **{each.name: each.column for each in OPTIONAL_CONDITIONS}}
 """Columns that a recording may lack, by the attribute of `FrameTable` that holds them."""
-_PLANE, _UPPER = (*NORMAL, "d"), np.triu_indices(4)
-PLANE_COVARIANCE = [f"{_PLANE[i]}_{_PLANE[j]}" for i, j in zip(*_UPPER, strict=True)]
+PLANE_COVARIANCE = [
+    "nx_nx",
+    "nx_ny",
+    "nx_nz",
+    "nx_d",
+    "ny_ny",
+    "ny_nz",
+    "ny_d",
+    "nz_nz",
+    "nz_d",
+    "d_d",
+]
 """Columns of the covariance of (nx, ny, nz, d): all ten, or none."""
+_UPPER = np.triu_indices(4)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
