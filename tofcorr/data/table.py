@@ -30,18 +30,7 @@ REQUIRED_COLUMNS = ("frame", *NUMBERS, "target")
 """Columns that every recording has, in the order in which they are written."""
 COLUMN_OF = {"pose_id": "pose_id", **{each.name: each.column for each in OPTIONAL_CONDITIONS}}
 """Columns that a recording may lack, by the attribute of `FrameTable` that holds them."""
-PLANE_COVARIANCE = [
-    "nx_nx",
-    "nx_ny",
-    "nx_nz",
-    "nx_d",
-    "ny_ny",
-    "ny_nz",
-    "ny_d",
-    "nz_nz",
-    "nz_d",
-    "d_d",
-]
+COVARIANCE = ["nx_nx", "nx_ny", "nx_nz", "nx_d", "ny_ny", "ny_nz", "ny_d", "nz_nz", "nz_d", "d_d"]
 """Columns of the covariance of (nx, ny, nz, d): all ten, or none."""
 _UPPER = np.triu_indices(4)
 
@@ -114,8 +103,8 @@ def read_table(path: Path) -> FrameTable:
             and frame.
     """
     cells = _read_cells(path)
-    has_covariance = PLANE_COVARIANCE[0] in cells
-    needed = [*REQUIRED_COLUMNS, *(PLANE_COVARIANCE if has_covariance else ())]
+    has_covariance = COVARIANCE[0] in cells
+    needed = [*REQUIRED_COLUMNS, *(COVARIANCE if has_covariance else ())]
     missing = [name for name in needed if name not in cells]
     if missing:
         raise CalibrationDataError(f"{path}: column {_names(missing)} is missing.")
@@ -153,7 +142,7 @@ def read_table(path: Path) -> FrameTable:
 
 def _plane_covariance(cells: dict[str, list[str]], path: Path) -> np.ndarray:
     """Return the covariances, shape (N, 4, 4)."""
-    numbers = np.stack([_numbers(cells, name, path) for name in PLANE_COVARIANCE], axis=1)
+    numbers = np.stack([_numbers(cells, name, path) for name in COVARIANCE], axis=1)
     found = np.zeros((len(numbers), 4, 4))
     found[:, *_UPPER] = found[:, *_UPPER[::-1]] = numbers
     least = np.linalg.eigvalsh(found)
@@ -205,7 +194,7 @@ def table_text(rows: Iterable[FrameRow]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     # Of some planes alone nothing can be weighed.
     known = all(row.plane_covariance is not None for row in rows)
-    names = PLANE_COVARIANCE if known else []
+    names = COVARIANCE if known else []
     writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept), *names])
     for frame, row in enumerate(rows):
         # The csv module writes None as an empty cell: unknown.
