@@ -142,7 +142,7 @@ def _predicted_rms(recording: "Recording", wall: str) -> float:
     unseen = np.flatnonzero(data.targets == wall)
     model = _fit(recording, _PARABOLA, seen).model
     data = walls_alone(data, unseen, model).put_into(data)
-    return frame_errors(data, {"after": model})["after"].rms_mm(unseen)
+    return frame_errors(data, {"after": model})["after"]["to_plane"].rms_mm(unseen)
 
 
 def _drawn(found: dict[str, dict[str, Any]]) -> "Figure":

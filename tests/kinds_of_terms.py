@@ -53,7 +53,7 @@ def randomise(
     with torch.no_grad():
         for name, value in [*model.named_parameters(), *model.named_buffers()]:
             if isinstance(value, torch.nn.Parameter) or name.endswith("offset"):
-                scale = of_network if "residual" in name else size
+                scale = of_network if "residual.p" in name else size  # Places, and radii.
                 value.copy_(scale * torch.randn(value.shape, generator=generator))
 
 

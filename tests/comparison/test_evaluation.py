@@ -41,7 +41,7 @@ def test_every_split_is_measured_as_a_training_on_its_frames_would_be(
         train = np.setdiff1d(np.arange(dataset.num_frames), test)
         for named in options().models:
             trained = fit(dataset, train, TrainingOptions(name="x", model=named.model), domain)
-            expected = frame_errors(dataset, {"x": trained.model})["x"]
+            expected = frame_errors(dataset, {"x": trained.model})["x"]["to_plane"]
             found = [values[metric][named.name][-1] for metric in ("mean_abs_mm", "rms_mm")]
             # Both fits end within a millionth of a standard error of the optimum.
             assert found == pytest.approx([expected.mean_abs_mm(test), expected.rms_mm(test)], 1e-6)
@@ -57,7 +57,7 @@ def test_before_has_no_correction_and_hand_eye_only_no_term(
     hand_eye = HandEye(dataset.first.tool_from_camera)
     bare = CalibrationModel(ErrorModel(ErrorModelOptions(), domain), hand_eye)
     test = evaluation.splits["half"]["half"]
-    expected = frame_errors(dataset, {"bare": bare})["bare"].mean_abs_mm(test)
+    expected = frame_errors(dataset, {"bare": bare})["bare"]["to_plane"].mean_abs_mm(test)
     found = evaluation.values["half"]["mean_abs_mm"]
     assert found[BEFORE][0] == pytest.approx(expected, rel=1e-12)
     assert found["EA"][0] < found[HAND_EYE_ONLY][0] < found[BEFORE][0]

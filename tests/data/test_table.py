@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow, read_table, table_text
+from tofcorr.errors import CalibrationDataError
 
 
 def test_an_empty_optional_cell_is_unknown_and_not_zero(folder: Path) -> None:
@@ -95,3 +96,19 @@ def test_any_pose_and_time_survive_the_table(
     np.testing.assert_allclose(present(table.integration_time), [seconds], rtol=1e-14)
     assert (table.offset[0], table.timestamp[0]) == (pytest.approx(metres, rel=1e-14), metres)
     assert table.target[0] == 'a, "b"'
+
+
+def test_covariances_of_planes_survive_the_table_and_others_are_refused(tmp_path: Path) -> None:
+    root = np.random.default_rng(0).normal(size=(2, 4, 4))
+    known, pose, path = root @ root.transpose(0, 2, 1), np.eye(4), tmp_path / "frames.csv"
+    plane: dict[str, Any] = {"normal_world": pose[2, :3], "offset": 1.0, "target": "white"}
+    plane |= {"world_from_tool": pose, "timestamp": 0.0}
+    path.write_text(table_text([FrameRow(**plane, plane_covariance=one) for one in known]))
+    np.testing.assert_array_equal(read_table(path).plane_covariance, known)
+    text = path.read_text()
+    path.write_text(text.replace(",nz_d,", ",other,"))
+    with pytest.raises(CalibrationDataError, match="column 'nz_d' is missing"):
+        read_table(path)
+    path.write_text(text.replace(repr(float(known[1, 3, 3])), "-1.0"))
+    with pytest.raises(CalibrationDataError, match="frame 1: nx_nx to d_d are no covariance"):
+        read_table(path)

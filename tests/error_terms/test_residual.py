@@ -16,8 +16,8 @@ COLUMNS = torch.arange(7, dtype=torch.float64)[None, :]
 
 def trained(generator: Generator, domain: Domain = DOMAIN) -> ResidualNetwork:
     network = ResidualNetwork(ResidualNetworkOptions(bound_mm=15.0), domain)
-    size = network.weight_vector().shape
-    network.set_weight_vector(3 * torch.randn(size, generator=generator, dtype=torch.float64))
+    with torch.no_grad():
+        network.weights.copy_(0.02 * torch.randn(len(network.weights), generator=generator))
     return network
 
 
@@ -45,6 +45,27 @@ def test_it_fades_to_zero_outside_the_calibrated_ranges(generator: Generator) ->
     distance = torch.linspace(2.9, 3.2, 3001, dtype=torch.float64)[:, None, None]
     found = network(distance, torch.full_like(distance, 100.0), ROWS, COLUMNS)
     assert float(found.detach().diff(dim=0).abs().max()) < 1e-4
+
+
+def test_it_is_zero_a_radius_away_from_all_that_it_has_seen_and_smooth_on_the_way(
+    generator: Generator,
+) -> None:
+    network = trained(generator)
+    distance = 1.2 + 0.05 * torch.randn(500, generator=generator).double().clamp(-2, 2)
+    rows, columns = (torch.full_like(distance, one) for one in (1.0, 2.0))
+    seen = network.scaled(distance, 100 * torch.ones_like(distance), rows, columns)
+    network.look_at(seen)
+    with torch.no_grad():
+        network.weights.mul_(0.02)  # Below the bound, which has an edge.
+    assert all((seen == place).all(dim=1).any() for place in network.places)
+    # One and a half times half of the range of 2 m beyond the farthest one that was seen.
+    edge = float(distance.max()) + 1.5
+    path = torch.linspace(1.1, 2.9, 10001, dtype=torch.float64)
+    found = network(path, torch.full_like(path, 100.0), *(one[:1] for one in (rows, columns)))
+    assert found[path < 1.4].abs().max() > 1e-4
+    assert not found[path >= edge].any()
+    slope = found.detach().diff() / path.diff()
+    assert float(slope.diff().abs().max()) < 0.03 * float(slope.abs().max())
 
 
 def test_it_scripts_identically_and_needs_no_amplitude(generator: Generator) -> None:

@@ -11,6 +11,7 @@ from synthetic_scene import EA
 from tofcorr.correction.state import load_calibration, save_calibration
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import Fit
+from tofcorr.fit.residual import gate
 from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.passes import frame_errors
 from tofcorr.simulation.signal import PixelDelayOptions, pixel_delay
@@ -38,7 +39,7 @@ def fitted(dataset: Dataset, terms: list[dict], **options: object) -> Fit:
 
 
 def held_out(dataset: Dataset, found: Fit) -> float:
-    return frame_errors(dataset, {"model": found.model})["model"].rms_mm(TEST)
+    return frame_errors(dataset, {"model": found.model})["model"]["to_plane"].rms_mm(TEST)
 
 
 @pytest.fixture(scope="module")
@@ -68,12 +69,24 @@ def test_network_is_dropped_where_the_core_is_the_truth(tmp_path: Path) -> None:
     assert held_out(dataset, found) == held_out(dataset, fitted(dataset, CORE))
 
 
+def test_gate_refuses_a_worse_tail_beside_a_better_mean(generator: torch.Generator) -> None:
+    absolute = 4 + torch.rand(60, generator=generator).double()
+    without = torch.stack([absolute, 1.5 * absolute.square()])
+    better = without * torch.tensor([[0.8], [0.7]])
+    tail = better.clone()
+    tail[1, :3] += 400  # Three views are far off.
+    assert gate(without, better) < 1e-6
+    assert gate(without[:1], tail[:1]) < 1e-6
+    assert gate(without, tail) > 0.5
+    assert gate(without[:, :2], better[:, :2]) == 1
+
+
 def test_joint_training_lowers_the_loss_of_the_sample_further(wavy: Dataset) -> None:
     short = NETWORK | {"keep": "always", "iterations": 20, "folds": 2}
     apart = fitted(wavy, CORE, residual=short | {"joint": False})
     joint = fitted(wavy, CORE, residual=short)
     errors = frame_errors(wavy, {"apart": apart.model, "joint": joint.model})
-    assert errors["joint"].rms_mm(TRAIN) < errors["apart"].rms_mm(TRAIN)
+    assert errors["joint"]["to_plane"].rms_mm(TRAIN) < errors["apart"]["to_plane"].rms_mm(TRAIN)
     moved = joint.solution.parameters.coefficients - apart.solution.parameters.coefficients
     assert moved.abs().max() > 0
 

@@ -29,6 +29,10 @@ from tofcorr.training.figures import save_figure
 from tofcorr.training.report import number_or_none
 from tofcorr.version import __version__
 
+# Of the RMS error in z: offset and tilts of whole images, which no model of a pixel sees; the rest;
+# and all of it with each held-out plane estimated again within its covariance, if it has one.
+_VIEWS = "between_views_mm", "within_views_mm", "within_prior_mm"
+
 
 @dataclass(frozen=True, repr=False)
 class EvaluationResult:
@@ -174,9 +178,20 @@ class EvaluationResult:
         if self.options.repeats.number:
             found.append(self._repeats_table("rms_mm", "distance to the plane"))
             found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
+            found += [self._repeats_table(of, f"error in z {_in_words(of)}") for of in _VIEWS]
             found.append(self._tests_table("repeats", "rms_mm"))
+        found.append(self._views_table())
         walls = any(len(one.targets) > 1 for one in self.sets)
         return [*found, self._walls_table()] if walls else found
+
+    def _views_table(self) -> Table:
+        columns, each = self.options.columns, [(one, of) for one in self.sets for of in _VIEWS]
+        found = [(f"{one.name}: {_in_words(of)}", one.values["half"][of]) for one, of in each]
+        rows = [[name, *(f"{own[column][0]:.2f}" for column in columns)] for name, own in found]
+        note = (
+            "Between views: offset and tilts of whole images, which no model of a pixel corrects."
+        )
+        return self._table("Parts of the half's RMS error of the z depth, mm", rows, note)
 
     def _table(self, title: str, rows: list[list[str]], note: str) -> Table:
         seed = f" Seed {self.options.seed}." if "seed" not in note else ""
@@ -319,6 +334,10 @@ def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
         for first, second in pairs(columns)
         if first == models[0] or columns.index(second) == columns.index(first) + 1
     ]
+
+
+def _in_words(metric: str) -> str:
+    return metric.removesuffix("_mm").replace("_", " ")
 
 
 def _interval(found: Estimate) -> str:

@@ -24,7 +24,7 @@ from tofcorr.fit.fitting import fit, hand_eye_alone
 from tofcorr.fit.problem import FitOptions, Problem, build_model, refuse_missing_inputs
 from tofcorr.fit.walls import FoundWalls, recorded_walls, walls_alone, with_every_wall
 from tofcorr.pixels.dataset import Dataset, covered_domain, hand_eye_is_free, recorded_hand_eye
-from tofcorr.pixels.passes import FittedModel, FrameErrors, held_out_errors, image_moments
+from tofcorr.pixels.passes import FittedModel, FrameErrors, held_out_errors, image_moments, views_mm
 from tofcorr.pixels.sample import MaskOptions, usable_pixels
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import LOG, through
@@ -49,6 +49,9 @@ METRICS: dict[str, Callable[[dict[str, FrameErrors]], float]] = {
     "rms_mm": lambda errors: errors["to_plane"].rms_mm(),
     "rms_along_ray_mm": lambda errors: errors["along_ray"].rms_mm(),
     "rms_z_mm": lambda errors: errors["in_z"].rms_mm(),
+    "between_views_mm": lambda errors: views_mm(errors)["between_views"],
+    "within_views_mm": lambda errors: views_mm(errors)["within_views"],
+    "within_prior_mm": lambda errors: views_mm(errors)["within_prior"],
 }
 
 
@@ -262,7 +265,7 @@ class ModelFitter:
             fitted = f"{model.name}, fitted to {len(train)} frames"
             self.warnings.append(f"{fitted}: {found.solution.message}")
         planes = self._judged_against(found.walls, model.name, held_out, found.model)
-        return FittedModel(found.model, held_out, planes)
+        return FittedModel(found.model, held_out, planes, found.observability.variance)
 
     def size(self, model: ComparedModel) -> float:
         """Return about how long a model takes to fit, in times one without terms.

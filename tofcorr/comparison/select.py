@@ -13,7 +13,6 @@ from tofcorr.comparison.options import SelectionOptions, comparability_notes, ma
 from tofcorr.comparison.statistics import Ranking, Table
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.files import staged_folder, write_json
 from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
@@ -234,5 +233,5 @@ def _complexity(training: TrainingOptions, domain: Domain, dataset: Dataset) -> 
     if training.planes == "unknown":
         unknowns += 3 * len(name_walls(dataset)[1])
     if training.residual is not None:
-        unknowns += ResidualNetwork(training.residual.network, domain).weight_vector().numel()
+        unknowns += training.residual.network.width
     return unknowns

@@ -176,7 +176,7 @@ class CalibrationState(CalibrationExtras, Setting):
         """
         pattern, network = error.fixed_pattern, error.residual
         residual = None
-        if network is not None and bool(network.last.weight.any() or network.last.bias.any()):
+        if network is not None and bool(network.weights.any()):
             weights = network.weight_vector().double()
             residual = ResidualState(options=network.options, weights=weights)
         return cls(

@@ -30,6 +30,9 @@ REQUIRED_COLUMNS = ("frame", *NUMBERS, "target")
 """Columns that every recording has, in the order in which they are written."""
 COLUMN_OF = {"pose_id": "pose_id", **{each.name: each.column for each in OPTIONAL_CONDITIONS}}
 """Columns that a recording may lack, by the attribute of `FrameTable` that holds them."""
+COVARIANCE = ["nx_nx", "nx_ny", "nx_nz", "nx_d", "ny_ny", "ny_nz", "ny_d", "nz_nz", "nz_d", "d_d"]
+"""Columns of the covariance of (nx, ny, nz, d): all ten, or none."""
+_UPPER = np.triu_indices(4)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,6 +45,8 @@ class FrameRow(Conditions[Value]):
         offset: d of that plane, metres.
         target: `white`, `checkerboard` or another name.
         pose_id: Frames with the same id were taken without moving; None if unknown.
+        plane_covariance: Of (nx, ny, nz, d), shape (4, 4), without unit and metres: what is not
+            known of the plane, independent of that of other poses; None: unknown, taken as zero.
     """
 
     world_from_tool: np.ndarray
@@ -49,15 +54,16 @@ class FrameRow(Conditions[Value]):
     offset: Value
     target: Any
     pose_id: Any = None
+    plane_covariance: Any = None
 
 
 class FrameTable(FrameRow[np.ndarray]):
     """The rows of `frames.csv` as arrays, one entry per frame; units as in `FrameRow`.
 
-    A condition has shape (N,), and so have offsets, and targets and pose ids as text; poses have
-    shape (N, 4, 4), normals (N, 3), of exactly unit length. An optional column that the file lacks
-    is None. An empty cell in an optional column is NaN (the empty text in `pose_id`): unknown,
-    never zero.
+    A condition has shape (N,), and so have offsets, and targets and pose ids as text; poses and
+    covariances have shape (N, 4, 4), normals (N, 3), of exactly unit length. An optional column
+    that the file lacks is None. An empty cell in an optional column is NaN (the empty text in
+    `pose_id`): unknown, never zero.
     """
 
     def __len__(self) -> int:
@@ -97,7 +103,9 @@ def read_table(path: Path) -> FrameTable:
             and frame.
     """
     cells = _read_cells(path)
-    missing = [name for name in REQUIRED_COLUMNS if name not in cells]
+    has_covariance = COVARIANCE[0] in cells
+    needed = [*REQUIRED_COLUMNS, *(COVARIANCE if has_covariance else ())]
+    missing = [name for name in needed if name not in cells]
     if missing:
         raise CalibrationDataError(f"{path}: column {_names(missing)} is missing.")
     if not cells["frame"]:
@@ -123,12 +131,26 @@ def read_table(path: Path) -> FrameTable:
         offset=number["d"] / length,
         target=np.array(cells["target"]),
         pose_id=np.array(cells["pose_id"]) if "pose_id" in cells else None,
+        plane_covariance=_plane_covariance(cells, path) if has_covariance else None,
         **{
             each.name: each.si_per_unit * _numbers(cells, each.column, path, each)
             for each in OPTIONAL_CONDITIONS
             if each.column in cells
         },
     )
+
+
+def _plane_covariance(cells: dict[str, list[str]], path: Path) -> np.ndarray:
+    """Return the covariances, shape (N, 4, 4)."""
+    numbers = np.stack([_numbers(cells, name, path) for name in COVARIANCE], axis=1)
+    found = np.zeros((len(numbers), 4, 4))
+    found[:, *_UPPER] = found[:, *_UPPER[::-1]] = numbers
+    least = np.linalg.eigvalsh(found)
+    # What is zero is rounded to the digits of the largest.
+    for frame in np.flatnonzero(least[:, 0] < -UNIT_LENGTH_TOLERANCE * least[:, -1])[:1]:
+        said = "nx_nx to d_d are no covariance: a variance is negative"
+        raise CalibrationDataError(f"{path}: frame {frame}: {said}.")
+    return found
 
 
 def rigid_transforms(
@@ -170,10 +192,14 @@ def table_text(rows: Iterable[FrameRow]) -> str:
     kept = {name: cells for name, cells in optional.items() if any(c is not None for c in cells)}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept)])
+    # Of some planes alone nothing can be weighed.
+    known = all(row.plane_covariance is not None for row in rows)
+    names = COVARIANCE if known else []
+    writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept), *names])
     for frame, row in enumerate(rows):
         # The csv module writes None as an empty cell: unknown.
         more = [cells[frame] for cells in kept.values()]
+        more += row.plane_covariance[_UPPER].tolist() if known else []
         writer.writerow([frame, *_required_cells(row), row.target, *more])
     return text.getvalue()
 

@@ -1,5 +1,6 @@
-"""A small network that learns the error that remains after the terms."""
+"""A small network that learns the error that remains after the terms, where it has seen it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,22 +12,22 @@ from tofcorr.error_terms.base import DescribedModule, DescribedOptions, Domain, 
 # Beyond the calibrated range the network fades to zero within this share of its half-width (no
 # unit). Set by hand: short against the range, and long enough for a smooth step.
 _FADE = 0.1
-# Standard deviation of the first layer's weights at the start (no unit): a neuron's step then
-# spans about a quarter of an input's range, so that waves can be learnt. Set by hand.
-_STEEPNESS = 3.0
 
 
 class ResidualNetworkOptions(DescribedOptions):
     """Options of `ResidualNetwork`.
 
     Attributes:
-        width: Neurons of each of the two hidden layers.
+        width: Neurons: how many places the network learns about.
         bound_mm: The network never adds more than this.
-        seed: Seed of the hidden layers' random start.
+        radius: How far a place is felt, in half-widths of the ranges of distance, log amplitude,
+            rows and columns; a fit may stretch it. On views of a Kinect v2, 1.5 and 2 err as much.
+        seed: Seed of the places at the start; a fit puts them where it has seen pixels.
     """
 
-    width: PositiveInt = Field(default=16, le=128)
+    width: PositiveInt = Field(default=256, le=1024)
     bound_mm: PositiveFloat = 20.0
+    radius: PositiveFloat = 1.5
     seed: NonNegativeInt = 0
 
     def structure(self) -> dict[str, Any]:
@@ -37,17 +38,21 @@ class ResidualNetworkOptions(DescribedOptions):
 
 
 class ResidualNetwork(DescribedModule):
-    r"""Two hidden layers of tanh, added to the terms: bounded, and zero until it is trained.
+    r"""Radial functions around places that were seen: bounded, and zero far from all of them.
 
-    .. math:: R = b \, f(D) f(I) \tanh(w^T h(D, \ln I, r, c))
+    .. math:: R = \Big[ f(D) f(I) \sum_k w_k\, \phi(|s (x - x_k)|) \Big]_{-b}^{b}, \qquad
+        \phi(d) = (1 - d)_+^5 (5 d + 1)
 
-    The last layer starts at zero, so that an untrained network predicts exactly nothing. The
-    fades f are one inside the calibrated ranges and fall smoothly to zero outside: where the
-    network has learnt nothing, it adds nothing.
+    with :math:`x = (D, \ln I, r, c)`, all on the scale of their ranges, and reciprocal radii s.
+    Wendland's function (1995) is positive definite in five dimensions and zero from 1 on: at a
+    radius from every place :math:`x_k`, where the network has learnt nothing, it adds nothing.
+    The fades f do the same outside the calibrated ranges. Untrained weights w are zero, so that
+    an untrained network predicts exactly nothing.
 
     Args:
         options: Width and bound.
         domain: The ranges scale the inputs; without amplitudes the network does not read them.
+        stretch: How many times longer the radius is along each input.
 
     Shape:
         - Input: `(*)` radial distances in metres, amplitudes in the camera's units, rows and
@@ -59,7 +64,9 @@ class ResidualNetwork(DescribedModule):
     half_width: Tensor
     floor: Tensor
 
-    def __init__(self, options: ResidualNetworkOptions, domain: Domain) -> None:
+    def __init__(
+        self, options: ResidualNetworkOptions, domain: Domain, stretch: Sequence[float] = (1,) * 4
+    ) -> None:
         super().__init__()
         self.options = options
         self.uses_amplitude: bool = domain.amplitude is not None
@@ -75,10 +82,13 @@ class ResidualNetwork(DescribedModule):
             self.register_buffer(name, torch.tensor(numbers, dtype=torch.float64))
         self.margin: float = _FADE
         self.bound: float = options.bound_mm / 1000
-        self.first = nn.Linear(4, options.width, dtype=torch.float64)
-        self.second = nn.Linear(options.width, options.width, dtype=torch.float64)
-        self.last = nn.Linear(options.width, 1, dtype=torch.float64)
-        _initialise(self.first, self.second, self.last, seed=options.seed)
+        self.width: int = options.width
+        generator = torch.Generator().manual_seed(options.seed)
+        places = 2 * torch.rand(options.width, 4, generator=generator, dtype=torch.float64) - 1
+        self.places = nn.Parameter(places)
+        radii = options.radius * torch.tensor(stretch, dtype=torch.float64)
+        self.per_radius = nn.Parameter(1 / radii)
+        self.weights = nn.Parameter(torch.zeros(options.width, dtype=torch.float64))
 
     def description(self) -> dict[str, Any]:
         """Return size, bound, and whether the network reads amplitudes."""
@@ -88,50 +98,56 @@ class ResidualNetwork(DescribedModule):
         self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
     ) -> Tensor:
         """Return the predicted error, shape (...), metres."""
-        return self.of_scaled(*self.scaled(radial_distance, amplitude, rows, columns))
+        inputs = self.scaled(radial_distance, amplitude, rows, columns)
+        total = torch.zeros_like(inputs[..., 0])
+        # Sixteen images of temporaries at once, not hundreds.
+        for first in range(0, self.width, 16):
+            near = self.functions(inputs, self.places[first : first + 16])
+            total = total + (near * self.weights[first : first + 16]).sum(dim=-1)
+        return (self.fade(inputs) * total).clamp(-self.bound, self.bound)
 
     def scaled(
         self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return what of `forward` depends on no weight: inputs (..., 4), and most metres (...)."""
+    ) -> Tensor:
+        """Return the inputs on the scale of their ranges, shape (..., 4)."""
         strength = torch.zeros_like(radial_distance)
         if self.uses_amplitude:
             strength = torch.maximum(amplitude, self.floor).log()
         given = torch.broadcast_tensors(radial_distance, strength, rows, columns)
         inputs = (torch.stack(given, dim=-1) - self.centre) / self.half_width
-        fade = self.fade(inputs[..., 0]) * self.fade(inputs[..., 1])
-        # Far outside, where the fade is zero, the network must still be finite.
-        return inputs.clamp(-2.0, 2.0), self.bound * fade
+        # Far outside, where every function is zero, the network must still be finite.
+        return inputs.clamp(-100.0, 100.0)
 
-    def of_scaled(self, inputs: Tensor, most: Tensor) -> Tensor:
-        """Return the predicted error, shape (...), metres, from what `scaled` returns."""
-        hidden = torch.tanh(self.second(torch.tanh(self.first(inputs))))
-        return most * torch.tanh(self.last(hidden).squeeze(-1))
+    def functions(self, inputs: Tensor, places: Tensor) -> Tensor:
+        """Return what the weights of some places (K, 4) multiply, shape (..., K)."""
+        apart = (inputs[..., None, :] - places) * self.per_radius
+        distance = torch.linalg.vector_norm(apart, dim=-1)
+        left = (1.0 - distance).clamp(min=0.0)
+        return left.square().square() * left * (5.0 * distance + 1.0)
 
-    def fade(self, scaled: Tensor) -> Tensor:
-        """Return 1 on [-1, 1], 0 beyond the fading zone, and a smooth step between."""
-        left = ((1.0 + self.margin - scaled.abs()) / self.margin).clamp(0.0, 1.0)
-        return left * left * (3.0 - 2.0 * left)
+    def fade(self, inputs: Tensor) -> Tensor:
+        """Return 1 in the calibrated ranges, 0 beyond the fading zone, and smooth steps between."""
+        left = ((1.0 + self.margin - inputs[..., :2].abs()) / self.margin).clamp(0.0, 1.0)
+        return (left * left * (3.0 - 2.0 * left)).prod(dim=-1)
+
+    @torch.no_grad()
+    def look_at(self, inputs: Tensor) -> None:
+        """Put the places where pixels were seen, each as far as can be from those before it.
+
+        Args:
+            inputs: What `scaled` returns of the pixels, shape (M, 4).
+        """
+        apart = torch.full_like(inputs[:, 0], torch.inf)
+        for place in self.places:
+            place.copy_(inputs[int(apart.argmax())])
+            own = ((inputs - place) * self.per_radius).square().sum(dim=1)
+            apart = torch.minimum(apart, own)
 
     def weight_vector(self) -> Tensor:
-        """Return all weights as one vector, detached, float64."""
+        """Return places, radii and weights as one vector, detached, float64."""
         return nn.utils.parameters_to_vector(self.parameters()).detach().clone()
 
     def set_weight_vector(self, values: Tensor) -> None:
-        """Set all weights from one vector; inverse of `weight_vector`."""
+        """Set places, radii and weights from one vector; inverse of `weight_vector`."""
         with torch.no_grad():
             nn.utils.vector_to_parameters(values.to(torch.float64), self.parameters())
-
-
-@torch.no_grad()
-def _initialise(first: nn.Linear, second: nn.Linear, last: nn.Linear, seed: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    # Steps of different width, their centres spread over the inputs' range.
-    first.weight.copy_(torch.randn(first.weight.shape, generator=generator) * _STEEPNESS)
-    middle = 2 * torch.rand(first.weight.shape, generator=generator) - 1
-    first.bias.copy_(-(first.weight * middle).sum(dim=1))
-    spread = second.in_features**-0.5
-    second.weight.copy_(torch.randn(second.weight.shape, generator=generator) * spread)
-    second.bias.zero_()
-    last.weight.zero_()
-    last.bias.zero_()

@@ -19,7 +19,7 @@ from torch import Tensor
 from tofcorr.estimation.linear import Curvature, NormalEquations
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.solvers import SolverOptions, minimise
-from tofcorr.geometry.rays import plane_in_frame, tangents
+from tofcorr.geometry.rays import plane_in_frame, plane_moves, tangents
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,35 @@ class Walls:
         self, moments: ImageMoments, parameters: Parameters
     ) -> Float[Tensor, "N S {self.size}"]:
         """Return the derivative of each image's residual vector by a step, (N, 3C + 1, 3G)."""
-        across, pose = tangents(self.normal_world)[self.index], self.world_from_tool
-        lever = (across * pose[:, None, :3, 3]).sum(dim=-1, keepdim=True)
-        turns = torch.cat([across @ pose[:, :3, :3], lever], dim=-1)
-        shift = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]]).to(turns).expand(len(turns), 1, 4)
-        own = (torch.cat([turns, shift], dim=1) @ parameters.by_entries()).mT
+        moves = plane_moves(self.normal_world)[self.index] @ self.world_from_tool
+        own = (moves @ parameters.by_entries()).mT
         everywhere = own.new_zeros(*own.shape[:2], len(self.offset), 3)
         everywhere[torch.arange(len(own)), :, self.index] = own
         return everywhere.flatten(2)
+
+
+def within_prior(
+    moments: ImageMoments, at: Parameters, precision: Float[Tensor, "N 3 3"]
+) -> ImageMoments:
+    r"""Return moments whose loss is the least over each image's plane, within a prior.
+
+    With the moves J of the residual vector p by two turns and a shift, and their precision P,
+
+    .. math:: \min_\delta\, (p + J\delta)^T G\, (p + J\delta) + \delta^T P \delta
+        = p^T \big(G - G J (J^T G J + P)^{-1} J^T G\big) p ,
+
+    which is generalised least squares with the residuals' covariance :math:`1 + J P^{-1} J^T`.
+
+    Args:
+        moments: Of the images, with their planes as measured.
+        at: Parameters near the solution; the moves hardly depend on them.
+        precision: Inverse covariance of the steps of `plane_moves` in the tool frame, in the unit
+            of the loss.
+    """
+    moves = (plane_moves(moments.normal_tool) @ at.by_entries()).mT
+    lever = moments.gram @ moves
+    moved = lever @ torch.linalg.solve(moves.mT @ lever + precision, lever.mT)
+    return replace(moments, gram=moments.gram - moved)
 
 
 def joint_image_equations(

@@ -35,7 +35,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import Curvature, solvable
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.planes import estimate_walls, joint_image_equations
+from tofcorr.estimation.planes import estimate_walls, joint_image_equations, within_prior
 from tofcorr.estimation.regularisation import (
     penalties_of,
     smoothness,
@@ -55,6 +55,7 @@ from tofcorr.fit.problem import Core, Fit, FitOptions, Problem, Shift, build_mod
 from tofcorr.fit.residual import fit_residual
 from tofcorr.fit.walls import recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights
+from tofcorr.geometry.rays import plane_precision
 from tofcorr.pixels.dataset import Dataset, Frames, thread_number
 from tofcorr.pixels.passes import image_moments
 from tofcorr.pixels.sample import distance_to_plane, estimate_noise, pixels_of_image
@@ -183,8 +184,17 @@ def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
 def _on_walls(
     problem: Problem, moments: ImageMoments, *, held: bool = True
 ) -> tuple[Problem, Core]:
-    """Solve; where the walls are unknown, estimate them with the unknowns, and solve on them."""
-    core = solve(problem, moments, held=held)
+    """Solve; then on walls that are estimated, or within what is not known of each image's."""
+    core, covariance = solve(problem, moments, held=held), problem.dataset.plane_covariance()
+    if not problem.estimates_walls and covariance is not None:
+        best, poses = core.solution.parameters, problem.poses()
+        variance = effective_variance(core.moments, best)
+        known = variance * plane_precision(moments.normal_tool, covariance[problem.frames])
+        # Images of one pose share the error of its plane: together they are held by one prior.
+        known = known / torch.bincount(poses)[poses][:, None, None]
+        at = replace(best, coefficients=best.coefficients[: len(moments.symbols)])
+        again = replace(problem, resumed=best)
+        return problem, solve(again, within_prior(moments, at, known), held=held)
     if not problem.estimates_walls:
         return problem, core
     found, best = recorded_walls(problem.dataset, problem.frames), core.solution.parameters

@@ -225,6 +225,24 @@ def tangents(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
     return torch.stack([first, torch.linalg.cross(normal, first)], dim=-2)
 
 
+def plane_moves(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 4"]:
+    """Return what two turns about `tangents` and a shift add to (n, d), a row each."""
+    turns = torch.nn.functional.pad(tangents(normal), (0, 1))
+    shift = torch.nn.functional.pad(torch.zeros_like(normal), (0, 1), value=1.0)
+    return torch.cat([turns, shift[..., None, :]], dim=-2)
+
+
+def plane_precision(
+    normal: Float[Tensor, "*batch 3"], covariance: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Return the inverse covariance of the steps of `plane_moves`, from that of (n, d).
+
+    A hundredth of a millimetre, or milliradian, is added: what is known better is known exactly.
+    """
+    moves, least = plane_moves(normal), torch.eye(3).to(normal) / 100_000**2
+    return torch.linalg.inv(moves @ covariance @ moves.mT + least)
+
+
 SPEED_OF_LIGHT = 299_792_458.0
 """In vacuum, metres per second. Exact by the definition of the metre."""
 # How far an error may be from a whole number of unambiguous ranges, metres. Chosen: twice what

@@ -128,6 +128,15 @@ class Dataset:
         every = [getattr(recording.frames, name) for recording in self.recordings]
         return torch.from_numpy(np.concatenate(every))
 
+    def plane_covariance(self) -> Float[Tensor, "N 4 4"] | None:
+        """Return the covariances of (n, d) in the tool frame; None unless all recordings have them.
+
+        Planes that were estimated have none: what is not known of them is all of them.
+        """
+        known = all(one.frames.plane_covariance is not None for one in self.recordings)
+        pose, used = self.column("world_from_tool"), known and not self.planes_are_estimated
+        return pose.mT @ self.column("plane_covariance") @ pose if used else None
+
     @property
     def targets(self) -> np.ndarray:
         """Each frame's target, shape (N,), text."""

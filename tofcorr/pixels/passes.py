@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -22,7 +22,7 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import Pixels
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, concatenate
-from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.geometry.rays import plane_in_frame, plane_moves, plane_precision
 from tofcorr.pixels.dataset import Dataset, Frames, in_threads, thread_number
 from tofcorr.pixels.sample import pixels_of_image
 
@@ -116,10 +116,11 @@ def image_moments(
     return concatenate([moments for _, moments in everything]).images(order)
 
 
-KINDS = ("to_plane", "along_ray", "in_z")
+KINDS = ("to_plane", "along_ray", "in_z", "within_views", "within_prior")
 """Kinds of error: the distance of the corrected points to the target's plane, which is what is
 fitted; corrected minus true distance along the viewing ray, larger at oblique rays; corrected minus
-true depth along the optical axis, at the same ray."""
+true depth along the optical axis, at the same ray; what is left of that without the offset and the
+two tilts of each image; and with each image's plane estimated again within its covariance."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,21 @@ class FrameErrors:
         return float(sums[inside].sum() / count) if count else math.nan
 
 
+ErrorsByKind = Mapping[str, FrameErrors]
+"""Of one model, by the names of `KINDS`."""
+
+
+def views_mm(errors: ErrorsByKind, frames: np.ndarray | None = None) -> dict[str, float]:
+    """Return RMS errors in z, mm: all, between views, within them, and with planes in their prior.
+
+    The part between views is offset and tilts of whole images.
+    """
+    all_of_it, within, again = (errors[kind].rms_mm(frames) for kind in KINDS[2:])
+    between = math.sqrt(np.maximum(all_of_it**2 - within**2, 0.0))
+    found = {"rms_z": all_of_it, "between_views": between}
+    return found | {"within_views": within, "within_prior": again}
+
+
 @dataclass(frozen=True)
 class FittedModel:
     """A model fitted to training frames, and what measures it.
@@ -160,20 +176,26 @@ class FittedModel:
         model: Error model and hand-eye transform.
         held_out: Global numbers of the frames that measure it.
         planes: The data set whose planes it is judged against; None: that which measures it.
+        variance: Effective variance of a residual, square metres, against which the covariance of
+            the planes is weighed; 0: the planes as given.
     """
 
     model: CalibrationModel
     held_out: np.ndarray
     planes: Dataset | None = None
+    variance: float = 0.0
 
 
 def frame_errors(
-    dataset: Dataset, models: Mapping[str, CalibrationModel], device: str = "cpu"
-) -> dict[str, FrameErrors]:
-    """Return the distances to the plane that models leave on all frames."""
+    dataset: Dataset,
+    models: Mapping[str, CalibrationModel],
+    device: str = "cpu",
+    scale: float = 0.0,
+) -> dict[str, ErrorsByKind]:
+    """Return the errors by kind that models leave on all frames; scale: `FittedModel.variance`."""
     every = np.arange(dataset.num_frames)
-    found = held_out_errors(dataset, [FittedModel(one, every) for one in models.values()], device)
-    return {name: one["to_plane"] for name, one in zip(models, found, strict=True)}
+    fitted = [FittedModel(one, every, variance=scale) for one in models.values()]
+    return dict(zip(models, held_out_errors(dataset, fitted, device), strict=True))
 
 
 def held_out_errors(
@@ -193,8 +215,9 @@ def held_out_errors(
     """
     rays = dataset.ray_directions().reshape(-1, 3).to(device)
     # The caller's models stay where they are.
-    models = [deepcopy(one.model).to(device) for one in fitted]
+    models = [replace(one, model=deepcopy(one.model).to(device)) for one in fitted]
     planes = [_planes_in_tool(one.planes or dataset) for one in fitted]
+    covariance = None if any(one.planes for one in fitted) else dataset.plane_covariance()
     frames = [set(one.held_out.tolist()) for one in fitted]
     sums: list[dict[int, Tensor]] = [{} for _ in fitted]
     wanted = np.unique(np.concatenate([one.held_out for one in fitted]))
@@ -202,9 +225,11 @@ def held_out_errors(
         for k, frame in enumerate(batch.indices.tolist()):
             used = batch.valid[k].reshape(-1).nonzero()[:, 0]
             pixels = pixels_of_image(batch, k, used)
+            known = None if covariance is None else covariance[frame].to(device)
             for model, own, plane, found in zip(models, frames, planes, sums, strict=True):
                 if frame in own:
-                    found[frame] = _error_sums(model, pixels, rays[used], plane[frame].to(device))
+                    there = plane[frame].to(device), known
+                    found[frame] = _error_sums(model, pixels, rays[used], *there)
     shares = everyones(sums)
     return [
         _by_kind({k: v for own in one for k, v in own.items()}) for one in zip(*shares, strict=True)
@@ -219,22 +244,35 @@ def _planes_in_tool(dataset: Dataset) -> Tensor:
 
 
 @torch.no_grad()
-def _error_sums(model: CalibrationModel, pixels: Pixels, rays: Tensor, plane: Tensor) -> Tensor:
-    """Return |error| and error^2 of the three kinds, summed, and the number of pixels: (7,)."""
+def _error_sums(
+    one: FittedModel, pixels: Pixels, rays: Tensor, plane: Tensor, covariance: Tensor | None
+) -> Tensor:
+    """Return |error| and error^2 of every kind, summed, and the number of pixels: (11,)."""
+    model = one.model
     corrected = pixels.radial_distance - model.error.error_at(pixels)
     plane_in_camera = plane.to(corrected) @ model.hand_eye()
     cosine = rays @ plane_in_camera[:3]
     to_plane = cosine * corrected + plane_in_camera[3]
-    along_ray = to_plane / cosine
-    kinds = torch.stack([to_plane, along_ray, along_ray * rays[:, 2]])
+    # What turns and a shift of the plane do to the distances.
+    normal, points = plane_in_camera[:3], rays * corrected[:, None]
+    moves = torch.nn.functional.pad(points, (0, 1), value=1.0) @ plane_moves(normal).mT
+    gram, slope = moves.mT @ moves, moves.mT @ to_plane
+    within, again = to_plane - moves @ (torch.linalg.pinv(gram, hermitian=True) @ slope), to_plane
+    if covariance is not None and one.variance:
+        in_camera = model.hand_eye().mT @ covariance.to(corrected) @ model.hand_eye()
+        precision = one.variance * plane_precision(normal, in_camera)
+        again = to_plane - moves @ torch.linalg.solve(gram + precision, slope)
+    along = rays[:, 2] / cosine
+    kinds = [to_plane, to_plane / cosine, to_plane * along, within * along, again * along]
+    kinds = torch.stack(kinds)
     sums = torch.stack([kinds.abs().sum(1), kinds.square().sum(1)], dim=1)
     return torch.cat([sums.flatten(), sums.new_tensor([len(rays)])]).cpu()
 
 
 def _by_kind(sums: dict[int, Tensor]) -> dict[str, FrameErrors]:
     frames = np.array(sorted(sums), dtype=np.int64)
-    rows = torch.stack([sums[k] for k in sorted(sums)], dim=1).numpy() if sums else np.zeros((7, 0))
+    rows = np.array([sums[k].numpy() for k in sorted(sums)]).reshape(-1, 2 * len(KINDS) + 1).T
     return {
-        kind: FrameErrors(frames, rows[2 * k], rows[2 * k + 1], rows[6])
+        kind: FrameErrors(frames, rows[2 * k], rows[2 * k + 1], rows[-1])
         for k, kind in enumerate(KINDS)
     }

@@ -70,6 +70,7 @@ class Calibration:
         stages: The models that the report compares: `before` any correction, with the recorded
             hand-eye; `hand_eye_only`; `after`, the fitted model.
         errors: The errors of each stage on all frames.
+        kinds: Those of the fitted model by kind, see `tofcorr.pixels.passes.KINDS`.
     """
 
     def __init__(
@@ -91,7 +92,9 @@ class Calibration:
             "hand_eye_only": without_correction(domain, found.hand_eye_only.tool_from_camera),
             "after": found.model,
         }
-        self.errors = frame_errors(data, self.stages, options.device)
+        every = frame_errors(data, self.stages, options.device, found.observability.variance)
+        self.errors = {stage: own["to_plane"] for stage, own in every.items()}
+        self.kinds = every["after"]
         if found.solution.parameters.hand_eye_is_free:
             with thread_number(1):
                 seen = misfit_pixels(data, found, self.frames)

@@ -251,6 +251,12 @@ def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) ->
     return f"{off}; `tofcorr diagnose` tells which."
 
 
+_VIEWS = (
+    "{:<8} RMS along z {rms_z:.2f}: {between_views:.2f} between views (offset and tilts of whole "
+    "images), {within_views:.2f} within; {within_prior:.2f} with planes within their covariance"
+)
+
+
 def report_text(report: Mapping[str, Any]) -> str:
     """Return errors, hand-eye translation, advice and warnings, a line each.
 
@@ -268,6 +274,9 @@ def report_text(report: Mapping[str, Any]) -> str:
         lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
     if report["hand_eye"]["estimated"]:
         lines += _hand_eye_lines(report)
+    for half, own in report["views_mm"].items():
+        if own["rms_z"] is not None:
+            lines.append(_VIEWS.format(half.replace("test", "held out"), **own))
     if advice := report["advice"]:
         largest = f"{advice['sigma_mm_or_mrad']:.2f} mm (or mrad), of {advice['direction']}"
         expects = advice["worst_sigma_mm_or_mrad"]

@@ -16,7 +16,7 @@ from tofcorr.estimation.robust import outlying_images, student_quantile
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.passes import FrameErrors
+from tofcorr.pixels.passes import FrameErrors, views_mm
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import Calibration, TrainingOptions
@@ -147,6 +147,10 @@ def training_report(
         "iterations": solution.iterations,
         "hand_eye": hand_eye_summary(fit, data.first.frame_names),
         "error_mm": errors,
+        "views_mm": {
+            half: {k: number_or_none(own) for k, own in views_mm(calibration.kinds, frames).items()}
+            for half, frames in (("train", calibration.train), ("test", calibration.test))
+        },
         "frames": {"train": calibration.train.tolist(), "test": calibration.test.tolist()},
         "assumptions": [
             {"name": one.cause, "error": one.words, **one.to_mapping(hand_eye[:3, :3])}

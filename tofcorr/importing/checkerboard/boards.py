@@ -310,6 +310,7 @@ class BoardPose:
         reprojection_rms: Root mean square reprojection error of the corners used, pixels.
         plane_deviation: Standard deviation of the plane's position at the board's centre along
             its normal, metres, propagated from the reprojection errors.
+        plane_covariance: Of n and d, shape (4, 4), propagated likewise.
     """
 
     rotation: np.ndarray
@@ -317,6 +318,7 @@ class BoardPose:
     used: np.ndarray
     reprojection_rms: float
     plane_deviation: float
+    plane_covariance: np.ndarray
 
     def plane(self) -> tuple[np.ndarray, float]:
         """Return n (3,) and d in metres of n . x + d = 0 in the camera frame, n to the camera."""
@@ -411,17 +413,22 @@ def poses_of(
     centre, poses = points.mean(axis=0), []
     for start in zip(vectors, translations, strict=True):
         vector, translation = cv2.solvePnPRefineLM(points, pixels, matrix, distortion, *start)
-        rotation, place = cv2.Rodrigues(vector)[0], translation[:, 0]
+        (rotation, by_vector), place = cv2.Rodrigues(vector), translation[:, 0]
         projected, jacobian = _project(points - centre, camera, vector, rotation @ centre + place)
         errors = projected - pixels
         variance = (errors**2).sum() / max(2 * len(points) - 6, 1)
-        covariance = variance * np.linalg.pinv(jacobian.T @ jacobian)[3:, 3:]
+        covariance = variance * np.linalg.pinv(jacobian.T @ jacobian)
+        # Of n, the third column of the rotation, and of d = -n . centre.
+        turned = by_vector.reshape(3, 3, 3)[:, :, 2].T
+        of_offset = np.append(-(rotation @ centre + place) @ turned, -rotation[:, 2])
+        slope = np.vstack([np.hstack([turned, np.zeros((3, 3))]), of_offset])
         pose = BoardPose(
             rotation=rotation,
             translation=place,
             used=used,
             reprojection_rms=float(np.sqrt((errors**2).sum(axis=1).mean())),
-            plane_deviation=float(np.sqrt(rotation[:, 2] @ covariance @ rotation[:, 2])),
+            plane_deviation=float(np.sqrt(rotation[:, 2] @ covariance[3:, 3:] @ rotation[:, 2])),
+            plane_covariance=slope @ covariance @ slope.T,
         )
         if np.isfinite(pose.reprojection_rms):
             poses.append(pose)

@@ -305,6 +305,7 @@ class BoardImport:
                 normal_world=normal,
                 offset=offset,
                 target=self._board.kind,
+                plane_covariance=view.pose.plane_covariance,
             )
             depth, amplitude = self._read(view.reported["view"])
             yield row, depth, amplitude, self._area(view.pose)
