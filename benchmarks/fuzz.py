@@ -440,7 +440,7 @@ IMPORTED: dict[str, tuple[Callable[[Path], Any], Any]] = {
     "opencv.yaml": (read_intrinsics, OPENCV),
     "scene_camera.json": (read_scene_camera, {str(n): SCENE for n in range(3)}),
     "measurements.csv": (
-        lambda path: read_distances(path, (2, 2)),
+        lambda path: read_distances(path, np.arange(4).reshape(2, 2), (), []),
         [list("tabcd"), *([0.5 + n / 100, n, n + 1, n + 2, 400] for n in range(8))],
     ),
 }
