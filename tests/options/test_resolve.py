@@ -84,7 +84,7 @@ def test_a_shipped_name_comes_before_a_folder_or_file_so_called(
     [
         ("eaa", [], r"^eaa: neither a file .* shipped for 'train'\. Did you mean 'ea'\? .*bspline"),
         ("far/ea.yaml", [], r"Did you mean 'ea'\?"),
-        ("zzzzzzz", [], r"shipped for 'train'\. Shipped: bspline, .*tensor_bspline\.$"),
+        ("zzzzzzz", [], r"shipped for 'train'\. Shipped: bspline, .*zones\.$"),
         ("z" * 300, [], r"^z{300}: neither a file nor"),
         (Path("ea"), [], r"^ea: there is no such file"),
         ({"nam": 1}, [], r"^the configuration: .*'nam' is not a known key\. Did you mean 'name'"),
