@@ -203,7 +203,8 @@ def compare(sets: Sequence[Experiment], tell: Callable[[str], object] = LOG.info
             tell(f"{column}: {errors} mm RMS held out, after {spent:.0f} s")
             if column == options.models[0].name and len(sizes) > 1:
                 ahead = spent * (sum(sizes.values()) / sizes[column] - 1)
-                tell(f"The other models will take about {max(ahead / 60, 1):.0f} min.")
+                long = f"{ahead:.0f} s" if ahead < 100 else f"{ahead / 60:.0f} min"
+                tell(f"The other models will take about {long}.")
     except KeyboardInterrupt:
         if not set(done) - set(options.baselines):
             raise
