@@ -59,15 +59,13 @@ class Observed:
             their squares, and numbers, in each pose, along `AXES` at `LAGS`: shape (P, 3, 2, 2).
         within: Half squares of differences of neighbours in one image, squares of second
             differences there, and numbers, likewise; without the pattern and the edges of squares.
-        pattern: Variance of what the residuals of different poses share, m^2.
+        pattern: Variance of what the residuals of different poses share, m^2; of a single pose,
+            what its frames share.
         between_frames: Half the squared differences of frames one and two apart, of each pose,
             summed over tiles of the image, shape (2, T), m^2.
-        repeated: Variance of the mean residual of each pose less that of its noise, shape (P,),
-            m^2; NaN without repeats.
         map_missing: How often each pixel was missing, shape (H, W).
         map_frames: In how many frames it looked at the target, shape (H, W).
         losing_poses: How many poses miss a pixel.
-        saturated: How many pixels of all frames are saturated.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -75,32 +73,32 @@ class Observed:
         names = sorted(set(recording.frames.target.tolist()))
         shape = (recording.camera.height, recording.camera.width)
         self.map_missing, self.map_frames = np.zeros((2, *shape))
-        tables, sums, repeated, counts = ([] for _ in range(4))
+        tables, sums, counts = ([] for _ in range(3))
         self.between_frames: list[np.ndarray] = []
         fit = _SurfaceFit(recording.camera)
         poses, shared = repeats_of(recording), _BetweenPoses(shape)
         for frames in poses:
             shared.add(_PoseImages(recording, frames[:_MOST_REPEATS], fit))
+        self.pattern = shared.variance()
         for number, frames in enumerate(poses):
             images = _PoseImages(recording, frames[:_MOST_REPEATS], fit)
             residual = images.residual
             images.compare(shared.without(images))
             sums.append(_of_neighbours(images))
-            repeated.append(_repeated_variance(residual))
+            if len(poses) == 1:
+                self.pattern = _repeated_variance(residual)
             self.between_frames.append(_frame_differences(residual))
             target = str(recording.frames.target[frames[0]])
             tables.append(_rows(images, number, names.index(target), shape))
             self.map_missing[images.place] += images.missing.sum(0)
             self.map_frames[images.place] += images.on_target.sum(0)
-            counts.append([len(residual), images.missing.any(), images.saturated.sum()])
+            counts.append([len(residual), images.missing.any()])
         self.table = np.concatenate(tables).view(np.recarray)
         if not np.isfinite(self.table.distance).any():
             raise CalibrationDataError(f"{recording.path}: no image has 100 usable target pixels.")
-        self.repeats, losing, saturated = np.array(counts).T
-        self.losing_poses, self.saturated = int(losing.sum()), int(saturated.sum())
+        self.repeats, losing = np.array(counts).T
+        self.losing_poses = int(losing.sum())
         self.temporal, self.within = np.stack(sums, axis=1)
-        self.pattern = shared.variance()
-        self.repeated = np.array(repeated)
 
 
 class _PoseImages:
@@ -281,11 +279,15 @@ def log_of(values: np.ndarray) -> np.ndarray:
 
 
 def _repeated_variance(residual: np.ndarray) -> float:
-    """Return the variance within the mean image of a pose, less that of its noise, m^2."""
+    """Return the variance within the mean image of a pose, less that of its noise, m^2.
+
+    Without repeats it is taken to be 0.
+    """
     values = residual[:, np.isfinite(residual).all(0)]
     if len(values) < 2 or not values.size:
-        return np.nan
-    return float(np.mean(values.mean(0) ** 2) - values.var(0, ddof=1).mean() / len(values))
+        return 0.0
+    noise = values.var(0, ddof=1).mean() / len(values)
+    return max(float(np.mean(values.mean(0) ** 2) - noise), 0.0)
 
 
 def _frame_differences(residual: np.ndarray) -> np.ndarray:
