@@ -139,8 +139,6 @@ def _compare_noise(
         "ratio": None if ratio is None else round(ratio, 4),
         "ratio_ci": squares and [round(max(end, 0.0) ** 0.5, 4) for end in squares],
         "p_value": p_value,
-        "correlation_p_value": p_values[0],
-        "frame_correlation_p_value": p_values[1],
         "source": real.source,
         "same_poses": both.paired,
         "explained_by": _causes(
@@ -182,14 +180,11 @@ def _compare_dropouts(
     (lost, lost_by_sim), full = np.nan_to_num([missing.means(), saturated.means()]).tolist()
     p_value, saturated_p = missing.difference_p(random), saturated.difference_p(random)
     cause = _cause_of_missing(real if lost > lost_by_sim else sim)
-    ends = missing.difference_interval()
     return {
         "real_share": round(lost, 5),
         "sim_share": round(lost_by_sim, 5),
         "p_value": p_value,
-        "difference_ci": ends and [round(end, 5) for end in ends],
         "same_poses": both.paired,
-        "saturated_p_value": saturated_p,
         "explained_by": _causes(
             level,
             (cause, lost - lost_by_sim, p_value, _MATERIAL_SHARE),

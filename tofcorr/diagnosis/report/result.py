@@ -172,7 +172,6 @@ class DiagnosisResult:
                 "deleted_share": round(outliers.deleted, 6),
                 "reduced_share": round(outliers.reduced, 6),
                 "rms_mm": _mm(outliers.size),
-                "map": [_rounded(row) for row in outliers.tiles.tolist()],
                 "where": outliers.place,
             },
             "ranking": [_ranked(self.evidence.study, named, name) for name in named.ranking]
@@ -211,8 +210,6 @@ class DiagnosisResult:
             "next_recording": list(self.advice),
             "verdict": self.verdict,
             **{name: list(getattr(self, name)) for name in lists},
-            "unknown_score": round(remainder.score, 4),
-            "remaining_share": round(remainder.remaining_share, 4),
             "fingerprint": list(remainder.fingerprint),
         }
 
@@ -250,7 +247,6 @@ def _ranked(study: Study, named: NamedEffects, name: str) -> dict[str, Any]:
         "aliases": [other for other in members if other != name],
         "available": True,
         "missing": [],
-        "gain": round(named.models.gain_of(name), 2),
         "absorbed": absorbed,
     }
 
@@ -283,9 +279,9 @@ def _sized(gap: Estimated | None) -> dict[str, Any]:
     return {"gap_mm": _mm(gap), "ci": None if gap is None else _mm(gap.interval)}
 
 
-def _rounded(shares: tuple[float, float] | list[float]) -> list[float | None]:
-    """Return shares to four digits; None: it is not known."""
-    return [None if math.isnan(share) else round(share, 4) for share in shares]
+def _rounded(interval: tuple[float, float]) -> list[float]:
+    """Return the ends of an interval of a share to four digits."""
+    return [round(end, 4) for end in interval]
 
 
 def _finite(number: float) -> float | None:
