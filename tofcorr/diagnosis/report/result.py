@@ -213,17 +213,6 @@ class DiagnosisResult:
             "fingerprint": list(remainder.fingerprint),
         }
 
-    @property
-    def where(self) -> Stage:
-        """Bias along all covariates, after recalibration."""
-        return self.stages[1]
-
-    def all_figures(self) -> "dict[str, Figure]":
-        """Return every figure, by its name on the report page."""
-        from tofcorr.diagnosis.report.figures import all_figures
-
-        return all_figures(self)
-
     def plot(self, name: str) -> "Figure":
         """Return one figure, by its name in `tofcorr.diagnosis.report.figures.FIGURES`."""
         # With it comes matplotlib, which takes half as long to import as torch.
@@ -316,6 +305,7 @@ def render(result: DiagnosisResult) -> str:
     """Return the page: one HTML file that needs nothing else."""
     from markupsafe import Markup
 
+    from tofcorr.diagnosis.report.figures import all_figures
     from tofcorr.plausibility.page import page_text
 
     study, named = result.evidence.study, result.evidence.named
@@ -340,7 +330,7 @@ def render(result: DiagnosisResult) -> str:
     return page_text(
         "tofcorr.diagnosis.report",
         "report.html.j2",
-        result.all_figures(),
+        all_figures(result),
         filters,
         style=Markup(style),
         **result.to_mapping(),
@@ -358,8 +348,7 @@ def render(result: DiagnosisResult) -> str:
 def _mm_shown(value: float | None) -> str:
     if value is None:
         return "–"
-    text = f"{value:.1f}" if round(abs(value), 1) >= 1 else f"{value:.2f}"
-    return text.removeprefix("-") if float(text) == 0 else text
+    return f"{value:z.1f}" if round(abs(value), 1) >= 1 else f"{value:z.2f}"
 
 
 def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:
