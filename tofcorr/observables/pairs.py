@@ -167,10 +167,8 @@ class PoseSums:
 
     def ratio_p(self, random: Random) -> float | None:
         """Return the p-value of the poses' ratios to what is expected being alike."""
-        logs = []
-        for total, expected, left_out in zip(
-            self.total, self._expected(), self.left_out, strict=True
-        ):
+        logs, sides = [], zip(self.total, self._expected(), self.left_out, strict=True)
+        for total, expected, left_out in sides:
             seen = total.sum(1)
             share = np.where(seen > 0, quotient(seen, expected), np.nan)
             # Pseudo-values of a jackknife: a factor that all poses share moves them together, and

@@ -223,12 +223,10 @@ def absorption_table(study: Study) -> np.ndarray:
 
 def absorption_map(result: "DiagnosisResult") -> Figure:
     """Draw the share of each effect that calibration absorbs, then that other effects absorb."""
-    names = tuple(result.evidence.study.effects)
+    names, table = tuple(result.evidence.study.effects), absorption_table(result.evidence.study)
     figure, (axes,) = panels(5)
     axes.set_facecolor("#f3e9e9")
-    shown = axes.imshow(
-        absorption_table(result.evidence.study), cmap="Greys", vmin=0, vmax=1, aspect="auto"
-    )
+    shown = axes.imshow(table, cmap="Greys", vmin=0, vmax=1, aspect="auto")
     axes.axvline(0.5, color="white", linewidth=3)
     axes.set_xticks(range(len(names) + 1), ["calibration", *names], rotation=90)
     axes.set_yticks(range(len(names)), names)
