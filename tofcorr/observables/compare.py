@@ -139,6 +139,7 @@ def _compare_noise(
         "ratio": None if ratio is None else round(ratio, 4),
         "ratio_ci": squares and [round(max(end, 0.0) ** 0.5, 4) for end in squares],
         "p_value": p_value,
+        "frame_correlation": round(real.frame_correlation, 4),
         "source": real.source,
         "same_poses": both.paired,
         "explained_by": _causes(

@@ -421,9 +421,8 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
     step = max(seen.size / _MOST_OF_POSE, 1.0)
     pixel = (np.arange(min(seen.size, _MOST_OF_POSE)) * step).astype(np.int64)
     pixel = pixel[seen.ravel()[pixel]]
-    at = tuple(
-        each - side.start for each, side in zip(divmod(pixel, shape[1]), images.place, strict=True)
-    )
+    rows, columns = images.place
+    at = pixel // shape[1] - rows.start, pixel % shape[1] - columns.start
     chosen = (slice(None), *at)
     values, on_target = images.residual[chosen], images.on_target[chosen]
     known = np.isfinite(values)
@@ -435,7 +434,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
     squares = np.nansum((values - known_mean(values)) ** 2, axis=0)
     distance, cosine = images.distance[at], images.cosine[at]
     second = [known_mean(images.second[axis] ** 2)[at] for axis in AXES]
-    columns = {
+    fields = {
         "pose": np.full(len(pixel), pose),
         "pixel": pixel,
         "distance": distance,
@@ -451,7 +450,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
         "missing": images.missing[chosen].sum(0),
         "saturated": images.saturated[chosen].sum(0),
     }
-    return np.rec.fromarrays(list(columns.values()), names=",".join(columns))  # pyright: ignore[reportArgumentType]
+    return np.rec.fromarrays(list(fields.values()), names=",".join(fields))  # pyright: ignore[reportArgumentType]
 
 
 def _of_nearest(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:

@@ -167,12 +167,13 @@ class AmplitudeTable(CurveTable):
     variable: Literal["amplitude", "normalised_amplitude"] = "amplitude"
 
 
+_Row = Annotated[tuple[Number, ...], Field(min_length=1)]
+
+
 class LatticeTable(Options):
     """A bicubic map through a regular lattice of points from corner to corner of the image."""
 
-    values_m: Annotated[
-        tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...], Field(min_length=1)
-    ]
+    values_m: Annotated[tuple[_Row, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _rectangular(self) -> Self:

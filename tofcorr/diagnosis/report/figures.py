@@ -189,9 +189,7 @@ def effect_forest(result: "DiagnosisResult") -> Figure:
         colour = RED if name in result.effects else BLUE if name in alike else GREY
         closed = 1000**2 * found.closed[name].numpy() / count * len(found.closed[name])
         error = TWO_SIDED * closed.std(ddof=1) / len(closed) ** 0.5
-        left.errorbar(
-            closed.mean(), place, xerr=error, fmt="o", capsize=2, markersize=4, color=colour
-        )
+        left.errorbar(closed.mean(), place, xerr=error, fmt="o", markersize=4, color=colour)
         right.barh(place, found.probabilities.get(name, 0.0), color=colour)
     line_across(left, vertical=True)
     left.set_xlabel("closes, mm² of the\nheld-out mean square")
