@@ -372,9 +372,8 @@ def moving_waves(study: Study) -> str:
     if not study.fit.shared.striped:
         return ""
     return (
-        "An error that changes from frame to frame, such as waves that move, reaches farther over "
-        "the image than a filter does. Where it differs between neighbouring pixels, it counts as "
-        "noise."
+        "An error changes from frame to frame and reaches farther over the image than a filter, as "
+        "moving waves do. Where neighbouring pixels differ in it, it counts as noise."
     )
 
 
