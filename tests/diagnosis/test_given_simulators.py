@@ -225,7 +225,7 @@ def test_what_a_function_returned_is_refused_by_what_it_is(nothing_missing: Reco
     poses = np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)
     of_pose = "The simulator's tool_from_camera: "
     cases: list[tuple[str, Any]] = [
-        ("The simulator's depth must be numbers of the recording's shape", depth[:-1]),
+        ("The simulator's depth must be numbers of the shape", depth[:-1]),
         (r".*Use tensor\.detach\(\)", torch.ones(depth.shape, requires_grad=True)),
         (
             "the frames that the function returned/amplitude.npy: frame 0, row 0",

@@ -56,9 +56,9 @@ def test_the_one_near_pose_is_named(far: Recording, tmp_path: Path) -> None:
     near = recorded(tmp_path / "near", 35, [WIGGLING], _changes((0.5, 0.55), 1))
     joined = _with_one_more(far, near, tmp_path / "joined")
     result = diagnose(joined, config=OPTIONS)
-    (words,) = [one for one in result.remarks if one.startswith(f"Frame {far.num_frames}, at")]
-    assert "no other pose is like this one" in words
-    pattern = r"at ([0-9.]+) to ([0-9.]+) m, makes (\d+) % .* The others make ([0-9.]+) mm"
+    start = f"1 of {result.evidence.study.sums.num_units} poses, with frame {far.num_frames} and at"
+    (words,) = [one for one in result.remarks if one.startswith(start)]
+    pattern = r"at ([0-9.]+) to ([0-9.]+) m, hold (\d+) % .* The others make ([0-9.]+) mm"
     found = present(re.search(pattern, words))
     near, distant, share, others = map(float, found.groups())
     assert 0.4 < near <= distant < 1.0

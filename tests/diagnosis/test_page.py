@@ -18,7 +18,7 @@ from optional import present
 
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Estimated, Stage
-from tofcorr.diagnosis.report.figures import stage_bars
+from tofcorr.diagnosis.report.figures import all_figures, stage_bars
 from tofcorr.diagnosis.report.result import DiagnosisResult, render
 from tofcorr.diagnosis.report.words import (
     along,
@@ -107,7 +107,7 @@ def test_nothing_of_the_page_is_cut_and_every_picture_has_a_text_beside_it(
         assert seen["scroll"] <= width
         assert seen["cut"] == []
         assert seen["silent"] == []
-        assert seen["pictures"] == len(kind(time_diagnosis).all_figures())
+        assert seen["pictures"] == len(all_figures(kind(time_diagnosis)))
 
 
 @needs_browser
@@ -127,7 +127,7 @@ def test_every_picture_of_every_kind_of_report_has_words(
 ) -> None:
     kinds = [(kind(time_diagnosis), rendered(kind)) for kind in (with_simulator, without_effects)]
     for result, whole in (*kinds, (time_diagnosis, page)):
-        figures, shown = result.all_figures(), html.unescape(whole)
+        figures, shown = all_figures(result), html.unescape(whole)
         assert ("where_as_given" in figures) == (result.stages[0].gap is not None)
         for name in figures:
             figure = shown[shown.index(f'<figure id="{name}">') :].split("</figure>")[0]
@@ -142,7 +142,7 @@ def test_every_picture_of_every_kind_of_report_has_words(
 def test_the_first_strip_is_what_the_text_beside_it_names(time_diagnosis: DiagnosisResult) -> None:
     # Of several biases at the least p-value the text named the largest, often a straight line over
     # a few far pixels: "distance: it changes by -5.1 mm" beside a strip from 0.5 to -1.1 mm.
-    where = time_diagnosis.where
+    where = time_diagnosis.stages[1]
     times = [one for one in where.regions if one.covariate == "integration_time"]
     bins = [replace(one, p_value=0.003) for one in times if not one.trend]
     one = Estimated(1.0)

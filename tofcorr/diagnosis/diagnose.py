@@ -189,10 +189,8 @@ def prepare(
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
     outliers = outliers_of(study)
-    warnings += filter(None, (outliers.warning, mask_warning(observations)))
-    return Prepared(
-        study=study, warnings=(*warnings, *absorbed), as_given=as_given, outliers=outliers
-    )
+    warnings += filter(None, (outliers.warning, mask_warning(observations), *absorbed))
+    return Prepared(study=study, warnings=tuple(warnings), as_given=as_given, outliers=outliers)
 
 
 def _both_known(

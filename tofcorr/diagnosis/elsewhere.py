@@ -72,11 +72,8 @@ def simulated_elsewhere(
     frames, known = frames.at(keep), known.at(keep)
     here, there = effect_inputs(real, pose), effect_inputs(frames, pose)
     scale = _amplitude_scale(real, frames, here, there)
-    if real.amplitude is not None and real.amplitude_images is not None:
-        scaled = {
-            "amplitude": real.amplitude / scale,
-            "amplitude_images": real.amplitude_images / scale,
-        }
+    if real.amplitude is not None:
+        scaled = {name: getattr(real, name) / scale for name in ("amplitude", "amplitude_images")}
         real, here = replace(real, **scaled), replace(here, **scaled)
     base, lacking = supported_base(frames.recording, options.base)
     base, _ = supported_base(real.recording, base)

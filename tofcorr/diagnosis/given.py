@@ -137,8 +137,7 @@ def frames_of(returned: Any, recording: Recording) -> Recording:  # noqa: ANN401
             found = f"{type(values).__name__} ({error})"
         if found != str(shape):
             raise CalibrationDataError(
-                f"The simulator's {name} must be numbers of the recording's shape {shape}, got "
-                f"{found}."
+                f"The simulator's {name} must be numbers of the shape {shape}, got {found}."
             )
         if not of_pose:
             IMAGE_ARRAYS[name].check(checked[name], range(recording.num_frames), source)
@@ -319,8 +318,7 @@ def refuse_other_camera(real: Recording, simulated: Recording) -> None:
     if not 100 * pixels <= 1:
         raise CalibrationDataError(
             f"{simulated.path}: its pixels look up to {pixels:.2g} pixels beside those of "
-            f"{real.path}; render with the recording's own K and distortion (recording.yaml: "
-            "camera)."
+            f"{real.path}; render with the K and distortion of its recording.yaml."
         )
 
 

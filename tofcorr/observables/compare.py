@@ -134,17 +134,14 @@ def _compare_noise(
     near = float(real.correlation[:, 0].mean() - sim.correlation[:, 0].mean())
     later = real.frame_correlation - sim.frame_correlation
     return {
-        "real_mm": _mm(means[0]),
-        "sim_mm": _mm(means[1]),
+        "real_mm": round(1e3 * means[0], 4),
+        "sim_mm": round(1e3 * means[1], 4),
         "ratio": None if ratio is None else round(ratio, 4),
         "ratio_ci": squares and [round(max(end, 0.0) ** 0.5, 4) for end in squares],
         "p_value": p_value,
-        "correlation_p_value": p_values[0],
-        "frame_correlation_p_value": p_values[1],
+        "frame_correlation": round(real.frame_correlation, 4),
         "source": real.source,
         "same_poses": both.paired,
-        "real": _noise_alone(real),
-        "sim": _noise_alone(sim),
         "explained_by": _causes(
             level,
             (largest, more, p_value, _MATERIAL),
@@ -172,32 +169,6 @@ def contributions(noise: NoiseMeasurement) -> np.ndarray:
     return np.array(mean) * (1.0 - curve.fixed_share)
 
 
-def _noise_alone(noise: NoiseMeasurement) -> Block:
-    """Return what one recording shows by itself."""
-    rows, columns = (
-        [round(value, 4) if np.isfinite(value) else None for value in along]
-        for along in noise.correlation.tolist()
-    )
-    repeats = noise.observed.repeats
-    return {
-        "temporal_mm": _mm(noise.temporal_m),
-        "temporal_ci": [_mm(end) for end in noise.temporal_interval],
-        "pattern_mm": _mm(noise.pattern_m),
-        "scene_mm": _mm(noise.scene_m),
-        "correlation_row": rows,
-        "correlation_column": columns,
-        "frame_correlation": round(noise.frame_correlation, 4),
-        "correlation_px": round(noise.curve.correlation_px, 3),
-        "curve": noise.curve.model_dump(exclude={"fixed_seed"}),
-        "poses": len(repeats),
-        "repeated_poses": int((repeats > 1).sum()),
-    }
-
-
-def _mm(metres: float | None) -> float | None:
-    return None if metres is None or not np.isfinite(metres) else round(metres * 1e3, 4)
-
-
 def _compare_dropouts(
     both: Matched, real: DropoutMeasurement, sim: DropoutMeasurement, random: Random, level: float
 ) -> Block:
@@ -210,16 +181,11 @@ def _compare_dropouts(
     (lost, lost_by_sim), full = np.nan_to_num([missing.means(), saturated.means()]).tolist()
     p_value, saturated_p = missing.difference_p(random), saturated.difference_p(random)
     cause = _cause_of_missing(real if lost > lost_by_sim else sim)
-    ends = missing.difference_interval()
     return {
         "real_share": round(lost, 5),
         "sim_share": round(lost_by_sim, 5),
         "p_value": p_value,
-        "difference_ci": ends and [round(end, 5) for end in ends],
         "same_poses": both.paired,
-        "saturated_p_value": saturated_p,
-        "real": _dropouts_alone(real),
-        "sim": _dropouts_alone(sim),
         "explained_by": _causes(
             level,
             (cause, lost - lost_by_sim, p_value, _MATERIAL_SHARE),
@@ -237,16 +203,6 @@ def _cause_of_missing(dropouts: DropoutMeasurement) -> str:
     if dropouts.border_share > 3 * dropouts.centre_share:
         return "missing border of the image"
     return "missing pixels at any amplitude"
-
-
-def _dropouts_alone(dropouts: DropoutMeasurement) -> Block:
-    """Return what one recording shows by itself."""
-    names = ("share", "saturated_share", "saturated_missing", "border_share", "centre_share")
-    return {
-        **{name: round(getattr(dropouts, name), 5) for name in names},
-        "model": dropouts.model.model_dump(exclude={"saturated_share"}),
-        "amplitude_recorded": dropouts.amplitude_recorded,
-    }
 
 
 def _compare_amplitude(

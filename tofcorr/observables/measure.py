@@ -19,7 +19,7 @@ from tofcorr.estimation.noise import (
     mean_correlation,
     neighbour_correlation,
 )
-from tofcorr.estimation.robust import LEVEL, student_quantile, without_strays
+from tofcorr.estimation.robust import without_strays
 from tofcorr.observables.read import FEWEST_PIXELS, LAGS, Observed, log_of, quotient
 from tofcorr.options import Options, PositiveNumber, Share
 
@@ -45,10 +45,7 @@ class NoiseMeasurement:
             different poses share, corrected for the correlation of the pixels compared, and to the
             level of repeated frames, which count where there are any.
         temporal_m: Of what changes from frame to frame, in one frame.
-        temporal_interval: Its 95 % interval, with poses as the unit.
         pattern_m: Of the pattern that is the same in all poses, pixel by pixel.
-        scene_m: Of what repeats within a pose and in no other: texture and edges of the target.
-            None without repeats.
         correlation: Of the temporal noise of neighbours, shape (2, 2): along rows and columns, at
             lags 1 and 2.
         frame_correlation: Of successive frames of a pose, 0 if not significant: a filter in time.
@@ -83,7 +80,8 @@ class NoiseMeasurement:
             variance, self.correlation, self.pose_correlation, self.left_out = found
             variance = variance * level_of_repeats(_brightness(table), repeats, variance)
             self.variance = np.where(np.isfinite(repeats), repeats, variance)
-        temporal, interval = _level_of_poses(table.pose, self.variance)
+        known = self.variance[np.isfinite(self.variance)]
+        temporal = max(float(known.mean()), 0.0) if len(known) else 0.0
         curve = _curve_of(table, self.variance, filter_width(self.correlation.mean(0).tolist()))
         if self.source == "neighbours":
             # Single pixels between edges have no difference; the curve covers them too. It has a
@@ -91,14 +89,11 @@ class NoiseMeasurement:
             at = table.amplitude if curve.needs_amplitude else table.distance
             lit = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
             squares = curve.sigma(table.distance[lit], table.amplitude[lit]) ** 2
-            everywhere = float(squares.mean()) if lit.any() else 0.0
-            more = (everywhere / temporal) ** 0.5 if temporal > 0 else 1.0
-            temporal, interval = everywhere, (interval[0] * more, interval[1] * more)
-        pattern, scene = _fixed(observed)
+            temporal = float(squares.mean()) if lit.any() else 0.0
+        pattern = observed.pattern
         share = pattern / (pattern + temporal) if pattern > 0 and temporal > 0 else 0.0
         self.curve = curve.with_fixed_share(share)
-        self.temporal_m, self.temporal_interval = temporal**0.5, interval
-        self.pattern_m, self.scene_m = pattern**0.5, None if scene is None else scene**0.5
+        self.temporal_m, self.pattern_m = temporal**0.5, pattern**0.5
 
 
 def noise_source(observed: Observed) -> Source:
@@ -197,33 +192,6 @@ def level_of_repeats(
     at = [float(np.median(np.log(brightness[part]))) for part in parts]
     here = np.log(np.where(lit, brightness, np.exp(at[0])))
     return np.interp(here, at, levels)
-
-
-def _level_of_poses(pose: np.ndarray, variance: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """Return the mean variance, m^2, and the 95 % interval of its root, metres, by poses."""
-    known = np.isfinite(variance)
-    if not known.any():
-        return 0.0, (0.0, 0.0)
-    _, number = np.unique(pose[known], return_inverse=True)
-    sums, counts = np.bincount(number, variance[known]), np.bincount(number)
-    mean = max(float(sums.sum() / counts.sum()), 0.0)
-    poses = len(sums)
-    if poses < 2:
-        return mean, (0.0, float("inf"))
-    error = np.sqrt(((sums - mean * counts) ** 2).sum() * poses / (poses - 1)) / counts.sum()
-    reach = student_quantile(1 - LEVEL / 2, poses - 1) * float(error)
-    return mean, (max(mean - reach, 0.0) ** 0.5, (mean + reach) ** 0.5)
-
-
-def _fixed(observed: Observed) -> tuple[float, float | None]:
-    """Return the variance of the pattern of all poses, and of what only a pose repeats, m^2."""
-    repeated = observed.repeated[np.isfinite(observed.repeated)]
-    if not len(repeated):
-        return observed.pattern, None
-    within = max(float(repeated.mean()), 0.0)
-    if len(observed.repeats) == 1:
-        return within, 0.0
-    return observed.pattern, max(within - observed.pattern, 0.0)
 
 
 def _curve_of(table: np.recarray, variance: np.ndarray, correlation_px: float) -> NoiseModel:
@@ -334,31 +302,24 @@ class DropoutMeasurement:
     Attributes:
         model: The probability that a pixel is missing.
         share: Share without a distance.
-        saturated_share: Share at or above the saturation amplitude.
         saturated_missing: Share that is saturated and has no distance.
         map: Share of each pixel, shape (H, W); NaN where it never looked at the target.
         border_share: Share in the outer eighth of the image on each side.
         centre_share: Share in the rest.
         amplitude: Amplitude of each row of the pixel table, counts, also where a pixel is missing;
             NaN where unknown.
-        amplitude_recorded: Whether missing pixels have an amplitude of their own. If not, theirs
-            was estimated from the other pixels.
         observed: What it was measured from.
     """
 
     def __init__(self, observed: Observed) -> None:
         self.observed, table = observed, observed.table
-        self.amplitude, self.amplitude_recorded = _amplitude_everywhere(observed)
-        saturation, stated = _saturation(observed, self.amplitude)
+        self.amplitude = _amplitude_everywhere(observed)
+        saturation = _saturation(observed, self.amplitude)
         self.model = _likeliest(observed, self.amplitude, saturation)
-        beyond, frames = self.model.saturated(self.amplitude), max(table.frames.sum(), 1)
-        pixels = max(observed.map_frames.sum(), 1)
-        self.saturated_share = float(
-            observed.saturated / pixels if stated else table.frames[beyond].sum() / frames
-        )
-        self.saturated_missing = float(table.missing[beyond].sum() / frames)
+        beyond = self.model.saturated(self.amplitude)
+        self.saturated_missing = float(table.missing[beyond].sum() / max(table.frames.sum(), 1))
         missing, seen = observed.map_missing, observed.map_frames
-        self.map, self.share = quotient(missing, seen), float(missing.sum() / pixels)
+        self.map, self.share = quotient(missing, seen), float(missing.sum() / max(seen.sum(), 1))
         height, width = seen.shape
         border = np.ones((height, width), dtype=bool)
         border[height // 8 : height - height // 8, width // 8 : width - width // 8] = False
@@ -367,16 +328,17 @@ class DropoutMeasurement:
         )
 
 
-def _saturation(observed: Observed, amplitude: np.ndarray) -> tuple[float | None, bool]:
-    """Return the saturation amplitude, and whether the recording states it.
+def _saturation(observed: Observed, amplitude: np.ndarray) -> float | None:
+    """Return the saturation amplitude.
 
-    If not, it is where many pixels share the largest amplitude: random ones hardly ever agree.
+    If the recording does not state it, it is where many pixels share the largest amplitude: random
+    ones hardly ever agree.
     """
     if observed.recording.saturation_amplitude is not None:
-        return observed.recording.saturation_amplitude, True
+        return observed.recording.saturation_amplitude
     known = amplitude[np.isfinite(amplitude)]
     piled = int((known == known.max()).sum()) if len(known) else 0
-    return (float(known.max()) if piled >= max(20, len(known) / 10_000) else None), False
+    return float(known.max()) if piled >= max(20, len(known) / 10_000) else None
 
 
 def _likeliest(observed: Observed, amplitude: np.ndarray, saturation: float | None) -> DropoutModel:
@@ -423,26 +385,20 @@ def _likeliest(observed: Observed, amplitude: np.ndarray, saturation: float | No
     return found if found.base_share * total >= 1 else found.model_copy(update={"base_share": 0.0})
 
 
-def _amplitude_everywhere(observed: Observed) -> tuple[np.ndarray, bool]:
-    """Return the amplitude of each row of the pixel table, and whether the camera recorded it.
+def _amplitude_everywhere(observed: Observed) -> np.ndarray:
+    """Return the amplitude of each row of the pixel table, counts, (M,); NaN where unknown.
 
     Where the camera writes no amplitude for missing pixels, it is that of the pixels around the
     same target: cos / d^2 times the fall-off of the lens, fitted in ln amplitude.
-
-    Returns:
-        Counts, shape (M,), NaN where unknown; and False if missing pixels were estimated.
     """
     table = observed.table
     lost = table.missing > 0
     raw = table.raw_amplitude
-    if not np.isfinite(raw).any():
-        return raw, False
     positive = np.isfinite(raw[lost]) & (raw[lost] > 0)
-    if not lost.any() or positive.mean() >= 0.5:
-        return raw, True
-    estimated = _light_law(observed)
+    if not np.isfinite(raw).any() or not lost.any() or positive.mean() >= 0.5:
+        return raw
     known = np.isfinite(table.amplitude) & ~lost
-    return np.where(known, table.amplitude, estimated), False
+    return np.where(known, table.amplitude, _light_law(observed))
 
 
 def _light_law(observed: Observed) -> np.ndarray:

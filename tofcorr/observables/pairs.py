@@ -129,8 +129,6 @@ class PoseSums:
 
     def ratio_interval(self) -> Interval | None:
         """Return the 95 % interval of the ratio of the means, None where one is not positive."""
-        if not min(self.means()) > 0:
-            return None
         ends = self._interval(lambda a, b: np.log(a / b) if min(a, b) > 0 else np.nan)
         return ends and (float(np.exp(ends[0])), float(np.exp(ends[1])))
 
@@ -144,7 +142,7 @@ class PoseSums:
             return None
         sides = ([0, 1],) if self.paired else ([0], [1])
         middle, half = statistic(*self.means()), reach(self._without(s, statistic) for s in sides)
-        return (middle - half, middle + half) if np.isfinite(half) else None
+        return (middle - half, middle + half) if np.isfinite(middle + half) else None
 
     def _without(self, sides: list[int], statistic: Callable[[float, float], float]) -> Pair:
         """Return the statistic without each pose, and the poses' shares of the sum, both (P,).
@@ -169,10 +167,8 @@ class PoseSums:
 
     def ratio_p(self, random: Random) -> float | None:
         """Return the p-value of the poses' ratios to what is expected being alike."""
-        logs = []
-        for total, expected, left_out in zip(
-            self.total, self._expected(), self.left_out, strict=True
-        ):
+        logs, sides = [], zip(self.total, self._expected(), self.left_out, strict=True)
+        for total, expected, left_out in sides:
             seen = total.sum(1)
             share = np.where(seen > 0, quotient(seen, expected), np.nan)
             # Pseudo-values of a jackknife: a factor that all poses share moves them together, and

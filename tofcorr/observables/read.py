@@ -59,15 +59,13 @@ class Observed:
             their squares, and numbers, in each pose, along `AXES` at `LAGS`: shape (P, 3, 2, 2).
         within: Half squares of differences of neighbours in one image, squares of second
             differences there, and numbers, likewise; without the pattern and the edges of squares.
-        pattern: Variance of what the residuals of different poses share, m^2.
+        pattern: Variance of what the residuals of different poses share, m^2; of a single pose,
+            what its frames share.
         between_frames: Half the squared differences of frames one and two apart, of each pose,
             summed over tiles of the image, shape (2, T), m^2.
-        repeated: Variance of the mean residual of each pose less that of its noise, shape (P,),
-            m^2; NaN without repeats.
         map_missing: How often each pixel was missing, shape (H, W).
         map_frames: In how many frames it looked at the target, shape (H, W).
         losing_poses: How many poses miss a pixel.
-        saturated: How many pixels of all frames are saturated.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -75,32 +73,32 @@ class Observed:
         names = sorted(set(recording.frames.target.tolist()))
         shape = (recording.camera.height, recording.camera.width)
         self.map_missing, self.map_frames = np.zeros((2, *shape))
-        tables, sums, repeated, counts = ([] for _ in range(4))
+        tables, sums, counts = ([] for _ in range(3))
         self.between_frames: list[np.ndarray] = []
         fit = _SurfaceFit(recording.camera)
         poses, shared = repeats_of(recording), _BetweenPoses(shape)
         for frames in poses:
             shared.add(_PoseImages(recording, frames[:_MOST_REPEATS], fit))
+        self.pattern = shared.variance()
         for number, frames in enumerate(poses):
             images = _PoseImages(recording, frames[:_MOST_REPEATS], fit)
             residual = images.residual
             images.compare(shared.without(images))
             sums.append(_of_neighbours(images))
-            repeated.append(_repeated_variance(residual))
+            if len(poses) == 1:
+                self.pattern = _repeated_variance(residual)
             self.between_frames.append(_frame_differences(residual))
             target = str(recording.frames.target[frames[0]])
             tables.append(_rows(images, number, names.index(target), shape))
             self.map_missing[images.place] += images.missing.sum(0)
             self.map_frames[images.place] += images.on_target.sum(0)
-            counts.append([len(residual), images.missing.any(), images.saturated.sum()])
+            counts.append([len(residual), images.missing.any()])
         self.table = np.concatenate(tables).view(np.recarray)
         if not np.isfinite(self.table.distance).any():
             raise CalibrationDataError(f"{recording.path}: no image has 100 usable target pixels.")
-        self.repeats, losing, saturated = np.array(counts).T
-        self.losing_poses, self.saturated = int(losing.sum()), int(saturated.sum())
+        self.repeats, losing = np.array(counts).T
+        self.losing_poses = int(losing.sum())
         self.temporal, self.within = np.stack(sums, axis=1)
-        self.pattern = shared.variance()
-        self.repeated = np.array(repeated)
 
 
 class _PoseImages:
@@ -281,11 +279,15 @@ def log_of(values: np.ndarray) -> np.ndarray:
 
 
 def _repeated_variance(residual: np.ndarray) -> float:
-    """Return the variance within the mean image of a pose, less that of its noise, m^2."""
+    """Return the variance within the mean image of a pose, less that of its noise, m^2.
+
+    Without repeats it is taken to be 0.
+    """
     values = residual[:, np.isfinite(residual).all(0)]
     if len(values) < 2 or not values.size:
-        return np.nan
-    return float(np.mean(values.mean(0) ** 2) - values.var(0, ddof=1).mean() / len(values))
+        return 0.0
+    noise = values.var(0, ddof=1).mean() / len(values)
+    return max(float(np.mean(values.mean(0) ** 2) - noise), 0.0)
 
 
 def _frame_differences(residual: np.ndarray) -> np.ndarray:
@@ -419,9 +421,8 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
     step = max(seen.size / _MOST_OF_POSE, 1.0)
     pixel = (np.arange(min(seen.size, _MOST_OF_POSE)) * step).astype(np.int64)
     pixel = pixel[seen.ravel()[pixel]]
-    at = tuple(
-        each - side.start for each, side in zip(divmod(pixel, shape[1]), images.place, strict=True)
-    )
+    rows, columns = images.place
+    at = pixel // shape[1] - rows.start, pixel % shape[1] - columns.start
     chosen = (slice(None), *at)
     values, on_target = images.residual[chosen], images.on_target[chosen]
     known = np.isfinite(values)
@@ -433,7 +434,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
     squares = np.nansum((values - known_mean(values)) ** 2, axis=0)
     distance, cosine = images.distance[at], images.cosine[at]
     second = [known_mean(images.second[axis] ** 2)[at] for axis in AXES]
-    columns = {
+    fields = {
         "pose": np.full(len(pixel), pose),
         "pixel": pixel,
         "distance": distance,
@@ -449,7 +450,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
         "missing": images.missing[chosen].sum(0),
         "saturated": images.saturated[chosen].sum(0),
     }
-    return np.rec.fromarrays(list(columns.values()), names=",".join(columns))  # pyright: ignore[reportArgumentType]
+    return np.rec.fromarrays(list(fields.values()), names=",".join(fields))  # pyright: ignore[reportArgumentType]
 
 
 def _of_nearest(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:

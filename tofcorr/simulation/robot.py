@@ -95,9 +95,8 @@ def hand_eye_guess(mount: CameraMountOptions, generator: torch.Generator) -> Ten
     """Return the recorded guess of the hand-eye transform, shape (4, 4): see the options."""
     if mount.guess is None:
         return torch.eye(4, dtype=torch.float64)
-    direction = torch.nn.functional.normalize(
-        torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1
-    )
+    drawn = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    direction = torch.nn.functional.normalize(drawn, dim=-1)
     zero, truth = torch.zeros(3, dtype=torch.float64), mount.tool_from_camera()
     turn = se3.exp(torch.cat([zero, direction[1] * math.radians(mount.guess.rotation_deg)]))
     shift = truth[:3, 3] + direction[0] * mount.guess.translation_mm / 1000
@@ -250,9 +249,8 @@ def _draw_path(
         positions = CubicSpline(knots, waypoints[:, :3, 3])
         rotations = RotationSpline(knots, Rotation.from_matrix(waypoints[:, :3, :3]))
         turned = rotations(times)
-        path = se3.assemble(
-            torch.from_numpy(turned.as_matrix()), torch.from_numpy(positions(times))
-        )
+        rotation = torch.from_numpy(turned.as_matrix())
+        path = se3.assemble(rotation, torch.from_numpy(positions(times)))
         if all(fills_image(pose) for pose in path):
             # Of a spline of rotations the rate is in the moving frame already.
             rates = turned.inv().apply(positions(times, 1)), rotations(times, 1)

@@ -27,7 +27,6 @@ class CheckerboardTarget(Options):
     square_mm: PositiveNumber = 80.0
     reflectivity_dark: Share = 0.1
     reflectivity_bright: Share = 0.8
-    corner_mm: tuple[Number, Number] = (0.0, 0.0)
 
 
 Target = Annotated[UniformTarget | CheckerboardTarget, Field(discriminator="pattern")]
@@ -97,8 +96,7 @@ def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Ten
     """
     if isinstance(target, UniformTarget):
         return torch.full_like(target_xy[..., 0], target.reflectivity)
-    corner = target_xy.new_tensor(target.corner_mm) / 1000
-    in_squares = (target_xy - corner) / (target.square_mm / 1000)
+    in_squares = target_xy / (target.square_mm / 1000)
     share_bright = _bright(in_squares)
     # How the coordinates change from row to row, and from column to column.
     steps = [

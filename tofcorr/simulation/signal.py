@@ -167,12 +167,13 @@ class AmplitudeTable(CurveTable):
     variable: Literal["amplitude", "normalised_amplitude"] = "amplitude"
 
 
+_Row = Annotated[tuple[Number, ...], Field(min_length=1)]
+
+
 class LatticeTable(Options):
     """A bicubic map through a regular lattice of points from corner to corner of the image."""
 
-    values_m: Annotated[
-        tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...], Field(min_length=1)
-    ]
+    values_m: Annotated[tuple[_Row, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _rectangular(self) -> Self:
@@ -352,22 +353,17 @@ class ReadoutOptions(Options):
         electrons_per_count: Electrons per count of the converter. Amplitude, ambient light and raw
             samples of the recording are in counts.
         converter_bits: Resolution. A pixel with a sample at the largest count has no distance.
-        full_well_electrons: Largest charge of a tap; null: more than the converter can show.
         least_amplitude_counts: Pixels with a smaller amplitude have no distance.
     """
 
     read_noise_electrons: NonNegativeNumber = 200.0
     electrons_per_count: PositiveNumber = 40.0
     converter_bits: Annotated[int, Field(ge=4, le=32)] = 16
-    full_well_electrons: PositiveNumber | None = None
     least_amplitude_counts: NonNegativeNumber = 0.0
 
     def largest_count(self) -> float:
         """Return the count at which a sample is saturated."""
-        largest = 2.0**self.converter_bits - 1
-        if self.full_well_electrons is None:
-            return largest
-        return min(largest, self.full_well_electrons / self.electrons_per_count)
+        return 2.0**self.converter_bits - 1
 
 
 def read_out(taps: Tensor, options: ReadoutOptions, generator: torch.Generator | None) -> Tensor:

@@ -109,10 +109,9 @@ def load_c(path: Path | str, flags: Sequence[str] = ("-O2",), compiler: str = ""
         depth, amplitude = depth.contiguous(), amplitude.contiguous()
         corrected = torch.empty_like(depth)
         valid = torch.empty_like(depth, dtype=torch.bool)
-        frames = [one.unsqueeze(0) if one.dim() == 2 else one for one in (depth, amplitude)]
-        outputs = [one.unsqueeze(0) if one.dim() == 2 else one for one in (corrected, valid)]
-        for pointers in zip(*frames, *outputs, strict=True):
-            run(*(one.data_ptr() for one in pointers))
+        batches = [one.view(-1, *one.shape[-2:]) for one in (depth, amplitude, corrected, valid)]
+        for images in zip(*batches, strict=True):
+            run(*(one.data_ptr() for one in images))
         return corrected, valid
 
     return correct
@@ -277,11 +276,8 @@ def pieces_of(term: SignalTerm, limits: Domain) -> Pieces:
 
 def _smooth(term: SignalTerm, limits: Domain) -> tuple[Axis, ...]:
     distance = Axis("distance", *limits.radial_distance)
-    return (
-        (distance, Axis("amplitude", *(limits.amplitude or EVERYTHING)))
-        if term.needs_amplitude
-        else (distance,)
-    )
+    amplitude = Axis("amplitude", *(limits.amplitude or EVERYTHING))
+    return (distance, amplitude) if term.needs_amplitude else (distance,)
 
 
 def _interpolated(term: SignalTerm, axes: tuple[Axis, ...]) -> Pieces:

@@ -274,25 +274,19 @@ class OpenSet:
             1 to 3 mm. What depends on anything recorded is no scatter.
         least_variance: Least variance that others are divided by, m^2: a micrometre squared.
             Chosen, below any noise.
-        half_size: Size of an unknown gap at which the score is a half, metres. Chosen.
 
     Attributes:
         unknown: Whether a gap remains that no effect explains.
-        score: How large and how unexplained the remainder is, from 0 to 1, for ranking.
         after: Structure of the residual with the named effects.
-        remaining_share: Squared structure after over before.
         fingerprint: What the remainder looks like: clauses that follow "It".
     """
 
     least_poses: ClassVar[int] = 8
     most_scatter: ClassVar[float] = 0.003
     least_variance: ClassVar[float] = 1e-12
-    half_size: ClassVar[float] = 0.0007
 
     unknown: bool
-    score: float
     after: Coherence
-    remaining_share: float
     fingerprint: tuple[str, ...]
 
     @property
@@ -337,12 +331,9 @@ def judge_remainder(study: Study, named: NamedEffects, gap: Gap) -> OpenSet:
     unknown = named.unknown > options.tests.named_from and most > (target / 2) ** 2
     unknown |= scattered or (large and share > options.unknown_share)
     enough = named.tested and poses >= OpenSet.least_poses
-    size = remains / (remains + OpenSet.half_size**2)
     return OpenSet(
         unknown=bool(unknown and enough),
-        score=max(named.unknown, min(share, 1.0)) * size,
         after=after,
-        remaining_share=min(share, 1.0),
         fingerprint=tuple(_fingerprint(named, left, after)),
     )
 

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from tofcorr.diagnosis.findings.where import TILES
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
@@ -41,8 +40,6 @@ class Outliers:
         reduced: Share of the pixels that get less than full weight.
         size: Root mean square residual of the deleted pixels, metres; 0 if there are none.
         noise: Root mean square noise of all other pixels, metres.
-        tiles: Share of deleted and reduced pixels in each tile of the image, shape (6, 8); NaN
-            where the tile holds no pixel.
         place: Where they lie: a clause that follows "They lie".
         wrapped_by: The unambiguous range, metres, if most deleted pixels are off by multiples of
             it; None: they are not, or it is unknown.
@@ -54,7 +51,6 @@ class Outliers:
     reduced: float
     size: float
     noise: float
-    tiles: np.ndarray
     place: str
     wrapped_by: float | None = None
 
@@ -90,9 +86,7 @@ def _percent(share: float) -> str:
 def outliers_of(study: Study) -> Outliers:
     """Count the pixels that the base fit leaves out or weighs down, and find where they lie."""
     odd, deleted = study.fit.trust < 1, study.fit.trust == 0
-    errors, (rows, columns) = study.fit.residual[deleted], TILES
-    tile = _tiles(study.observations, rows, columns)
-    held, all_held = (torch.bincount(tile, x, rows * columns) for x in (odd.double(), None))
+    errors = study.fit.residual[deleted]
     frequency = study.observations.recording.modulation_frequency
     whole = unambiguous_range(frequency) if frequency else None
     return Outliers(
@@ -100,7 +94,6 @@ def outliers_of(study: Study) -> Outliers:
         reduced=float((odd & ~deleted).double().mean()),
         size=float(errors.square().mean().sqrt()) if len(errors) else 0.0,
         noise=study.fit.floor,
-        tiles=(held / all_held).reshape(TILES).numpy(),
         place=place_of(study, odd),
         wrapped_by=whole if mostly_wrapped(errors.numpy(), frequency) else None,
     )
@@ -135,15 +128,16 @@ def _places(
         edge_ratio: Brightest over darkest pixel of a 3 x 3 neighbourhood that holds an edge of the
             target. Chosen: neighbours of one reflectivity differ by a few per cent and by noise.
     """
-    observations, width = study.observations, study.observations.recording.camera.width
-    row, column = observations.pixel // width, observations.pixel % width
+    observations, camera = study.observations, study.observations.recording.camera
+    row, column = observations.pixel // camera.width, observations.pixel % camera.width
     # Tiles along a side, groups of like distance, and the most frames that are listed. Chosen.
     groups = 8
     found = {"at the rim of the target's mask": _at_edges(observations, observations.on_target, 1)}
     if observations.amplitude_images is not None:
         at_edges = _at_edges(observations, observations.amplitude_images, edge_ratio)
         found["at edges between dark and bright"] = at_edges
-    members = chosen & _crowded(_tiles(observations, groups, groups), chosen)
+    tile = row * groups // camera.height * groups + column * groups // camera.width
+    members = chosen & _crowded(tile, chosen)
     if bool(members.any()):
         places = torch.stack([row, column], dim=1)[members]
         (top, left), (bottom, right) = places.amin(0).tolist(), places.amax(0).tolist()
@@ -167,13 +161,6 @@ def _places(
         there = _crowded(torch.bucketize(own, levels), chosen)
         if bool(there.any()):
             yield words.format(float(own[there].min()), float(own[there].max())), there
-
-
-def _tiles(observations: Observations, rows: int, columns: int) -> Tensor:
-    """Return the tile of the image that each pixel lies in, shape (M,)."""
-    camera, pixel = observations.recording.camera, observations.pixel
-    row, column = pixel // camera.width, pixel % camera.width
-    return row * rows // camera.height * columns + column * columns // camera.width
 
 
 def _at_edges(observations: Observations, images: Tensor, ratio: float) -> Tensor:

@@ -189,9 +189,7 @@ def effect_forest(result: "DiagnosisResult") -> Figure:
         colour = RED if name in result.effects else BLUE if name in alike else GREY
         closed = 1000**2 * found.closed[name].numpy() / count * len(found.closed[name])
         error = TWO_SIDED * closed.std(ddof=1) / len(closed) ** 0.5
-        left.errorbar(
-            closed.mean(), place, xerr=error, fmt="o", capsize=2, markersize=4, color=colour
-        )
+        left.errorbar(closed.mean(), place, xerr=error, fmt="o", markersize=4, color=colour)
         right.barh(place, found.probabilities.get(name, 0.0), color=colour)
     line_across(left, vertical=True)
     left.set_xlabel("closes, mm² of the\nheld-out mean square")
@@ -223,12 +221,10 @@ def absorption_table(study: Study) -> np.ndarray:
 
 def absorption_map(result: "DiagnosisResult") -> Figure:
     """Draw the share of each effect that calibration absorbs, then that other effects absorb."""
-    names = tuple(result.evidence.study.effects)
+    names, table = tuple(result.evidence.study.effects), absorption_table(result.evidence.study)
     figure, (axes,) = panels(5)
     axes.set_facecolor("#f3e9e9")
-    shown = axes.imshow(
-        absorption_table(result.evidence.study), cmap="Greys", vmin=0, vmax=1, aspect="auto"
-    )
+    shown = axes.imshow(table, cmap="Greys", vmin=0, vmax=1, aspect="auto")
     axes.axvline(0.5, color="white", linewidth=3)
     axes.set_xticks(range(len(names) + 1), ["calibration", *names], rotation=90)
     axes.set_yticks(range(len(names)), names)

@@ -172,7 +172,6 @@ class DiagnosisResult:
                 "deleted_share": round(outliers.deleted, 6),
                 "reduced_share": round(outliers.reduced, 6),
                 "rms_mm": _mm(outliers.size),
-                "map": [_rounded(row) for row in outliers.tiles.tolist()],
                 "where": outliers.place,
             },
             "ranking": [_ranked(self.evidence.study, named, name) for name in named.ranking]
@@ -211,21 +210,8 @@ class DiagnosisResult:
             "next_recording": list(self.advice),
             "verdict": self.verdict,
             **{name: list(getattr(self, name)) for name in lists},
-            "unknown_score": round(remainder.score, 4),
-            "remaining_share": round(remainder.remaining_share, 4),
             "fingerprint": list(remainder.fingerprint),
         }
-
-    @property
-    def where(self) -> Stage:
-        """Bias along all covariates, after recalibration."""
-        return self.stages[1]
-
-    def all_figures(self) -> "dict[str, Figure]":
-        """Return every figure, by its name on the report page."""
-        from tofcorr.diagnosis.report.figures import all_figures
-
-        return all_figures(self)
 
     def plot(self, name: str) -> "Figure":
         """Return one figure, by its name in `tofcorr.diagnosis.report.figures.FIGURES`."""
@@ -250,7 +236,6 @@ def _ranked(study: Study, named: NamedEffects, name: str) -> dict[str, Any]:
         "aliases": [other for other in members if other != name],
         "available": True,
         "missing": [],
-        "gain": round(named.models.gain_of(name), 2),
         "absorbed": absorbed,
     }
 
@@ -283,9 +268,9 @@ def _sized(gap: Estimated | None) -> dict[str, Any]:
     return {"gap_mm": _mm(gap), "ci": None if gap is None else _mm(gap.interval)}
 
 
-def _rounded(shares: tuple[float, float] | list[float]) -> list[float | None]:
-    """Return shares to four digits; None: it is not known."""
-    return [None if math.isnan(share) else round(share, 4) for share in shares]
+def _rounded(interval: tuple[float, float]) -> list[float]:
+    """Return the ends of an interval of a share to four digits."""
+    return [round(end, 4) for end in interval]
 
 
 def _finite(number: float) -> float | None:
@@ -320,6 +305,7 @@ def render(result: DiagnosisResult) -> str:
     """Return the page: one HTML file that needs nothing else."""
     from markupsafe import Markup
 
+    from tofcorr.diagnosis.report.figures import all_figures
     from tofcorr.plausibility.page import page_text
 
     study, named = result.evidence.study, result.evidence.named
@@ -344,7 +330,7 @@ def render(result: DiagnosisResult) -> str:
     return page_text(
         "tofcorr.diagnosis.report",
         "report.html.j2",
-        result.all_figures(),
+        all_figures(result),
         filters,
         style=Markup(style),
         **result.to_mapping(),
@@ -362,8 +348,7 @@ def render(result: DiagnosisResult) -> str:
 def _mm_shown(value: float | None) -> str:
     if value is None:
         return "–"
-    text = f"{value:.1f}" if round(abs(value), 1) >= 1 else f"{value:.2f}"
-    return text.removeprefix("-") if float(text) == 0 else text
+    return f"{value:z.1f}" if round(abs(value), 1) >= 1 else f"{value:z.2f}"
 
 
 def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:

@@ -339,14 +339,11 @@ def lone_poses(study: Study, floor: float, *, alone_limit: float = 8.0, most: fl
     others = max(float(beyond[~alone].sum() / count[~alone].sum()), 0.0) ** 0.5
     distance = study.inputs.radial_distance[alone[study.unit_of_pixel]]
     frame = int(alone[study.observations.unit].nonzero()[0])
-    start, makes, these = f"Frame {frame}", "makes", "this one"
-    if int(alone.sum()) > 1:
-        start = f"{int(alone.sum())} poses, such as that of frame {frame}"
-        makes, these = "make", "these"
     return (
-        f"{start}, at {float(distance.min()):.1f} to {float(distance.max()):.1f} m, {makes} "
+        f"{int(alone.sum())} of {len(alone)} poses, with frame {frame} and at "
+        f"{float(distance.min()):.1f} to {float(distance.max()):.1f} m, hold "
         f"{percent(min(share, 1.0))} of the squared gap: the gap is what a fit to all other poses "
-        f"misses, and no other pose is like {these}. The others make {mm(others)} mm. Record more "
+        f"misses, and there is no other pose there. The others make {mm(others)} mm. Record more "
         "poses there."
     )
 
@@ -375,9 +372,8 @@ def moving_waves(study: Study) -> str:
     if not study.fit.shared.striped:
         return ""
     return (
-        "An error that changes from frame to frame, such as waves that move, reaches farther over "
-        "the image than a filter does. Where it differs between neighbouring pixels, it counts as "
-        "noise."
+        "An error changes from frame to frame and reaches farther over the image than a filter, as "
+        "moving waves do. Where neighbouring pixels differ in it, it counts as noise."
     )
 
 

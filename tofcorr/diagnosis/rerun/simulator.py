@@ -6,6 +6,7 @@ The simulator's options can be written out, and run at the same poses. The senso
 
 import copy
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -272,39 +273,29 @@ def _variable_of(term: SignalTerm) -> str | None:
 def _plain(study: Study) -> SimulatorOptions:
     """Return a sensor without errors, as noisy as the recording, with its targets and frames."""
     observations, recording = study.observations, study.observations.recording
-    names, counts = np.unique(recording.frames.target, return_counts=True)
+    shown = sorted(Counter(recording.frames.target.tolist()).items())
+    targets = dict.fromkeys(dict(shown), UniformTarget()) | SceneOptions().targets
     # Errors are tables of the distance, so that a frequency that is unknown hardly matters.
     frequency = recording.modulation_frequency or SensorOptions().modulation_frequency_hz
-    light = LightOptions()
-    electrons_per_count = ReadoutOptions().electrons_per_count
-    electrons_at_1m = light.electrons_at_1m
+    light, readout = LightOptions(), ReadoutOptions(read_noise_electrons=0.0, converter_bits=32)
     if observations.amplitude is not None:
         amplitude = float(observations.amplitude.median())
         scale = unambiguous_range(frequency) / (2 * np.pi)
         noise = float(study.fit.sigma.median())
         # Shot noise: sigma = scale sqrt(B / 2) / A, with the mean B = A / contrast.
         electrons = scale**2 / (2 * light.demodulation_contrast * noise**2)
-        electrons_per_count = electrons / max(amplitude, TINY)
+        per_count = {"electrons_per_count": electrons / max(amplitude, TINY)}
+        readout = readout.model_copy(update=per_count)
         distance = float(observations.measured.median())
         # Of a grey wall, which reflects a half.
-        electrons_at_1m = electrons * distance**2 / (0.5 * light.demodulation_contrast)
+        at_1m = electrons * distance**2 / (0.5 * light.demodulation_contrast)
+        light = light.model_copy(update={"electrons_at_1m": at_1m})
     return SimulatorOptions(
         camera=CameraOptions(**recording.camera.section()),
         depth_kind=recording.depth_kind,
-        shots=tuple(
-            ShotOptions(target=name, poses=n)
-            for name, n in zip(names.tolist(), counts.tolist(), strict=True)
-        ),
-        scene=SceneOptions(
-            targets=dict.fromkeys(names.tolist(), UniformTarget()) | SceneOptions().targets
-        ),
-        sensor=SensorOptions(
-            modulation_frequency_hz=frequency,
-            light=light.model_copy(update={"electrons_at_1m": electrons_at_1m}),
-            readout=ReadoutOptions(
-                electrons_per_count=electrons_per_count, read_noise_electrons=0.0, converter_bits=32
-            ),
-        ),
+        shots=tuple(ShotOptions(target=name, poses=count) for name, count in shown),
+        scene=SceneOptions(targets=targets),
+        sensor=SensorOptions(modulation_frequency_hz=frequency, light=light, readout=readout),
     )
 
 

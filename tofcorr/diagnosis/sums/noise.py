@@ -310,9 +310,8 @@ def estimate_noise(observations: Observations, tool_from_camera: Tensor) -> Pixe
     noise = _with_repeats(observations, noise)
     # Two standard errors, at most half; second differences that overlap count half.
     error = min(2 / np.sqrt(max(len(place), 1)), 0.5)
-    return replace(
-        noise, sigma=np.maximum(noise.sigma * noise.ratios[1], _LEAST_SIGMA), error=error
-    )
+    sigma = np.maximum(noise.sigma * noise.ratios[1], _LEAST_SIGMA)
+    return replace(noise, sigma=sigma, error=error)
 
 
 def _second_differences(

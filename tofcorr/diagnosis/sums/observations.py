@@ -200,8 +200,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
     counts = torch.tensor([len(own) for own in chosen])
     if (seen := int((counts > 0).sum())) < 2:
         raise CalibrationDataError(
-            f"{recording.path}: a diagnosis needs at least two frames with usable pixels, "
-            f"got {seen}."
+            f"{recording.path}: a diagnosis needs two frames with usable pixels, got {seen}."
         )
     every = Observations(
         recording=recording,
@@ -387,9 +386,8 @@ def with_walls_moved(observations: Observations, step: Tensor) -> Observations:
     change = step.reshape(observations.num_walls, -1)[wall]
     turned = facts.normal_world + (change[:, :2, None] * tangents(facts.normal_world)).sum(1)
     normal = torch.nn.functional.normalize(turned, dim=1)
-    return with_planes(
-        observations, replace(facts, normal_world=normal, offset=facts.offset + change[:, 2])
-    )
+    moved = replace(facts, normal_world=normal, offset=facts.offset + change[:, 2])
+    return with_planes(observations, moved)
 
 
 def with_planes(observations: Observations, facts: FrameFacts) -> Observations:

@@ -51,9 +51,7 @@ class WarmUpEffect(FrameEffect, shape=WarmUpShape):
 
     name = "warm_up"
     summary = "drift while the camera warms up and cools down between frames"
-    remedy = (
-        "poses in random order with revisits, the first minutes included, body temperature logged"
-    )
+    remedy = "random poses with revisits, the first minutes included, body temperature logged"
     needs = (TIMESTAMP,)
     linear = True
 
