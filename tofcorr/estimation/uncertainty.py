@@ -196,6 +196,7 @@ def observability(
     order = variances.argsort(descending=True)
     # Rounding may leave a variance below zero where the images fit exactly.
     variances, vectors = variances[order].clamp(min=0.0), vectors[:, order]
+    # Half of the variance is then the prior's.
     undetermined = int((variances > PRIOR_SIGMA**2 / 2).sum())
     vectors[:, :undetermined] = sparse_basis(vectors[:, :undetermined])
     left, right = torch.triu_indices(len(names), len(names), offset=1)
@@ -211,9 +212,7 @@ def observability(
         shares = named_components(vectors[:, k], names)
         first = [names.index(name) for name in list(shares)[:2]]
         both = float(correlation[first[0], first[1]]) if len(first) > 1 else None
-        # Half of the variance is then the prior's.
-        undetermined = 2 * float(variances[k]) > PRIOR_SIGMA**2
-        return Direction(float(variances[k]) ** 0.5, shares, both, undetermined)
+        return Direction(float(variances[k]) ** 0.5, shares, both, k < undetermined)
 
     return Observability(
         [direction(k) for k in range(len(names))], pairs, posterior, vectors, precision, variance
@@ -262,11 +261,10 @@ def prior_on_undetermined(found: Observability, guess: Parameters) -> Prior | No
     Returns:
         The prior; None if every direction is determined.
     """
-    rows = [k for k, direction in enumerate(found.directions) if direction.is_undetermined]
-    if not rows:
+    names = [one.in_words() for one in found.undetermined]
+    if not names:
         return None
-    factor = found.vectors[:, rows].T.contiguous() / PRIOR_SIGMA
-    names = [found.directions[k].in_words() for k in rows]
+    factor = found.vectors[:, : len(names)].T.contiguous() / PRIOR_SIGMA
     return Prior(guess, factor, found.variance, names)
 
 
