@@ -160,11 +160,6 @@ class DistanceNoise(NamedTuple):
         inverse = 1 / amplitude.clamp(min=torch.finfo(amplitude.dtype).tiny)
         return self.floor + inverse * (self.shot + self.readout * inverse)
 
-    @property
-    def coefficients(self) -> tuple[float, float, float]:
-        """a, b and c."""
-        return self.floor, self.shot, self.readout
-
 
 def fit_noise(
     differences: Float[Tensor, "S"], amplitude: Float[Tensor, "S"], source: Source

@@ -58,7 +58,7 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
         depth_kind=recording.depth_kind,
         saturation_amplitude=recording.saturation_amplitude,
         covariance=fit.covariance.matrix[parameters.twist_size :, parameters.twist_size :],
-        noise=None if fit.noise is None else fit.noise.coefficients,
+        noise=None if fit.noise is None else fit.noise[:3],
         frames=recording.frame_names,
         hand_eye_accuracy=hand_eye_accuracy(fit),
     )
