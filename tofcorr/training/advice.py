@@ -286,16 +286,9 @@ def draw_pool(
         tilt_deg=min(max(recorded, 30), 40),
         longest_ray=ranges.high * (1 + 1 / 20),
     )
-    return draw_views(
-        camera,
-        (normal, offset),
-        hand_eye,
-        space,
-        target_brightness(dataset, frames, hand_eye),
-        dataset.ray_directions(),
-        generator,
-        size,
-    )
+    wall, rays = (normal, offset), dataset.ray_directions()
+    brightness = target_brightness(dataset, frames, hand_eye)
+    return draw_views(camera, wall, hand_eye, space, brightness, rays, generator, size)
 
 
 def target_brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[str, Tensor]:
@@ -306,20 +299,16 @@ def target_brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) ->
         frames: Global numbers of the frames.
         hand_eye: tool_from_camera, shape (4, 4).
     """
-    names = dataset.targets[frames]
-    nothing = {str(name): torch.zeros(2, dtype=torch.float64) for name in np.unique(names)}
-    if not dataset.has_amplitude:
-        return nothing
-    rays, found = dataset.ray_directions(), {}
+    names, rays, found = dataset.targets[frames], dataset.ray_directions(), {}
     # A tenth of the pixels is darker than what stands for dark, a tenth brighter than bright.
     quantiles = torch.tensor([1 / 10, 9 / 10], dtype=torch.float64)
-    for name in np.unique(names):
+    for name in np.unique(names) if dataset.has_amplitude else ():
         batches = dataset.batches(frames[names == name])
         logs = torch.cat([sample_reflectivity(one, rays, hand_eye, 500)[1] for one in batches])
         if logs.numel():  # A target may have no pixel with light that is not too grazing.
             found[str(name)] = logs.quantile(quantiles)
     if not found:
-        return nothing
+        return {str(name): torch.zeros(2, dtype=torch.float64) for name in np.unique(names)}
     if all(float(high - low) < math.log(ENOUGH_REFLECTIVITY) for low, high in found.values()):
         bright = max(float(high) for _, high in found.values())
         found["checkerboard"] = torch.tensor([bright + math.log(_DARK), bright]).double()
@@ -350,8 +339,7 @@ def advise(
     moments = pool.moments(design, best.tool_from_camera, share, enough)
     # Poses carry no information about condition terms.
     beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
-    if beyond:
-        moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
+    moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
     added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
     # What no pose shows is not what further poses are for.
     shown = [k for k, one in enumerate(fit.observability.directions) if not fit.is_unseen(one)]
@@ -467,16 +455,10 @@ def plan_poses(
     # In the axes of the start camera.
     normal = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
     offset = torch.tensor([start_distance or middle], dtype=torch.float64)
-    rays = ray_directions(camera)
-    pool = draw_views(
-        torch.eye(4, dtype=torch.float64)[None],
-        (normal, offset),
-        hand_eye,
-        workspace,
-        {"wall": torch.tensor([workspace.log_dark, 0.0]).double()},
-        rays,
-        np.random.default_rng(seed),
-    )
+    wall, rays = (normal, offset), ray_directions(camera)
+    start, random = torch.eye(4, dtype=torch.float64)[None], np.random.default_rng(seed)
+    brightness = {"wall": torch.tensor([workspace.log_dark, 0.0]).double()}
+    pool = draw_views(start, wall, hand_eye, workspace, brightness, rays, random)
     if pool is None:
         raise ConfigError("No view lies on the wall: allow shorter distances, or less tilt.")
     domain = _domain(camera, workspace)
