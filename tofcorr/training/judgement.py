@@ -208,10 +208,8 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
     if not solution.converged and solution.stopped != "not_finite":
         yield "usable", solution.message
     if free and max(fit.hand_eye_errors) > _WEAK:
-        yield (
-            "usable",
-            f"The hand-eye is known to {_known(fit)} only: record more tilts and distances.",
-        )
+        loose = f"The hand-eye is known to {_known(fit)} only"
+        yield "usable", f"{loose}: record more tilts and distances."
     wide, of_pose = 1e3 * PRIOR_SIGMA, "usable" if free else "good"
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
     weak = [one for one in fit.directions if one.sigma > _WEAK and not fit.is_unseen(one)]
@@ -319,9 +317,6 @@ def _hand_eye_lines(report: Mapping[str, Any]) -> Iterator[str]:
         done = "taken off" if shift["removed"] else "not taken off; the standard errors contain it"
         millimetres = "  ".join(f"{t:+z.2f}" for t in shift["translation_mm"])
         yield f"  moved by the noise of the distances, mm: {millimetres} ({done})"
-    moved = [
-        f"{math.hypot(*one['translation_mm']):.1f} mm for {one['error']}"
-        for one in report["assumptions"]
-    ]
-    if moved:
-        yield f"  what ± leaves out: {', '.join(moved)}"
+    moved = ((math.hypot(*one["translation_mm"]), one["error"]) for one in report["assumptions"])
+    if said := ", ".join(f"{size:.1f} mm for {error}" for size, error in moved):
+        yield f"  what ± leaves out: {said}"
