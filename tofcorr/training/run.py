@@ -129,8 +129,7 @@ class TrainingResult:
         fit, options = self.fit, self.options
         state = calibration_state(self.data, options, fit)
         save_calibration(folder / STATE_FILE, state)
-        seen, frames = self.data, self.calibration.frames
-        reference = estimate_reference(seen, frames, fit, state.noise)
+        reference = estimate_reference(self.data, self.calibration.frames, fit, state.noise)
         if reference is not None:
             save_reference(folder / REFERENCE_FILE, reference, state)
         if self.force or self.report["verdict"] != DO_NOT_USE:
