@@ -231,10 +231,8 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
     # Six folds choose the strength of a penalty; poses go to them in turn, with all their images.
     held_out = [(poses % 6 == k).nonzero()[:, 0].tolist() for k in range(6)]
     penalties = with_strengths(penalties_of(model), moments, start, held_out)
-    strengths = {one.name: float(one.strength) for one in penalties}
-    chosen = [
-        strengths[t.symbols[0]] for t, _ in model.penalised() if t.options.is_open("strength")
-    ]
+    both = zip(model.penalised(), penalties, strict=True)
+    chosen = [float(one.strength) for (term, _), one in both if term.options.is_open("strength")]
     core = Core(
         options=options.with_found("strength", chosen),
         moments=moments,
