@@ -73,9 +73,8 @@ class Finding:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        values = asdict(self)
-        del values["spoils"]  # For those who fit.
-        return values
+        # Those who fit look at `spoils`.
+        return {name: value for name, value in asdict(self).items() if name != "spoils"}
 
 
 impossible, doubtful, note = (

@@ -268,11 +268,9 @@ def drift(look: Look) -> Iterator[Finding]:
 def late(look: Look) -> Iterator[Finding]:
     """Are a pose and its image of one moment, or does one hold a share of the frame before?"""
     if look.late is not None:
-        what, share, found = look.late
+        (kind, of), share, found = look.late
         size = f"{1e3 * found.size:.1f} mm (standard error {1e3 * found.size_error:.1f} mm)"
-        said = (
-            f"Each {what[0]} holds {100 * share:.1f} % of {what[1]}, which moves points by {size}"
-        )
+        said = f"Each {kind} holds {100 * share:.1f} % of {of}, which moves points by {size}"
         cause = "the robot still moved, poses lag, or the camera filters over time"
         yield doubtful(f"{said}: {cause}; wait after a move.", spoils=found.size > SPOILS)
 
