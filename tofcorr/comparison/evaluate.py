@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, ScalarFormatter
 
-from tofcorr.comparison.experiment import METRICS, Experiment, compare
+from tofcorr.comparison.experiment import METRICS, VIEWS, Experiment, compare
 from tofcorr.comparison.options import (
     BEFORE,
     HAND_EYE_ONLY,
@@ -28,10 +28,6 @@ from tofcorr.progress import LOG, event_writer
 from tofcorr.training.figures import save_figure
 from tofcorr.training.report import number_or_none
 from tofcorr.version import __version__
-
-# Of the RMS error in z: offset and tilts of whole images, which no model of a pixel sees; the rest;
-# and all of it with each held-out plane estimated again within its covariance, if it has one.
-_VIEWS = "between_views_mm", "within_views_mm", "within_prior_mm"
 
 
 @dataclass(frozen=True, repr=False)
@@ -178,19 +174,20 @@ class EvaluationResult:
         if self.options.repeats.number:
             found.append(self._repeats_table("rms_mm", "distance to the plane"))
             found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
-            found += [self._repeats_table(of, f"error in z {_in_words(of)}") for of in _VIEWS]
+            kinds = {f"{of}_mm": f"error in z {of.replace('_', ' ')}" for of in VIEWS}
+            found += [self._repeats_table(metric, kind) for metric, kind in kinds.items()]
             found.append(self._tests_table("repeats", "rms_mm"))
         found.append(self._views_table())
         walls = any(len(one.targets) > 1 for one in self.sets)
         return [*found, self._walls_table()] if walls else found
 
     def _views_table(self) -> Table:
-        columns, each = self.options.columns, [(one, of) for one in self.sets for of in _VIEWS]
-        found = [(f"{one.name}: {_in_words(of)}", one.values["half"][of]) for one, of in each]
-        rows = [[name, *(f"{own[column][0]:.2f}" for column in columns)] for name, own in found]
-        note = (
-            "Between views: offset and tilts of whole images, which no model of a pixel corrects."
-        )
+        rows = []
+        for one, of in product(self.sets, VIEWS):
+            errors = (one.values["half"][f"{of}_mm"][column] for column in self.options.columns)
+            cells = [f"{error[0]:.2f}" for error in errors]
+            rows.append([f"{one.name}: {of.replace('_', ' ')}", *cells])
+        note = "Between views: offset and tilts of whole images, beyond any model of a pixel."
         return self._table("Parts of the half's RMS error of the z depth, mm", rows, note)
 
     def _table(self, title: str, rows: list[list[str]], note: str) -> Table:
@@ -303,22 +300,15 @@ def evaluate(
         data = [Dataset((recording,)) for recording in sets]
         inspections = [vet(one, resolved_planes(options.planes, sets), force=force) for one in data]
         headlines = tuple(one.headline for one in inspections if one.headline)
-        names = _numbered_where_alike([recording.path.resolve().name for recording in sets])
-        evaluations = tuple(
-            Experiment(name, one, options, inspection)
-            for name, one, inspection in zip(names, data, inspections, strict=True)
-        )
+        names = [recording.path.resolve().name for recording in sets]
+        names = [k if names.count(k) == 1 else f"{k} ({n})" for n, k in enumerate(names, start=1)]
+        parts = zip(names, data, inspections, strict=True)
+        evaluations = tuple(Experiment(name, one, options, seen) for name, one, seen in parts)
         done = compare(evaluations, tell)
         result = EvaluationResult(evaluations, options.only(done), headlines)
         if folder is not None:
             result.write(folder)
     return result
-
-
-def _numbered_where_alike(names: Sequence[str]) -> list[str]:
-    return [
-        name if names.count(name) == 1 else f"{name} ({k})" for k, name in enumerate(names, start=1)
-    ]
 
 
 def pairs(columns: list[str]) -> list[tuple[str, str]]:
@@ -334,10 +324,6 @@ def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
         for first, second in pairs(columns)
         if first == models[0] or columns.index(second) == columns.index(first) + 1
     ]
-
-
-def _in_words(metric: str) -> str:
-    return metric.removesuffix("_mm").replace("_", " ")
 
 
 def _interval(found: Estimate) -> str:
