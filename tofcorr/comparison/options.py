@@ -337,12 +337,11 @@ def comparability_notes(options: ComparisonOptions) -> list[str]:
     fits = [_how_fitted(options.training(model), common) for model in options.models]
     if not any(fits):
         return []
-    walls = "" if options.planes == "known" else ", or the walls that a model estimated in its "
-    return [
-        *filter(None, fits),
-        f"All models are measured on the same held-out pixels ({_pixels(common)}), all of the same "
-        f"weight, against the recorded planes{walls and walls + 'training images'}.",
-    ]
+    said = f"All models are measured on the same held-out pixels ({_pixels(common)}), all of the"
+    said = f"{said} same weight, against the recorded planes"
+    if options.planes != "known":
+        said = f"{said}, or the walls that a model estimated in its training images"
+    return [*filter(None, fits), f"{said}."]
 
 
 def _how_fitted(training: TrainingOptions, common: MaskOptions) -> str:
