@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import FrameBatch
@@ -219,17 +220,14 @@ def _moved_camera(
     """
     tilt, azimuth, roll, away = wanted
     point = camera[:3, 3] + distance * camera[:3, 2]
-    across = torch.linalg.cross(normal, camera[:3, 0])
-    across = across / across.norm()
+    across = normalize(torch.linalg.cross(normal, camera[:3, 0]), dim=0)
     along = torch.linalg.cross(across, normal)
     aside = math.cos(azimuth) * along + math.sin(azimuth) * across
     axis = -math.cos(math.radians(tilt)) * normal + math.sin(math.radians(tilt)) * aside
-    x = camera[:3, 0] - axis * (camera[:3, 0] @ axis)
-    x = x / x.norm()
+    x = normalize(camera[:3, 0] - axis * (camera[:3, 0] @ axis), dim=0)
     turned = torch.stack([x, torch.linalg.cross(axis, x), axis], dim=1)
-    c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
-    spin = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return se3.assemble(turned @ spin, point - away * axis)
+    spin = se3.exp(torch.tensor([0.0] * 5 + [math.radians(roll)], dtype=torch.float64))
+    return se3.assemble(turned @ spin[:3, :3], point - away * axis)
 
 
 def _sees_wall(
