@@ -249,6 +249,7 @@ def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) ->
     return f"{off}; `tofcorr diagnose` tells which."
 
 
+_POSE = "  {target:<14}{distance_m:6.2f} m, tilted {tilt_deg:.0f} deg, rolled by {roll_by_deg:+.0f}"
 _VIEWS = (
     "{:<8} RMS along z {rms_z:.2f}: {between_views:.2f} between views (offset and tilts of whole "
     "images), {within_views:.2f} within; {within_prior:.2f} with planes within their covariance"
@@ -279,12 +280,9 @@ def report_text(report: Mapping[str, Any]) -> str:
         largest = f"{advice['sigma_mm_or_mrad']:.2f} mm (or mrad), of {advice['direction']}"
         expects = advice["worst_sigma_mm_or_mrad"]
         lines.append(f"The largest standard error is {largest}. To lower it, add:")
-        lines += [
-            f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
-            f"deg, rolled by {pose['roll_by_deg']:+.0f}: lower by "
-            f"{100 - 100 * pose['worst_sigma_mm_or_mrad'] / expects:.0f} %"
-            for pose in advice["poses"]
-        ]
+        for pose in advice["poses"]:
+            lower = 100 - 100 * pose["worst_sigma_mm_or_mrad"] / expects
+            lines.append(f"{_POSE.format(**pose)}: lower by {lower:.0f} %")
     lines += left_out_words([one["frame"] for one in report["left_out"]])
     lines += outlying_words(report["outlying_images"])
     found = [warning for warning in report["warnings"] if warning != report["reason"]]
