@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import combinations, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -222,11 +222,10 @@ class EvaluationResult:
         found = [[one.estimate("folds", "mean_abs_mm", c) for c in columns] for one in self.sets]
         first = found[0][columns.index(HAND_EYE_ONLY)]
         factor = first.half_width / first.standard_error if first.standard_error else np.nan
-        return self._table(
-            f"Table 2. Mean absolute error per pixel, mm, {folds}-fold cross-validation",
-            [[one.name, *map(_interval, row)] for one, row in zip(self.sets, found, strict=True)],
-            f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t).",
-        )
+        rows = [[one.name, *map(_interval, row)] for one, row in zip(self.sets, found, strict=True)]
+        title = f"Table 2. Mean absolute error per pixel, mm, {folds}-fold cross-validation"
+        note = f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t)."
+        return self._table(title, rows, note)
 
     def _repeats_table(self, metric: str, kind: str) -> Table:
         rows, repeats = [], self.options.repeats
@@ -235,12 +234,10 @@ class EvaluationResult:
             rows.append([one.name, *(f"{e.mean:.2f} ± {e.standard_deviation:.2f}" for e in found)])
             ends = [f"{low:.2f}–{high:.2f}" for low, high in (e.interval for e in found)]
             rows.append(["  95 % interval", *ends])
-        return self._table(
-            f"Held-out RMS {kind}, mm, {repeats.number} random splits by pose, "
-            f"{100 * repeats.test_fraction:.0f} % held out",
-            rows,
-            "Mean ± standard deviation; the interval allows for the overlap of the splits.",
-        )
+        splits = f"{repeats.number} random splits by pose"
+        title = f"Held-out RMS {kind}, mm, {splits}, {100 * repeats.test_fraction:.0f} % held out"
+        note = "Mean ± standard deviation; the interval allows for the overlap of the splits."
+        return self._table(title, rows, note)
 
     def _tests_table(self, protocol: str, metric: str) -> Table:
         rows, dof = [], 0
@@ -255,12 +252,10 @@ class EvaluationResult:
                 rows.append([f"{one.name}: {first} / {second}", *cells])
         name = "mean absolute error" if metric == "mean_abs_mm" else "RMS"
         source = "folds" if protocol == "folds" else "random splits, corrected for their overlap"
-        return Table(
-            f"Paired t-tests of held-out {name} on the {source}",
-            ["set: first / second", "first − second, mm", "p", "verdict"],
-            rows,
-            f"± 95 %, Student's t with {dof} degrees of freedom; all pairs: evaluation.json.",
-        )
+        title = f"Paired t-tests of held-out {name} on the {source}"
+        header = ["set: first / second", "first − second, mm", "p", "verdict"]
+        note = f"± 95 %, Student's t with {dof} degrees of freedom; all pairs: evaluation.json."
+        return Table(title, header, rows, note)
 
 
 def evaluate(
@@ -319,11 +314,8 @@ def pairs(columns: list[str]) -> list[tuple[str, str]]:
 def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
     """Return the pairs that tables show: neighbouring columns, and each model with the first."""
     models = [column for column in columns if column not in (BEFORE, HAND_EYE_ONLY)]
-    return [
-        (first, second)
-        for first, second in pairs(columns)
-        if first == models[0] or columns.index(second) == columns.index(first) + 1
-    ]
+    neighbours = set(pairwise(columns))
+    return [pair for pair in pairs(columns) if pair[0] == models[0] or pair in neighbours]
 
 
 def _interval(found: Estimate) -> str:

@@ -10,6 +10,7 @@ which say which pixels the comparison is about.
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from itertools import product
 from time import perf_counter
 
 import numpy as np
@@ -153,15 +154,11 @@ class Experiment:
     @cached_property
     def values(self) -> dict[str, dict[str, dict[str, np.ndarray]]]:
         """For each protocol, metric and column, one value a split, shape (S,), millimetres."""
-        return {
-            protocol: {
-                metric: {
-                    k: np.array([measure(one[k]) for one in splits]) for k in self.options.columns
-                }
-                for metric, measure in METRICS.items()
-            }
-            for protocol, splits in self.errors.items()
-        }
+        found = {protocol: dict[str, dict[str, np.ndarray]]() for protocol in self.errors}
+        for (protocol, splits), (metric, of) in product(self.errors.items(), METRICS.items()):
+            each = {column: [of(one[column]) for one in splits] for column in self.options.columns}
+            found[protocol][metric] = {column: np.array(own) for column, own in each.items()}
+        return found
 
     def estimate(
         self, protocol: str, metric: str, column: str, less: str | None = None

@@ -138,11 +138,8 @@ class ComparisonOptions(MaskOptions):
 
     def training(self, model: ComparedModel) -> TrainingOptions:
         """Return the options that a model is fitted with: its own, completed by the common ones."""
-        common = {
-            name: getattr(self, name)
-            for name in ("hand_eye", "solver", "planes", *MaskOptions.model_fields)
-            if name not in model.model_fields_set
-        }
+        names = {"hand_eye", "solver", "planes", *MaskOptions.model_fields}
+        common = {name: getattr(self, name) for name in names - model.model_fields_set}
         if model.planes == "auto":
             common["planes"] = self.planes
         return model.model_copy(update=common | {"device": self.device})
@@ -166,9 +163,7 @@ class ComparisonOptions(MaskOptions):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values; of each model only the keys that it sets, as reading them needs."""
-        models = [
-            model.model_dump(mode="json", include=model.model_fields_set) for model in self.models
-        ]
+        models = [one.model_dump(mode="json", include=one.model_fields_set) for one in self.models]
         return self.model_dump(mode="json") | {"models": models}
 
 
@@ -225,10 +220,8 @@ class EvaluationOptions(ComparisonOptions):
         repeats = self.repeats
         if repeats.number:
             seeds = np.random.SeedSequence(self.seed).generate_state(repeats.number)
-            found["repeats"] = {
-                f"repeat {k}": drawn(repeats.test_fraction, int(seed))
-                for k, seed in enumerate(seeds, start=1)
-            }
+            tests = [drawn(repeats.test_fraction, seed) for seed in seeds.tolist()]
+            found["repeats"] = {f"repeat {k}": test for k, test in enumerate(tests, start=1)}
         targets = _by_target(dataset)
         return found | ({"walls": targets} if self.walls and len(targets) > 1 else {}), {}
 
@@ -313,12 +306,11 @@ def _by_distance(dataset: Dataset, bands: int) -> dict[str, np.ndarray]:
     poses = dataset.pose_groups()
     of_pose = np.array([np.median(distance[poses == pose]) for pose in range(poses.max() + 1)])
     order = np.argsort(of_pose, kind="stable")
-    return {
-        f"{of_pose[band].min():.2f} to {of_pose[band].max():.2f} m": np.flatnonzero(
-            np.isin(poses, band)
-        )
-        for band in np.array_split(order, min(bands, len(order)))
-    }
+    found = {}
+    for band in np.array_split(order, min(bands, len(order))):
+        ends = f"{of_pose[band].min():.2f} to {of_pose[band].max():.2f} m"
+        found[ends] = np.flatnonzero(np.isin(poses, band))
+    return found
 
 
 def masks_of(options: MaskOptions) -> MaskOptions:
