@@ -151,7 +151,6 @@ class Observability(NamedTuple):
     Attributes:
         directions: Every direction, the weakest first.
         confounded: Correlations of pairs that the images hardly separate, strongest first.
-        covariance: Of all unknowns, with the wide prior, shape (P, P).
         vectors: The directions as unit vectors in the columns, shape (P, P).
         precision: Of all unknowns, without the wide prior, shape (P, P).
         variance: The effective variance of a residual, in the unit of the loss.
@@ -159,7 +158,6 @@ class Observability(NamedTuple):
 
     directions: list[Direction]
     confounded: dict[tuple[str, str], float]
-    covariance: Tensor
     vectors: Tensor
     precision: Tensor
     variance: float
@@ -214,9 +212,8 @@ def observability(
         both = float(correlation[first[0], first[1]]) if len(first) > 1 else None
         return Direction(float(variances[k]) ** 0.5, shares, both, k < undetermined)
 
-    return Observability(
-        [direction(k) for k in range(len(names))], pairs, posterior, vectors, precision, variance
-    )
+    directions = [direction(k) for k in range(len(names))]
+    return Observability(directions, pairs, vectors, precision, variance)
 
 
 def sparse_basis(basis: Float[Tensor, "P k"]) -> Float[Tensor, "P k"]:
