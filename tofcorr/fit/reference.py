@@ -398,8 +398,7 @@ _FORMAT = {"format": "tofcorr-reference", "version": 2}
 
 def save_reference(path: Path, reference: Reference, state: CalibrationState) -> None:
     """Write a reference as JSON, with the coefficients that it belongs to."""
-    belongs = {"coefficients": state.coefficients.tolist()}
-    values = _FORMAT | belongs | reference.to_mapping()
+    values = _FORMAT | {"coefficients": state.coefficients.tolist()} | reference.to_mapping()
     values |= {"sha256": _digest(values)}
     path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -417,14 +416,14 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
     if not path.is_file():
         return None
     values: dict[str, Any] = {}
-    coefficients = state.coefficients.tolist()
     try:
         values |= json.loads(path.read_text(encoding="utf-8"))
         digest = values.pop("sha256")
         wrong = {
             "it was changed after it was written": digest != _digest(values),
             "it is of another version": any(values.pop(k) != v for k, v in _FORMAT.items()),
-            "it is of another calibration": values.pop("coefficients") != coefficients,
+            "it is of another calibration": values.pop("coefficients")
+            != state.coefficients.tolist(),
         }
     except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         wrong = {f"it cannot be read ({error})": True}
