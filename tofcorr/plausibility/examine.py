@@ -107,8 +107,7 @@ def examine(data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> 
         aligned = place in OF_GEOMETRY
         module, _, name = place.partition(":")
         check = getattr(import_module(f"tofcorr.plausibility.{module}"), name)
-        called = name.replace("_", " ")
-        findings += [replace(one, check=one.check or called) for one in check(look)]
+        findings += [replace(one, check=one.check or name.replace("_", " ")) for one in check(look)]
         impossible = any(one.severity == "impossible" for one in findings)
     share, bent, dominated = (0.0, False, False) if impossible else garbage_of(look)
     # Each sentence once. Sorting is stable: within a severity the order of the checks stays.
