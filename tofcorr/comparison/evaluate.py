@@ -85,9 +85,7 @@ class EvaluationResult:
                     "hand_eye_estimated": one.hand_eye_estimated,
                     "hand_eye": one.hand_eye,
                     "by_wall_rms_mm": {kind: one.by_wall(kind) for kind in one.splits},
-                    "held_out": {
-                        protocol: self._held_out(one, protocol) for protocol in one.splits
-                    },
+                    "held_out": {kind: self._held_out(one, kind) for kind in one.splits},
                     "warnings": one.warnings,
                 }
                 for one in self.sets
@@ -172,9 +170,8 @@ class EvaluationResult:
         if self.options.folds:
             found += [self._folds_table(), self._tests_table("folds", "mean_abs_mm")]
         if self.options.repeats.number:
-            found.append(self._repeats_table("rms_mm", "distance to the plane"))
-            found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
-            kinds = {f"{of}_mm": f"error in z {of.replace('_', ' ')}" for of in VIEWS}
+            kinds = {"rms_mm": "distance to the plane", "rms_z_mm": "error of the z depth"}
+            kinds |= {f"{of}_mm": f"error in z {of.replace('_', ' ')}" for of in VIEWS}
             found += [self._repeats_table(metric, kind) for metric, kind in kinds.items()]
             found.append(self._tests_table("repeats", "rms_mm"))
         found.append(self._views_table())
@@ -208,12 +205,11 @@ class EvaluationResult:
 
     def _walls_table(self) -> Table:
         shown = {"folds" if self.options.folds else "half": "images", "walls": "wall"}
-        rows = [
-            [f"{one.name}, {wall}, {what}", *(f"{error:.2f}" for error in errors.values())]
-            for one in self.sets
-            for protocol, what in shown.items()
-            for wall, errors in (one.by_wall(protocol) if protocol in one.splits else {}).items()
-        ]
+        rows = []
+        for one, (protocol, what) in product(self.sets, shown.items()):
+            walls = one.by_wall(protocol) if protocol in one.splits else {}
+            cells = {wall: [f"{k:.2f}" for k in errors.values()] for wall, errors in walls.items()}
+            rows += [[f"{one.name}, {wall}, {what}", *own] for wall, own in cells.items()]
         note = "'images': some of each wall's were held out; 'wall': all of one wall's, in turn."
         return self._table("Held-out RMS distance to each wall, mm", rows, note)
 

@@ -1,6 +1,6 @@
 """The options of `evaluate` and `select`: models, and which held-out pixels measure them."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -155,8 +155,7 @@ class ComparisonOptions(MaskOptions):
         fitted to it with robust weights. A model that chooses its pixels or robust weights keeps
         them, and so do options that choose the pixels.
         """
-        masks = {} if inspection is None else masks_against_garbage(self, inspection)
-        if inspection is None or not masks:
+        if inspection is None or not (masks := masks_against_garbage(self, inspection)):
             return self
         models = tuple(against_garbage(model, inspection) for model in self.models)
         return self.model_copy(update=masks | {"models": models})
@@ -258,9 +257,14 @@ class SelectionOptions(ComparisonOptions):
         found: Splits = {}
         skipped: dict[str, str] = {}
         poses = dataset.pose_groups()
+        ways: dict[Grouping, Callable[[], dict[str, np.ndarray]]] = {
+            "image": lambda: _by_image(dataset, self.folds, self.seed),
+            "distance": lambda: _by_distance(dataset, self.distance_bands),
+            "target": lambda: _by_target(dataset),
+        }
         for by in self.by:
             try:
-                groups = self._groups(dataset, by)
+                groups = ways[by]()
             except CalibrationDataError as error:
                 skipped[by] = str(error)
                 continue
@@ -278,13 +282,6 @@ class SelectionOptions(ComparisonOptions):
             why = f"no images can be held out to compare the models: {' '.join(skipped.values())}"
             raise CalibrationDataError(f"{dataset.first.path}: {why}")
         return found, skipped
-
-    def _groups(self, dataset: Dataset, by: Grouping) -> dict[str, np.ndarray]:
-        if by == "image":
-            return _by_image(dataset, self.folds, self.seed)
-        if by == "distance":
-            return _by_distance(dataset, self.distance_bands)
-        return _by_target(dataset)
 
 
 def _by_target(dataset: Dataset) -> dict[str, np.ndarray]:

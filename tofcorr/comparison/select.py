@@ -62,9 +62,9 @@ class SelectionResult:
         decisive, winner = self.decisive, self.winner
         best = "" if decisive.best == winner else f", {decisive.best}"
         text = (
-            f"{winner} is the choice ({decisive.errors[winner].mean:.2f} mm on {first}s held out): "
-            f"the simplest model within one standard error of the best{best}."
+            f"{winner} is the choice ({decisive.errors[winner].mean:.2f} mm on {first}s held out)"
         )
+        text += f": the simplest model within one standard error of the best{best}."
         if decisive.ties:
             text += f" Not significantly different from it: {', '.join(decisive.ties)}."
         for by in others:
