@@ -332,8 +332,7 @@ def advise(
     """
     best = fit.solution.parameters
     design = Design(fit.model.error, fit.domain, dataset.ray_directions())
-    camera = dataset.first.camera
-    share = float(fit.moments.count.mean()) / (camera.height * camera.width)
+    share = float(fit.moments.count.mean()) / (fit.domain.height * fit.domain.width)
     moments = pool.moments(design, best.tool_from_camera, share, enough)
     # Poses carry no information about condition terms.
     beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
