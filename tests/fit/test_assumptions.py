@@ -99,4 +99,5 @@ def test_planes_that_are_estimated_are_not_assumed(data: Dataset, right: Fit) ->
     assert seen is not None
     seen = replace(seen, walls_estimated=True)
     names = {one.cause for one in assumptions(seen, right)}
-    assert names == {"focal_length", "principal_point_right", "principal_point_down"}
+    lens = {"focal_length", "principal_point_right", "principal_point_down"}
+    assert names == {*lens, "robot_scale"}
