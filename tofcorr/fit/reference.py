@@ -416,14 +416,14 @@ def load_reference(path: Path, state: CalibrationState) -> Reference | None:
     if not path.is_file():
         return None
     values: dict[str, Any] = {}
+    coefficients = state.coefficients.tolist()
     try:
         values |= json.loads(path.read_text(encoding="utf-8"))
         digest = values.pop("sha256")
         wrong = {
             "it was changed after it was written": digest != _digest(values),
             "it is of another version": any(values.pop(k) != v for k, v in _FORMAT.items()),
-            "it is of another calibration": values.pop("coefficients")
-            != state.coefficients.tolist(),
+            "it is of another calibration": values.pop("coefficients") != coefficients,
         }
     except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         wrong = {f"it cannot be read ({error})": True}

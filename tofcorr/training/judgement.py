@@ -100,10 +100,9 @@ def judge(
         inspection: What was odd about the recordings; its noise of a pixel is the floor.
     """
     free = _is_free(fit)
-    with_intensity = fit.model.error.needs_amplitude()
     said = [*_of_errors(fit, errors, inspection.look), *_of_directions(fit)]
-    for serious, one in shortcomings(support, moves=free, with_intensity=with_intensity):
-        said.append(("usable" if serious else "good", one))
+    needed = shortcomings(support, moves=free, with_intensity=fit.model.error.needs_amplitude())
+    said += (("usable" if serious else "good", one) for serious, one in needed)
     noise = 1e3 * inspection.look.noise_rms
     if beyond := beyond_noise(errors["after"]["test"]["rms"], noise, moves=free):
         said.append(("usable", beyond))

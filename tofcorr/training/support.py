@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,7 +65,7 @@ _ENOUGH_TILT = 5
 
 def shortcomings(
     support: Support, *, moves: bool, with_intensity: bool
-) -> Iterator[tuple[Literal["good", "usable"], str]]:
+) -> Iterator[tuple[bool, str]]:
     """Yield what a calibration would need and the recording does not cover.
 
     Args:
@@ -74,33 +74,27 @@ def shortcomings(
         with_intensity: Whether the model has an intensity term.
 
     Yields:
-        The best verdict in spite of it, and one sentence.
+        Whether the result is worse for it in any case, and one sentence.
     """
     strong, weak = support.tilt_deg
     if moves and strong < _ENOUGH_TILT:
         needed = f"(standard deviation {strong:.1f} degrees, {_ENOUGH_TILT} needed on two axes)"
-        yield (
-            "usable",
-            f"The camera is hardly tilted {needed}: the hand-eye rests on the model's form.",
-        )
+        yield True, f"The camera is hardly tilted {needed}: the hand-eye rests on the model's form."
     elif moves and weak < _ENOUGH_TILT:
         roll = support.roll_deg or 0.0
         # More makes up for tilt about one axis only.
         hint = "" if roll > 10 else f" and hardly rolled ({roll:.1f} degrees)"
         needed = f"(standard deviation {strong:.1f} and {weak:.1f} degrees, {_ENOUGH_TILT} needed)"
-        yield "good", f"The camera is tilted about one axis only {needed}{hint}: tilt or roll it."
+        yield False, f"The camera is tilted about one axis only {needed}{hint}: tilt or roll it."
     low, high = support.distance_m
     # Below half of its centre the distance term can hardly be separated from the constant.
     if high - low < (high + low) / 4:
         ends = f"({low:.2f} to {high:.2f} m): c0 cannot be separated from t_z"
-        yield "good", f"The range of distances is narrow {ends}; add nearer and farther views."
+        yield False, f"The range of distances is narrow {ends}; add nearer and farther views."
     ratio = support.reflectivity_ratio
     if with_intensity and ratio is not None and ratio < ENOUGH_REFLECTIVITY:
         needed = f"(bright to dark {ratio:.1f} to 1, {ENOUGH_REFLECTIVITY} to 1 needed)"
-        yield (
-            "good",
-            f"The target has one reflectivity {needed}: add a checkerboard or a grey wall.",
-        )
+        yield False, f"The target has one reflectivity {needed}: add a checkerboard or a grey wall."
 
 
 def _roll(world_from_camera: Tensor, normal_world: Tensor) -> Tensor:
