@@ -102,7 +102,8 @@ def judge(
     free = _is_free(fit)
     said = [*_of_errors(fit, errors, inspection.look), *_of_directions(fit)]
     needed = shortcomings(support, moves=free, with_intensity=fit.model.error.needs_amplitude())
-    said += (("usable" if serious else "good", one) for serious, one in needed)
+    for serious, one in needed:
+        said.append(("usable" if serious else "good", one))
     noise = 1e3 * inspection.look.noise_rms
     if beyond := beyond_noise(errors["after"]["test"]["rms"], noise, moves=free):
         said.append(("usable", beyond))
