@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, ScalarFormatter
 
-from tofcorr.comparison.experiment import METRICS, Experiment, compare
+from tofcorr.comparison.experiment import METRICS, VIEWS, Experiment, compare
 from tofcorr.comparison.options import (
     BEFORE,
     HAND_EYE_ONLY,
@@ -28,10 +28,6 @@ from tofcorr.progress import LOG, event_writer
 from tofcorr.training.figures import save_figure
 from tofcorr.training.report import number_or_none
 from tofcorr.version import __version__
-
-# Of the RMS error in z: offset and tilts of whole images, which no model of a pixel sees; the rest;
-# and all of it with each held-out plane estimated again within its covariance, if it has one.
-_VIEWS = "between_views_mm", "within_views_mm", "within_prior_mm"
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,9 +85,7 @@ class EvaluationResult:
                     "hand_eye_estimated": one.hand_eye_estimated,
                     "hand_eye": one.hand_eye,
                     "by_wall_rms_mm": {kind: one.by_wall(kind) for kind in one.splits},
-                    "held_out": {
-                        protocol: self._held_out(one, protocol) for protocol in one.splits
-                    },
+                    "held_out": {kind: self._held_out(one, kind) for kind in one.splits},
                     "warnings": one.warnings,
                 }
                 for one in self.sets
@@ -176,21 +170,21 @@ class EvaluationResult:
         if self.options.folds:
             found += [self._folds_table(), self._tests_table("folds", "mean_abs_mm")]
         if self.options.repeats.number:
-            found.append(self._repeats_table("rms_mm", "distance to the plane"))
-            found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
-            found += [self._repeats_table(of, f"error in z {_in_words(of)}") for of in _VIEWS]
+            kinds = {"rms_mm": "distance to the plane", "rms_z_mm": "error of the z depth"}
+            kinds |= {f"{of}_mm": f"error in z {of.replace('_', ' ')}" for of in VIEWS}
+            found += [self._repeats_table(metric, kind) for metric, kind in kinds.items()]
             found.append(self._tests_table("repeats", "rms_mm"))
         found.append(self._views_table())
         walls = any(len(one.targets) > 1 for one in self.sets)
         return [*found, self._walls_table()] if walls else found
 
     def _views_table(self) -> Table:
-        columns, each = self.options.columns, [(one, of) for one in self.sets for of in _VIEWS]
-        found = [(f"{one.name}: {_in_words(of)}", one.values["half"][of]) for one, of in each]
-        rows = [[name, *(f"{own[column][0]:.2f}" for column in columns)] for name, own in found]
-        note = (
-            "Between views: offset and tilts of whole images, which no model of a pixel corrects."
-        )
+        rows = []
+        for one, of in product(self.sets, VIEWS):
+            errors = (one.values["half"][f"{of}_mm"][column] for column in self.options.columns)
+            cells = [f"{error[0]:.2f}" for error in errors]
+            rows.append([f"{one.name}: {of.replace('_', ' ')}", *cells])
+        note = "Between views: offset and tilts of whole images, beyond any model of a pixel."
         return self._table("Parts of the half's RMS error of the z depth, mm", rows, note)
 
     def _table(self, title: str, rows: list[list[str]], note: str) -> Table:
@@ -211,12 +205,11 @@ class EvaluationResult:
 
     def _walls_table(self) -> Table:
         shown = {"folds" if self.options.folds else "half": "images", "walls": "wall"}
-        rows = [
-            [f"{one.name}, {wall}, {what}", *(f"{error:.2f}" for error in errors.values())]
-            for one in self.sets
-            for protocol, what in shown.items()
-            for wall, errors in (one.by_wall(protocol) if protocol in one.splits else {}).items()
-        ]
+        rows = []
+        for one, (protocol, what) in product(self.sets, shown.items()):
+            walls = one.by_wall(protocol) if protocol in one.splits else {}
+            cells = {wall: [f"{k:.2f}" for k in errors.values()] for wall, errors in walls.items()}
+            rows += [[f"{one.name}, {wall}, {what}", *own] for wall, own in cells.items()]
         note = "'images': some of each wall's were held out; 'wall': all of one wall's, in turn."
         return self._table("Held-out RMS distance to each wall, mm", rows, note)
 
@@ -225,11 +218,10 @@ class EvaluationResult:
         found = [[one.estimate("folds", "mean_abs_mm", c) for c in columns] for one in self.sets]
         first = found[0][columns.index(HAND_EYE_ONLY)]
         factor = first.half_width / first.standard_error if first.standard_error else np.nan
-        return self._table(
-            f"Table 2. Mean absolute error per pixel, mm, {folds}-fold cross-validation",
-            [[one.name, *map(_interval, row)] for one, row in zip(self.sets, found, strict=True)],
-            f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t).",
-        )
+        rows = [[one.name, *map(_interval, row)] for one, row in zip(self.sets, found, strict=True)]
+        title = f"Table 2. Mean absolute error per pixel, mm, {folds}-fold cross-validation"
+        note = f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t)."
+        return self._table(title, rows, note)
 
     def _repeats_table(self, metric: str, kind: str) -> Table:
         rows, repeats = [], self.options.repeats
@@ -238,12 +230,10 @@ class EvaluationResult:
             rows.append([one.name, *(f"{e.mean:.2f} ± {e.standard_deviation:.2f}" for e in found)])
             ends = [f"{low:.2f}–{high:.2f}" for low, high in (e.interval for e in found)]
             rows.append(["  95 % interval", *ends])
-        return self._table(
-            f"Held-out RMS {kind}, mm, {repeats.number} random splits by pose, "
-            f"{100 * repeats.test_fraction:.0f} % held out",
-            rows,
-            "Mean ± standard deviation; the interval allows for the overlap of the splits.",
-        )
+        splits = f"{repeats.number} random splits by pose"
+        title = f"Held-out RMS {kind}, mm, {splits}, {100 * repeats.test_fraction:.0f} % held out"
+        note = "Mean ± standard deviation; the interval allows for the overlap of the splits."
+        return self._table(title, rows, note)
 
     def _tests_table(self, protocol: str, metric: str) -> Table:
         rows, dof = [], 0
@@ -258,12 +248,10 @@ class EvaluationResult:
                 rows.append([f"{one.name}: {first} / {second}", *cells])
         name = "mean absolute error" if metric == "mean_abs_mm" else "RMS"
         source = "folds" if protocol == "folds" else "random splits, corrected for their overlap"
-        return Table(
-            f"Paired t-tests of held-out {name} on the {source}",
-            ["set: first / second", "first − second, mm", "p", "verdict"],
-            rows,
-            f"± 95 %, Student's t with {dof} degrees of freedom; all pairs: evaluation.json.",
-        )
+        title = f"Paired t-tests of held-out {name} on the {source}"
+        header = ["set: first / second", "first − second, mm", "p", "verdict"]
+        note = f"± 95 %, Student's t with {dof} degrees of freedom; all pairs: evaluation.json."
+        return Table(title, header, rows, note)
 
 
 def evaluate(
@@ -303,22 +291,15 @@ def evaluate(
         data = [Dataset((recording,)) for recording in sets]
         inspections = [vet(one, resolved_planes(options.planes, sets), force=force) for one in data]
         headlines = tuple(one.headline for one in inspections if one.headline)
-        names = _numbered_where_alike([recording.path.resolve().name for recording in sets])
-        evaluations = tuple(
-            Experiment(name, one, options, inspection)
-            for name, one, inspection in zip(names, data, inspections, strict=True)
-        )
+        names = [recording.path.resolve().name for recording in sets]
+        names = [k if names.count(k) == 1 else f"{k} ({n})" for n, k in enumerate(names, start=1)]
+        parts = zip(names, data, inspections, strict=True)
+        evaluations = tuple(Experiment(name, one, options, seen) for name, one, seen in parts)
         done = compare(evaluations, tell)
         result = EvaluationResult(evaluations, options.only(done), headlines)
         if folder is not None:
             result.write(folder)
     return result
-
-
-def _numbered_where_alike(names: Sequence[str]) -> list[str]:
-    return [
-        name if names.count(name) == 1 else f"{name} ({k})" for k, name in enumerate(names, start=1)
-    ]
 
 
 def pairs(columns: list[str]) -> list[tuple[str, str]]:
@@ -329,15 +310,8 @@ def pairs(columns: list[str]) -> list[tuple[str, str]]:
 def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
     """Return the pairs that tables show: neighbouring columns, and each model with the first."""
     models = [column for column in columns if column not in (BEFORE, HAND_EYE_ONLY)]
-    return [
-        (first, second)
-        for first, second in pairs(columns)
-        if first == models[0] or columns.index(second) == columns.index(first) + 1
-    ]
-
-
-def _in_words(metric: str) -> str:
-    return metric.removesuffix("_mm").replace("_", " ")
+    neighbours = set(pairwise(columns))
+    return [pair for pair in pairs(columns) if pair[0] == models[0] or pair in neighbours]
 
 
 def _interval(found: Estimate) -> str:

@@ -1,6 +1,6 @@
 """The options of `evaluate` and `select`: models, and which held-out pixels measure them."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -138,11 +138,8 @@ class ComparisonOptions(MaskOptions):
 
     def training(self, model: ComparedModel) -> TrainingOptions:
         """Return the options that a model is fitted with: its own, completed by the common ones."""
-        common = {
-            name: getattr(self, name)
-            for name in ("hand_eye", "solver", "planes", *MaskOptions.model_fields)
-            if name not in model.model_fields_set
-        }
+        names = {"hand_eye", "solver", "planes", *MaskOptions.model_fields}
+        common = {name: getattr(self, name) for name in names - model.model_fields_set}
         if model.planes == "auto":
             common["planes"] = self.planes
         return model.model_copy(update=common | {"device": self.device})
@@ -158,17 +155,14 @@ class ComparisonOptions(MaskOptions):
         fitted to it with robust weights. A model that chooses its pixels or robust weights keeps
         them, and so do options that choose the pixels.
         """
-        masks = {} if inspection is None else masks_against_garbage(self, inspection)
-        if inspection is None or not masks:
+        if inspection is None or not (masks := masks_against_garbage(self, inspection)):
             return self
         models = tuple(against_garbage(model, inspection) for model in self.models)
         return self.model_copy(update=masks | {"models": models})
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values; of each model only the keys that it sets, as reading them needs."""
-        models = [
-            model.model_dump(mode="json", include=model.model_fields_set) for model in self.models
-        ]
+        models = [one.model_dump(mode="json", include=one.model_fields_set) for one in self.models]
         return self.model_dump(mode="json") | {"models": models}
 
 
@@ -225,10 +219,8 @@ class EvaluationOptions(ComparisonOptions):
         repeats = self.repeats
         if repeats.number:
             seeds = np.random.SeedSequence(self.seed).generate_state(repeats.number)
-            found["repeats"] = {
-                f"repeat {k}": drawn(repeats.test_fraction, int(seed))
-                for k, seed in enumerate(seeds, start=1)
-            }
+            tests = [drawn(repeats.test_fraction, seed) for seed in seeds.tolist()]
+            found["repeats"] = {f"repeat {k}": test for k, test in enumerate(tests, start=1)}
         targets = _by_target(dataset)
         return found | ({"walls": targets} if self.walls and len(targets) > 1 else {}), {}
 
@@ -265,9 +257,14 @@ class SelectionOptions(ComparisonOptions):
         found: Splits = {}
         skipped: dict[str, str] = {}
         poses = dataset.pose_groups()
+        ways: dict[Grouping, Callable[[], dict[str, np.ndarray]]] = {
+            "image": lambda: _by_image(dataset, self.folds, self.seed),
+            "distance": lambda: _by_distance(dataset, self.distance_bands),
+            "target": lambda: _by_target(dataset),
+        }
         for by in self.by:
             try:
-                groups = self._groups(dataset, by)
+                groups = ways[by]()
             except CalibrationDataError as error:
                 skipped[by] = str(error)
                 continue
@@ -285,13 +282,6 @@ class SelectionOptions(ComparisonOptions):
             why = f"no images can be held out to compare the models: {' '.join(skipped.values())}"
             raise CalibrationDataError(f"{dataset.first.path}: {why}")
         return found, skipped
-
-    def _groups(self, dataset: Dataset, by: Grouping) -> dict[str, np.ndarray]:
-        if by == "image":
-            return _by_image(dataset, self.folds, self.seed)
-        if by == "distance":
-            return _by_distance(dataset, self.distance_bands)
-        return _by_target(dataset)
 
 
 def _by_target(dataset: Dataset) -> dict[str, np.ndarray]:
@@ -313,12 +303,11 @@ def _by_distance(dataset: Dataset, bands: int) -> dict[str, np.ndarray]:
     poses = dataset.pose_groups()
     of_pose = np.array([np.median(distance[poses == pose]) for pose in range(poses.max() + 1)])
     order = np.argsort(of_pose, kind="stable")
-    return {
-        f"{of_pose[band].min():.2f} to {of_pose[band].max():.2f} m": np.flatnonzero(
-            np.isin(poses, band)
-        )
-        for band in np.array_split(order, min(bands, len(order)))
-    }
+    found = {}
+    for band in np.array_split(order, min(bands, len(order))):
+        ends = f"{of_pose[band].min():.2f} to {of_pose[band].max():.2f} m"
+        found[ends] = np.flatnonzero(np.isin(poses, band))
+    return found
 
 
 def masks_of(options: MaskOptions) -> MaskOptions:
@@ -337,12 +326,11 @@ def comparability_notes(options: ComparisonOptions) -> list[str]:
     fits = [_how_fitted(options.training(model), common) for model in options.models]
     if not any(fits):
         return []
-    walls = "" if options.planes == "known" else ", or the walls that a model estimated in its "
-    return [
-        *filter(None, fits),
-        f"All models are measured on the same held-out pixels ({_pixels(common)}), all of the same "
-        f"weight, against the recorded planes{walls and walls + 'training images'}.",
-    ]
+    said = f"All models are measured on the same held-out pixels ({_pixels(common)}), all of the"
+    said = f"{said} same weight, against the recorded planes"
+    if options.planes != "known":
+        said = f"{said}, or the walls that a model estimated in its training images"
+    return [*filter(None, fits), f"{said}."]
 
 
 def _how_fitted(training: TrainingOptions, common: MaskOptions) -> str:

@@ -62,9 +62,9 @@ class SelectionResult:
         decisive, winner = self.decisive, self.winner
         best = "" if decisive.best == winner else f", {decisive.best}"
         text = (
-            f"{winner} is the choice ({decisive.errors[winner].mean:.2f} mm on {first}s held out): "
-            f"the simplest model within one standard error of the best{best}."
+            f"{winner} is the choice ({decisive.errors[winner].mean:.2f} mm on {first}s held out)"
         )
+        text += f": the simplest model within one standard error of the best{best}."
         if decisive.ties:
             text += f" Not significantly different from it: {', '.join(decisive.ties)}."
         for by in others:
@@ -86,18 +86,14 @@ class SelectionResult:
     def tables(self) -> list[Table]:
         """Return a table for each grouping, the model with the smallest error first."""
         metric = {"mean_abs": "mean absolute", "rms": "RMS"}[self.options.metric]
-        return [
-            Table(
-                f"{by.capitalize()}s held out: {metric} error, mm",
-                ["model", "unknowns", "error", "behind the best", ""],
-                [
-                    self._row(ranking, name)
-                    for name in sorted(ranking.errors, key=lambda one: ranking.errors[one].mean)
-                ],
-                f"Held out in turn: {'; '.join(self.experiment.splits[by])}.",
-            )
-            for by, ranking in self.rankings.items()
-        ]
+        found, header = [], ["model", "unknowns", "error", "behind the best", ""]
+        for by, ranking in self.rankings.items():
+            ordered = sorted(ranking.errors.items(), key=lambda item: item[1].mean)
+            rows = [self._row(ranking, name) for name, _ in ordered]
+            title = f"{by.capitalize()}s held out: {metric} error, mm"
+            held_out = f"Held out in turn: {'; '.join(self.experiment.splits[by])}."
+            found.append(Table(title, header, rows, held_out))
+        return found
 
     def _row(self, ranking: Ranking, name: str) -> list[str]:
         one, behind = ranking.errors[name], ranking.behind[name]
@@ -199,10 +195,8 @@ def select(
         inspection = vet(dataset, planes, force=force)
         found = Experiment("", dataset, options, inspection)
         options = options.only(compare([found], tell))
-        complexity = {
-            model.name: _complexity(found.options.training(model), found.fitter.domain, dataset)
-            for model in found.options.models
-        }
+        trainings = [found.options.training(model) for model in found.options.models]
+        complexity = {k.name: _complexity(k, found.fitter.domain, dataset) for k in trainings}
         rankings = {}
         for by, groups in found.errors.items():
             errors = {k: _by_pose(dataset, found.held_out(by, k), options) for k in complexity}

@@ -125,18 +125,14 @@ class Table(NamedTuple):
         """Return the table as text, the first column aligned left and the others right."""
         lines = [self.header, *self.rows]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        aligned = [
-            "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip()
-            for line in lines
-        ]
+        cells = ([a.ljust(widths[0]), *map(str.rjust, others, widths[1:])] for a, *others in lines)
+        aligned = ["  ".join(line).rstrip() for line in cells]
         rule = "-" * (sum(widths) + 2 * len(widths) - 2)
         return "\n".join([self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note])
 
     def markdown(self) -> str:
         """Return a Markdown table."""
         rule = [":--", *["--:"] * (len(self.header) - 1)]
-        lines = [
-            f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |"
-            for line in [self.header, rule, *self.rows]
-        ]
+        cells = [[cell.replace("|", r"\|") for cell in line] for line in [self.header, *self.rows]]
+        lines = [f"| {' | '.join(line)} |" for line in [cells[0], rule, *cells[1:]]]
         return "\n".join([f"**{self.title}**", "", *lines, "", self.note])

@@ -204,9 +204,8 @@ class MomentAccumulator:
         along_row, along_column, static = self._smooth
         valid = None if bool(batch.valid[frames].all()) else batch.valid
         # Each block is written over the last: it is in the cache.
-        memory = self._gather.new_empty(
-            len(self.formed) * count * step * width, dtype=torch.float64
-        )
+        size = len(self.formed) * count * step * width
+        memory = self._gather.new_empty(size, dtype=torch.float64)
         blocks = []
         for row in range(0, height, step):
             at = frames, slice(row, row + step)
@@ -252,10 +251,9 @@ class MomentAccumulator:
             if isinstance(term, SignalPolynomial):
                 _write_powers(term, distance, amplitude, own)
             else:
-                for row, values in zip(
-                    own, term.basis(distance.double(), amplitude.double()), strict=True
-                ):
-                    row.copy_(values.detach())
+                basis = term.basis(distance.double(), amplitude.double()).detach()
+                for row, values in zip(own, basis, strict=True):
+                    row.copy_(values)
         if valid is not None:
             products[: len(self._kept)].mul_(valid)
         for row, (a, b) in zip(functions, self.formed[len(self._kept) :], strict=True):
@@ -339,10 +337,8 @@ def moments_of_few(
     measured, amplitude, weight = (one if one is None else one[frame].cpu() for one in images)
     assert measured is not None
     # The products of so many pixels stay in the processor's cache. Set by timing.
-    for rows, columns in zip(
-        *(index.split(8_192) for index in torch.nonzero(batch.valid[frame].cpu(), as_tuple=True)),
-        strict=True,
-    ):
+    for used in torch.nonzero(batch.valid[frame].cpu()).split(8_192):
+        rows, columns = used.unbind(dim=1)
         distance = measured[rows, columns].double()
         given = distance if amplitude is None else amplitude[rows, columns]
         signal = design.signal_functions(distance, given.double())[design.signal]

@@ -42,19 +42,17 @@ _TINY = torch.finfo(torch.float64).tiny
 
 
 def pose_products(
-    columns: Float[Tensor, "M S"], pose: Int[Tensor, "M"], weight: Float[Tensor, "M"] | None = None
+    columns: Float[Tensor, "M S"], pose: Int[Tensor, "M"], weight: Float[Tensor, "M"]
 ) -> Float[Tensor, "G S S"]:
     """Return the weighted sums of products of columns over the pixels of each pose.
 
     Args:
         columns: Of M pixels; the residual is usually the last.
         pose: Of each pixel, counted from zero.
-        weight: Of each pixel, not negative; None: 1 each.
+        weight: Of each pixel, not negative.
     """
-    order = pose.argsort(stable=True)
-    if weight is not None:
-        columns = columns * weight.sqrt()[:, None]
-    parts = columns[order].split(torch.bincount(pose).tolist())
+    columns = (columns * weight.sqrt()[:, None])[pose.argsort(stable=True)]
+    parts = columns.split(torch.bincount(pose).tolist())
     return torch.stack([own.T @ own for own in parts])
 
 

@@ -207,7 +207,7 @@ class MomentObjective:
     def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
         """Return the loss, differentiable."""
         images = self.image_losses(parameters).sum()
-        return images if self.prior is None else images + self.prior.penalty(parameters)
+        return images if self.prior is None else images + self.prior.equations(parameters).loss
 
     def image_equations(
         self, parameters: Parameters, further: Float[Tensor, "N S F"] | None = None
@@ -302,7 +302,3 @@ class Prior:
         deviation, jacobian = self.deviation(parameters), self._jacobian(parameters)
         parts = deviation.square().sum(), deviation @ jacobian, jacobian.T @ jacobian
         return NormalEquations(*(self.variance * part for part in parts))
-
-    def penalty(self, parameters: Parameters) -> Float[Tensor, ""]:
-        """Return the prior's part of the loss, differentiable."""
-        return self.variance * self.deviation(parameters).square().sum()

@@ -160,11 +160,6 @@ class DistanceNoise(NamedTuple):
         inverse = 1 / amplitude.clamp(min=torch.finfo(amplitude.dtype).tiny)
         return self.floor + inverse * (self.shot + self.readout * inverse)
 
-    @property
-    def coefficients(self) -> tuple[float, float, float]:
-        """a, b and c."""
-        return self.floor, self.shot, self.readout
-
 
 def fit_noise(
     differences: Float[Tensor, "S"], amplitude: Float[Tensor, "S"], source: Source
@@ -304,8 +299,7 @@ def filter_width(correlations: Sequence[float]) -> float:
         lags = range(1, len(correlations) + 1)
         return sum(neighbour_correlation(width, lag) for lag in lags) - wanted
 
-    white = not (correlations[0] > _WHITE and wanted > _WHITE)
-    if white or not np.isfinite(wanted):
+    if not (correlations[0] > _WHITE and _WHITE < wanted < np.inf):
         return 0.0
     if excess(WIDEST_PX) <= 0:
         return WIDEST_PX

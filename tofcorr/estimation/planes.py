@@ -52,9 +52,8 @@ class Walls:
 
     def seen_by(self, moments: ImageMoments) -> ImageMoments:
         """Return the moments with these walls in place of those recorded."""
-        normal, offset = plane_in_frame(
-            self.normal_world[self.index], self.offset[self.index], self.world_from_tool
-        )
+        walls = self.normal_world[self.index], self.offset[self.index]
+        normal, offset = plane_in_frame(*walls, self.world_from_tool)
         return replace(moments, normal_tool=normal, offset_tool=offset)
 
     def jacobian(
@@ -96,10 +95,8 @@ def joint_image_equations(
     moments: ImageMoments, parameters: Parameters, walls: Walls | None
 ) -> NormalEquations:
     """Return each image's normal equations in the unknowns and, after them, those of the walls."""
-    objective = MomentObjective(moments)
-    if walls is None:
-        return objective.image_equations(parameters)
-    return objective.image_equations(parameters, walls.jacobian(moments, parameters))
+    further = None if walls is None else walls.jacobian(moments, parameters)
+    return MomentObjective(moments).image_equations(parameters, further)
 
 
 def marginal_hessian(

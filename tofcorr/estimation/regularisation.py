@@ -120,10 +120,8 @@ def with_strengths(
         return total
 
     for k in unknown * (2 if len(unknown) > 1 else 1):
-        tried = [
-            [*chosen[:k], replace(chosen[k], strength=one), *chosen[k + 1 :]] for one in STRENGTHS
-        ]
-        chosen = min(tried, key=held_out)
+        own = [replace(chosen[k], strength=one) for one in STRENGTHS]
+        chosen = min([[*chosen[:k], one, *chosen[k + 1 :]] for one in own], key=held_out)
     return chosen
 
 

@@ -218,8 +218,8 @@ def largest_plane(
         g of the plane g . x = 1; None where no three pixels determine one.
     """
     if triples is None:
-        triples = torch.randint(max(len(distance), 1), (300, 3), generator=generator)
-        triples = triples[: 0 if len(distance) < 3 else 300]
+        number = 0 if len(distance) < 3 else 300
+        triples = torch.randint(max(len(distance), 1), (number, 3), generator=generator)
     matrix = rays[triples]
     sound = torch.linalg.det(matrix).abs() > torch.finfo(torch.float32).eps
     if not bool(sound.any()):

@@ -151,7 +151,6 @@ class Observability(NamedTuple):
     Attributes:
         directions: Every direction, the weakest first.
         confounded: Correlations of pairs that the images hardly separate, strongest first.
-        covariance: Of all unknowns, with the wide prior, shape (P, P).
         vectors: The directions as unit vectors in the columns, shape (P, P).
         precision: Of all unknowns, without the wide prior, shape (P, P).
         variance: The effective variance of a residual, in the unit of the loss.
@@ -159,7 +158,6 @@ class Observability(NamedTuple):
 
     directions: list[Direction]
     confounded: dict[tuple[str, str], float]
-    covariance: Tensor
     vectors: Tensor
     precision: Tensor
     variance: float
@@ -196,6 +194,7 @@ def observability(
     order = variances.argsort(descending=True)
     # Rounding may leave a variance below zero where the images fit exactly.
     variances, vectors = variances[order].clamp(min=0.0), vectors[:, order]
+    # Half of the variance is then the prior's.
     undetermined = int((variances > PRIOR_SIGMA**2 / 2).sum())
     vectors[:, :undetermined] = sparse_basis(vectors[:, :undetermined])
     left, right = torch.triu_indices(len(names), len(names), offset=1)
@@ -211,13 +210,10 @@ def observability(
         shares = named_components(vectors[:, k], names)
         first = [names.index(name) for name in list(shares)[:2]]
         both = float(correlation[first[0], first[1]]) if len(first) > 1 else None
-        # Half of the variance is then the prior's.
-        undetermined = 2 * float(variances[k]) > PRIOR_SIGMA**2
-        return Direction(float(variances[k]) ** 0.5, shares, both, undetermined)
+        return Direction(float(variances[k]) ** 0.5, shares, both, k < undetermined)
 
-    return Observability(
-        [direction(k) for k in range(len(names))], pairs, posterior, vectors, precision, variance
-    )
+    directions = [direction(k) for k in range(len(names))]
+    return Observability(directions, pairs, vectors, precision, variance)
 
 
 def sparse_basis(basis: Float[Tensor, "P k"]) -> Float[Tensor, "P k"]:
@@ -262,11 +258,10 @@ def prior_on_undetermined(found: Observability, guess: Parameters) -> Prior | No
     Returns:
         The prior; None if every direction is determined.
     """
-    rows = [k for k, direction in enumerate(found.directions) if direction.is_undetermined]
-    if not rows:
+    names = [one.in_words() for one in found.undetermined]
+    if not names:
         return None
-    factor = found.vectors[:, rows].T.contiguous() / PRIOR_SIGMA
-    names = [found.directions[k].in_words() for k in rows]
+    factor = found.vectors[:, : len(names)].T.contiguous() / PRIOR_SIGMA
     return Prior(guess, factor, found.variance, names)
 
 

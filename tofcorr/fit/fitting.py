@@ -231,10 +231,8 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
     # Six folds choose the strength of a penalty; poses go to them in turn, with all their images.
     held_out = [(poses % 6 == k).nonzero()[:, 0].tolist() for k in range(6)]
     penalties = with_strengths(penalties_of(model), moments, start, held_out)
-    strengths = {one.name: float(one.strength) for one in penalties}
-    chosen = [
-        strengths[t.symbols[0]] for t, _ in model.penalised() if t.options.is_open("strength")
-    ]
+    both = zip(model.penalised(), penalties, strict=True)
+    chosen = [float(one.strength) for (term, _), one in both if term.options.is_open("strength")]
     core = Core(
         options=options.with_found("strength", chosen),
         moments=moments,
@@ -248,8 +246,6 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
 def _start(problem: Problem, moments: ImageMoments, model: ErrorModel) -> Parameters:
     """Start penalised curves at zero: without the penalty the images hardly determine them."""
     penalised = {symbol for term, _ in model.penalised() for symbol in term.symbols}
-    if not penalised:
-        return problem.start(moments)
     others = [symbol for symbol in moments.symbols if symbol not in penalised]
     found = problem.start(moments.columns(others))
     coefficients = torch.zeros(len(moments.symbols), dtype=torch.float64)
@@ -285,10 +281,9 @@ def refuse_diverged(parameters: Parameters) -> None:
     off = rotation @ rotation.T - torch.eye(3).to(rotation)
     # Rounding makes 1e-15 for a step of any sensible size; only one of millions of turns makes half
     # of the digits wrong.
-    if bool((off.abs() < torch.finfo(rotation.dtype).eps ** 0.5).all()):
-        return
-    advice = "Record poses near and far and tilted to all sides, or choose a smaller model."
-    raise CalibrationDataError(f"The frames do not determine the hand-eye transform. {advice}")
+    if not bool((off.abs() < torch.finfo(rotation.dtype).eps ** 0.5).all()):
+        advice = "Record poses near and far and tilted to all sides, or choose a smaller model."
+        raise CalibrationDataError(f"The frames do not determine the hand-eye transform. {advice}")
 
 
 def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:

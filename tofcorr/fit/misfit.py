@@ -166,12 +166,9 @@ def probes(seen: MisfitPixels) -> Probes:
     (s, t), when = seen.on_wall.unbind(dim=1), _standard(seen.frame.to(torch.float64))
     one, none, u = torch.ones_like(x), torch.zeros_like(x), _standard(distance)
     frequency = seen.recording.modulation_frequency
-
-    def of_phase(further: Tensor) -> Tensor:
-        """Return the error by a weak signal of a longer path, in units of its share."""
-        if frequency is None:
-            return further
-        return torch.sin(phase_from_radial_distance(further, frequency))
+    phase = None if frequency is None else phase_from_radial_distance(distance, frequency)
+    # The error by a weak signal of a path twice as long, in units of its share.
+    of_echo = distance if phase is None else phase.sin()
 
     def lens(*moves: tuple[Tensor, Tensor]) -> Tensor:
         return torch.stack([seen.moved_rays(*move) for move in moves], dim=1)
@@ -195,15 +192,15 @@ def probes(seen: MisfitPixels) -> Probes:
         # Light that the camera's mount sends back to the wall.
         "facing": (
             "are those of light between target and camera",
-            error(of_phase(distance) * facing / distance**2),
+            error(of_echo * facing / distance**2),
         ),
     }
     if not seen.walls_estimated:
         found["plane"] = ("are those of planes elsewhere", torch.stack([one, s, t], dim=1))
-    if frequency is not None:
+    if phase is not None:
         # Four waves in one unambiguous range: of the third harmonic with four taps (Lange 2000).
-        phase = 4 * phase_from_radial_distance(distance, frequency)
-        found["circular"] = ("repeat over the distance", error(phase.sin(), phase.cos()))
+        waves = error((4 * phase).sin(), (4 * phase).cos())
+        found["circular"] = "repeat over the distance", waves
     if bright is not None:
         # The ratio is cut, so that single dark pixels do not decide.
         ratio = (amplitude.median() / amplitude).clamp(max=20)

@@ -262,10 +262,9 @@ class Shift(NamedTuple):
     def lacking(self) -> str:
         """Return one sentence for the user about an error that the model lacks."""
         moved, turned = self.size
-        return (
-            f"The residuals {self.words}: the model lacks a term, which moves the hand-eye by "
-            f"{1e3 * moved:.1f} mm and {1e3 * turned:.1f} mrad. `tofcorr diagnose` looks for it."
-        )
+        lacking = f"The residuals {self.words}: the model lacks a term, which moves the hand-eye by"
+        lacking = f"{lacking} {1e3 * moved:.1f} mm and {1e3 * turned:.1f} mrad"
+        return f"{lacking}. `tofcorr diagnose` looks for it."
 
     def to_mapping(self, rotation: Tensor) -> dict[str, Any]:
         """Return shift (mm) and turn (degrees) along the tool's axes, for JSON.

@@ -398,8 +398,7 @@ _FORMAT = {"format": "tofcorr-reference", "version": 2}
 
 def save_reference(path: Path, reference: Reference, state: CalibrationState) -> None:
     """Write a reference as JSON, with the coefficients that it belongs to."""
-    belongs = {"coefficients": state.coefficients.tolist()}
-    values = _FORMAT | belongs | reference.to_mapping()
+    values = _FORMAT | {"coefficients": state.coefficients.tolist()} | reference.to_mapping()
     values |= {"sha256": _digest(values)}
     path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
 

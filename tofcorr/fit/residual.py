@@ -7,6 +7,7 @@ a network must do better there on average and in the tail, in mean absolute and 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -50,8 +51,7 @@ def fit_residual(
     number = int(pose.max()) + 1
     folds = min(options.folds, number)
 
-    def untrained(stretch: Sequence[float]) -> ResidualNetwork:
-        return ResidualNetwork(options.network, problem.domain, stretch)
+    untrained = partial(ResidualNetwork, options.network, problem.domain)
 
     def held_out(stretch: Sequence[float]) -> Tensor:
         """Return mean absolute and squared error of each pose, without and with a network."""
@@ -80,11 +80,9 @@ def fit_residual(
         network, best = _train(core, error, sample, untrained(_STRETCHES[chosen]), options)
     (mean, square), (its_mean, its_square) = tried[chosen].mean(dim=2).tolist()
     kept = f"The residual network was {'dropped' if network is None else 'kept'}: held-out runs of"
-    words = (
-        f"{kept} images have {1e3 * its_square**0.5:.2f} mm RMS and {1e3 * its_mean:.2f} mm mean "
-        f"absolute error, {1e3 * square**0.5:.2f} and {1e3 * mean:.2f} without (p = {p_value:.3g})."
-    )
-    return words, network, best
+    found = f"{1e3 * its_square**0.5:.2f} mm RMS and {1e3 * its_mean:.2f} mm mean absolute error"
+    bare = f"{1e3 * square**0.5:.2f} and {1e3 * mean:.2f} without (p = {p_value:.3g})"
+    return f"{kept} images have {found}, {bare}.", network, best
 
 
 def gate(without: Tensor, with_network: Tensor) -> float:

@@ -91,10 +91,8 @@ def recorded_walls(dataset: Dataset, frames: Frames) -> FoundWalls:
     # A wall has three unknowns, and one image determines about three: fewer than three images
     # contribute little to the other unknowns.
     for place in np.flatnonzero(count < (1 if dataset.planes_are_estimated else 3))[:1]:
-        said = (
-            "planes: unknown needs at least 3 images of each wall (target and plane in frames.csv)"
-        )
-        said = f"{said}, '{names[numbers[place]]}' has {count[place]}"
+        needed = "at least 3 images of each wall (target and plane in frames.csv)"
+        said = f"planes: unknown needs {needed}, '{names[numbers[place]]}' has {count[place]}"
         raise CalibrationDataError(f"{dataset.first.path}: {said}. Record more, or measure.")
     columns = "normal_world", "offset", "world_from_tool"
     normal, offset, pose = (dataset.column(name)[frames] for name in columns)

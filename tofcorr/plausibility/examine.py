@@ -100,16 +100,15 @@ def examine(data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> 
     """Run the checks in turn; those of geometry until one finds something impossible."""
     look = Look(data, planes, fits=fits)
     findings: list[Finding] = []
-    aligned = False
+    aligned = impossible = False
     for place in (*OF_VALUES, *OF_GEOMETRY):
-        if place in OF_GEOMETRY and any(one.severity == "impossible" for one in findings):
+        if impossible and place in OF_GEOMETRY:
             break
         aligned = place in OF_GEOMETRY
         module, _, name = place.partition(":")
         check = getattr(import_module(f"tofcorr.plausibility.{module}"), name)
-        called = name.replace("_", " ")
-        findings += [replace(one, check=one.check or called) for one in check(look)]
-    impossible = {one.check for one in findings if one.severity == "impossible"}
+        findings += [replace(one, check=one.check or name.replace("_", " ")) for one in check(look)]
+        impossible = any(one.severity == "impossible" for one in findings)
     share, bent, dominated = (0.0, False, False) if impossible else garbage_of(look)
     # Each sentence once. Sorting is stable: within a severity the order of the checks stays.
     once = {one.sentence: one for one in findings}.values()

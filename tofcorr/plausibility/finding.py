@@ -73,9 +73,8 @@ class Finding:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        values = asdict(self)
-        del values["spoils"]  # For those who fit.
-        return values
+        # Those who fit look at `spoils`.
+        return {name: value for name, value in asdict(self).items() if name != "spoils"}
 
 
 impossible, doubtful, note = (
@@ -131,8 +130,7 @@ class Inspection:
         serious = [one for one in self.findings if one.severity != "note"]
         if not serious:
             return None
-        more = len(serious) - 1
-        rest = f" ({more} more: tofcorr inspect)" if more else ""
+        rest = f" ({len(serious) - 1} more: tofcorr inspect)" if serious[1:] else ""
         kind = "Ambiguous" if serious[0].severity == "ambiguous" else "Doubtful"
         return f"{kind} recording: {serious[0].sentence}{rest}"
 

@@ -294,9 +294,10 @@ class Look:
         if aligned:
             found["flatness of a frame's points, mm"] = 1e3 * self.flatness
             if (given := self.as_given) is not None:
-                angle = math.degrees(given.typical_angle)
                 found["distance to the planes after alignment, mm"] = 1e3 * given.misfit
-                found["angle to the planes after alignment, deg"] = angle
+                found["angle to the planes after alignment, deg"] = math.degrees(
+                    given.typical_angle
+                )
                 found["distances too long by, mm"] = 1e3 * given.constant
             if self.shape is not None and 100 * (focal := self.shape["focal"]).size_error < 3:
                 found["focal length should change by, %"] = 100 * float(focal.value[0])

@@ -146,9 +146,8 @@ def best_explanations(look: Look) -> list[Explanation]:
         and len(tried) * f_tail((given.relative / found.relative) ** 2, freedom, freedom) < LEVEL
     ]
     least = min((one[2].relative for one in better), default=0.0)
-    return sorted(
-        (one for one in better if 3 * one[2].relative <= 4 * least), key=lambda one: one[3]
-    )
+    near = [one for one in better if 3 * one[2].relative <= 4 * least]
+    return sorted(near, key=lambda one: one[3])
 
 
 def explanations(look: Look) -> Iterator[Explanation]:

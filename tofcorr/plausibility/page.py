@@ -73,9 +73,8 @@ def page_text(
 def refuse_page(path: Path) -> None:
     """Raise CalibrationDataError unless a page can be written here: a new name in .html."""
     if path.suffix.lower() not in (".html", ".htm"):
-        raise CalibrationDataError(
-            f"{path}: the page of an inspection is one file; expected a name that ends in .html"
-        )
+        said = "the page of an inspection is one file; expected a name that ends in .html"
+        raise CalibrationDataError(f"{path}: {said}")
     refuse_existing(path)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import FrameBatch
@@ -219,17 +220,14 @@ def _moved_camera(
     """
     tilt, azimuth, roll, away = wanted
     point = camera[:3, 3] + distance * camera[:3, 2]
-    across = torch.linalg.cross(normal, camera[:3, 0])
-    across = across / across.norm()
+    across = normalize(torch.linalg.cross(normal, camera[:3, 0]), dim=0)
     along = torch.linalg.cross(across, normal)
     aside = math.cos(azimuth) * along + math.sin(azimuth) * across
     axis = -math.cos(math.radians(tilt)) * normal + math.sin(math.radians(tilt)) * aside
-    x = camera[:3, 0] - axis * (camera[:3, 0] @ axis)
-    x = x / x.norm()
+    x = normalize(camera[:3, 0] - axis * (camera[:3, 0] @ axis), dim=0)
     turned = torch.stack([x, torch.linalg.cross(axis, x), axis], dim=1)
-    c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
-    spin = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return se3.assemble(turned @ spin, point - away * axis)
+    spin = se3.exp(torch.tensor([0.0] * 5 + [math.radians(roll)], dtype=torch.float64))
+    return se3.assemble(turned @ spin[:3, :3], point - away * axis)
 
 
 def _sees_wall(
@@ -286,16 +284,9 @@ def draw_pool(
         tilt_deg=min(max(recorded, 30), 40),
         longest_ray=ranges.high * (1 + 1 / 20),
     )
-    return draw_views(
-        camera,
-        (normal, offset),
-        hand_eye,
-        space,
-        target_brightness(dataset, frames, hand_eye),
-        dataset.ray_directions(),
-        generator,
-        size,
-    )
+    wall, rays = (normal, offset), dataset.ray_directions()
+    brightness = target_brightness(dataset, frames, hand_eye)
+    return draw_views(camera, wall, hand_eye, space, brightness, rays, generator, size)
 
 
 def target_brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[str, Tensor]:
@@ -306,20 +297,16 @@ def target_brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) ->
         frames: Global numbers of the frames.
         hand_eye: tool_from_camera, shape (4, 4).
     """
-    names = dataset.targets[frames]
-    nothing = {str(name): torch.zeros(2, dtype=torch.float64) for name in np.unique(names)}
-    if not dataset.has_amplitude:
-        return nothing
-    rays, found = dataset.ray_directions(), {}
+    names, rays, found = dataset.targets[frames], dataset.ray_directions(), {}
     # A tenth of the pixels is darker than what stands for dark, a tenth brighter than bright.
     quantiles = torch.tensor([1 / 10, 9 / 10], dtype=torch.float64)
-    for name in np.unique(names):
+    for name in np.unique(names) if dataset.has_amplitude else ():
         batches = dataset.batches(frames[names == name])
         logs = torch.cat([sample_reflectivity(one, rays, hand_eye, 500)[1] for one in batches])
         if logs.numel():  # A target may have no pixel with light that is not too grazing.
             found[str(name)] = logs.quantile(quantiles)
     if not found:
-        return nothing
+        return {str(name): torch.zeros(2, dtype=torch.float64) for name in np.unique(names)}
     if all(float(high - low) < math.log(ENOUGH_REFLECTIVITY) for low, high in found.values()):
         bright = max(float(high) for _, high in found.values())
         found["checkerboard"] = torch.tensor([bright + math.log(_DARK), bright]).double()
@@ -345,13 +332,11 @@ def advise(
     """
     best = fit.solution.parameters
     design = Design(fit.model.error, fit.domain, dataset.ray_directions())
-    camera = dataset.first.camera
-    share = float(fit.moments.count.mean()) / (camera.height * camera.width)
+    share = float(fit.moments.count.mean()) / (fit.domain.height * fit.domain.width)
     moments = pool.moments(design, best.tool_from_camera, share, enough)
     # Poses carry no information about condition terms.
     beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
-    if beyond:
-        moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
+    moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
     added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
     # What no pose shows is not what further poses are for.
     shown = [k for k, one in enumerate(fit.observability.directions) if not fit.is_unseen(one)]
@@ -467,16 +452,10 @@ def plan_poses(
     # In the axes of the start camera.
     normal = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
     offset = torch.tensor([start_distance or middle], dtype=torch.float64)
-    rays = ray_directions(camera)
-    pool = draw_views(
-        torch.eye(4, dtype=torch.float64)[None],
-        (normal, offset),
-        hand_eye,
-        workspace,
-        {"wall": torch.tensor([workspace.log_dark, 0.0]).double()},
-        rays,
-        np.random.default_rng(seed),
-    )
+    wall, rays = (normal, offset), ray_directions(camera)
+    start, random = torch.eye(4, dtype=torch.float64)[None], np.random.default_rng(seed)
+    brightness = {"wall": torch.tensor([workspace.log_dark, 0.0]).double()}
+    pool = draw_views(start, wall, hand_eye, workspace, brightness, rays, random)
     if pool is None:
         raise ConfigError("No view lies on the wall: allow shorter distances, or less tilt.")
     domain = _domain(camera, workspace)

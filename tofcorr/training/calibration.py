@@ -81,9 +81,8 @@ class Calibration:
         resumed: Parameters | None = None,
         left_out: Collection[int] = (),
     ) -> None:
-        self.train, self.test = (
-            frames[~np.isin(frames, list(left_out))] for frames in split_frames(data, options.split)
-        )
+        halves = split_frames(data, options.split)
+        self.train, self.test = (own[~np.isin(own, list(left_out))] for own in halves)
         domain = covered_domain(data, self.train)
         found = fit(data, self.train, options, domain, watcher, resumed)
         self.data = data = with_every_wall(data, found.walls, found.model)

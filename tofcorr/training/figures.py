@@ -13,11 +13,7 @@ if TYPE_CHECKING:  # Matplotlib takes longer to import than a short fit.
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_STAGES = {
-    "before": ("before", "tab:red"),
-    "hand_eye_only": ("hand-eye only", "tab:orange"),
-    "after": ("after", "tab:blue"),
-}
+_COLOURS = {"before": "tab:red", "hand_eye_only": "tab:orange", "after": "tab:blue"}
 # Colours from too near to too far, of 255, in equal steps: the diverging scale of ColorBrewer
 # (RdBu). Pixels that are not used are grey, which is no colour of it.
 _SCALE = np.array(
@@ -128,8 +124,8 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
     x, last = sample.covariates[covariate], list(sample.errors_mm.values())[-1]
     ends, tested = without_strays(x), np.isin(sample.frame, held_out)
     for stage, error in sample.errors_mm.items():
-        label, colour = _STAGES.get(stage, (stage, "k"))
-        draw_profile(panels[0], x, error, ends, colour, label)
+        label = stage.replace("hand_eye", "hand-eye").replace("_", " ")
+        draw_profile(panels[0], x, error, ends, _COLOURS.get(stage, "k"), label)
     halves = (~tested, "tab:blue", "fitted"), (tested, "tab:green", "held out")
     for chosen, colour, label in halves:
         if chosen.any():

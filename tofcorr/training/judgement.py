@@ -100,9 +100,9 @@ def judge(
         inspection: What was odd about the recordings; its noise of a pixel is the floor.
     """
     free = _is_free(fit)
-    with_intensity = fit.model.error.needs_amplitude()
     said = [*_of_errors(fit, errors, inspection.look), *_of_directions(fit)]
-    for serious, one in shortcomings(support, moves=free, with_intensity=with_intensity):
+    needed = shortcomings(support, moves=free, with_intensity=fit.model.error.needs_amplitude())
+    for serious, one in needed:
         said.append(("usable" if serious else "good", one))
     noise = 1e3 * inspection.look.noise_rms
     if beyond := beyond_noise(errors["after"]["test"]["rms"], noise, moves=free):
@@ -208,10 +208,8 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
     if not solution.converged and solution.stopped != "not_finite":
         yield "usable", solution.message
     if free and max(fit.hand_eye_errors) > _WEAK:
-        yield (
-            "usable",
-            f"The hand-eye is known to {_known(fit)} only: record more tilts and distances.",
-        )
+        loose = f"The hand-eye is known to {_known(fit)} only"
+        yield "usable", f"{loose}: record more tilts and distances."
     wide, of_pose = 1e3 * PRIOR_SIGMA, "usable" if free else "good"
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
     weak = [one for one in fit.directions if one.sigma > _WEAK and not fit.is_unseen(one)]
@@ -251,6 +249,7 @@ def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) ->
     return f"{off}; `tofcorr diagnose` tells which."
 
 
+_POSE = "  {target:<14}{distance_m:6.2f} m, tilted {tilt_deg:.0f} deg, rolled by {roll_by_deg:+.0f}"
 _VIEWS = (
     "{:<8} RMS along z {rms_z:.2f}: {between_views:.2f} between views (offset and tilts of whole "
     "images), {within_views:.2f} within; {within_prior:.2f} with planes within their covariance"
@@ -281,12 +280,9 @@ def report_text(report: Mapping[str, Any]) -> str:
         largest = f"{advice['sigma_mm_or_mrad']:.2f} mm (or mrad), of {advice['direction']}"
         expects = advice["worst_sigma_mm_or_mrad"]
         lines.append(f"The largest standard error is {largest}. To lower it, add:")
-        lines += [
-            f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
-            f"deg, rolled by {pose['roll_by_deg']:+.0f}: lower by "
-            f"{100 - 100 * pose['worst_sigma_mm_or_mrad'] / expects:.0f} %"
-            for pose in advice["poses"]
-        ]
+        for pose in advice["poses"]:
+            lower = 100 - 100 * pose["worst_sigma_mm_or_mrad"] / expects
+            lines.append(f"{_POSE.format(**pose)}: lower by {lower:.0f} %")
     lines += left_out_words([one["frame"] for one in report["left_out"]])
     lines += outlying_words(report["outlying_images"])
     found = [warning for warning in report["warnings"] if warning != report["reason"]]
@@ -319,9 +315,6 @@ def _hand_eye_lines(report: Mapping[str, Any]) -> Iterator[str]:
         done = "taken off" if shift["removed"] else "not taken off; the standard errors contain it"
         millimetres = "  ".join(f"{t:+z.2f}" for t in shift["translation_mm"])
         yield f"  moved by the noise of the distances, mm: {millimetres} ({done})"
-    moved = [
-        f"{math.hypot(*one['translation_mm']):.1f} mm for {one['error']}"
-        for one in report["assumptions"]
-    ]
-    if moved:
-        yield f"  what ± leaves out: {', '.join(moved)}"
+    moved = ((math.hypot(*one["translation_mm"]), one["error"]) for one in report["assumptions"])
+    if said := ", ".join(f"{size:.1f} mm for {error}" for size, error in moved):
+        yield f"  what ± leaves out: {said}"

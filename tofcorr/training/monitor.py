@@ -77,19 +77,17 @@ class RunMonitor:
         if not self.iterations:
             return
         moments, before = calibration.fit.moments, self.iterations[0].parameters.tool_from_camera
+        moved = ("t_x_mm", "t_y_mm", "t_z_mm", "rotation_deg")
+        tags = [f"hand_eye_since_start/{name}" for name in moved]
         # TensorBoard allows no ^ in a tag; c^1 of the column must not become c1.
-        tags = [f"coefficients_mm/{name.replace('^', '_to_the_')}" for name in moments.symbols]
+        tags += [f"coefficients_mm/{name.replace('^', '_to_the_')}" for name in moments.symbols]
 
         def state(now: Parameters) -> dict[str, float]:
             after = now.tool_from_camera
             shift = (1e3 * (after - before)[:3, 3]).tolist()
             turned = torch.rad2deg(se3.rotation_angle(before[:3, :3].T @ after[:3, :3]))
-            names = ("t_x_mm", "t_y_mm", "t_z_mm", "rotation_deg")
-            moved = zip(names, [*shift, float(turned)], strict=True)
-            return {
-                **{f"hand_eye_since_start/{name}": value for name, value in moved},
-                **dict(zip(tags, (1e3 * now.coefficients).tolist(), strict=True)),
-            }
+            values = [*shift, float(turned), *(1e3 * now.coefficients).tolist()]
+            return dict(zip(tags, values, strict=True))
 
         for iteration, when in zip(self.iterations, self._times, strict=True):
             loss, left = iteration.loss, math.log10(max(iteration.step_left, sys.float_info.min))

@@ -65,8 +65,7 @@ def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
         shift = fit.noise_shift.to_mapping(transform[:3, :3]) | {"removed": fit.noise_shift.removed}
     # Student's t, with the poses less one as degrees of freedom: a fortieth lies beyond each end.
     half_width = student_quantile(39 / 40, fit.covariance.degrees_of_freedom)
-    none = 0.0, 0.0, 0.0
-    exact = HandEyeAccuracy(translation_se_mm=none, rotation_se_deg=none)
+    exact = HandEyeAccuracy.model_validate(_in_units(torch.zeros(2, 3), "se"))
     return {
         "tool_from_camera": transform.tolist(),
         "estimated": known is not None,
@@ -103,9 +102,8 @@ def _curve(fit: Fit, distance: Tensor, amplitude: Tensor) -> list[dict[str, floa
     row, column = (torch.full_like(distance, (size - 1) / 2) for size in sizes)
     conditions = torch.zeros(len(distance), len(CONDITIONS)).to(distance)
     # Condition terms come last; they are zero at the mean conditions.
-    known = len(error.image_symbols())
-    with torch.no_grad():
-        basis = error.columns_at(Pixels(distance, amplitude, row, column, conditions))[:known].T
+    known, at = len(error.image_symbols()), Pixels(distance, amplitude, row, column, conditions)
+    basis = error.columns_at(at).detach()[:known].T
     own = slice(parameters.twist_size, parameters.twist_size + known)
     predicted = basis @ parameters.coefficients[:known]
     variance = ((basis @ fit.covariance.matrix[own, own]) * basis).sum(dim=1)

@@ -58,7 +58,7 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
         depth_kind=recording.depth_kind,
         saturation_amplitude=recording.saturation_amplitude,
         covariance=fit.covariance.matrix[parameters.twist_size :, parameters.twist_size :],
-        noise=None if fit.noise is None else fit.noise.coefficients,
+        noise=None if fit.noise is None else fit.noise[:3],
         frames=recording.frame_names,
         hand_eye_accuracy=hand_eye_accuracy(fit),
     )
@@ -129,8 +129,7 @@ class TrainingResult:
         fit, options = self.fit, self.options
         state = calibration_state(self.data, options, fit)
         save_calibration(folder / STATE_FILE, state)
-        seen, frames = self.data, self.calibration.frames
-        reference = estimate_reference(seen, frames, fit, state.noise)
+        reference = estimate_reference(self.data, self.calibration.frames, fit, state.noise)
         if reference is not None:
             save_reference(folder / REFERENCE_FILE, reference, state)
         if self.force or self.report["verdict"] != DO_NOT_USE:

@@ -122,10 +122,8 @@ def _reflectivity_ratio(dataset: Dataset, frames: Frames, tool_from_camera: Tens
     It is measured on about 200 000 pixels, at least 100 a frame; None with fewer than 100 in all.
     """
     rays, per_frame = dataset.ray_directions(), max(200_000 // max(len(frames), 1), 100)
-    samples = [
-        sample_reflectivity(batch, rays, tool_from_camera, per_frame)
-        for batch in dataset.batches(frames)
-    ]
+    batches = dataset.batches(frames)
+    samples = [sample_reflectivity(one, rays, tool_from_camera, per_frame) for one in batches]
     place, logarithm = (torch.cat(parts) for parts in zip(*samples, strict=True))
     if len(logarithm) < 100:
         return None
@@ -165,7 +163,5 @@ def sample_reflectivity(
         values.flatten(1)[:, ::step][chosen]
         for values in (batch.amplitude, batch.radial_distance, cosine)
     )
-    return (
-        quadratic.expand(len(chosen), -1, 6)[chosen],
-        (amplitude * distance.square() / frontal).log(),
-    )
+    logarithm = (amplitude * distance.square() / frontal).log()
+    return quadratic.expand(len(chosen), -1, 6)[chosen], logarithm

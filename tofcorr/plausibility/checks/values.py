@@ -35,13 +35,12 @@ def units(look: Look) -> Iterator[Finding]:
     values = look.stored[np.isfinite(look.stored)]
     median = float(np.median(values)) if len(values) else 1.0
     far = f"The median distance is {median:.4g} m"
+    seems = f"{far}: depth.npy seems to be in"
     if median > 100:
         unit = "millimetres" if median > 2000 else "millimetres or centimetres"
-        said = f"seems to be in {unit}, or to hold amplitudes"
-        yield impossible(f"{far}: depth.npy {said}; write metres.")
+        yield impossible(f"{seems} {unit}, or to hold amplitudes; write metres.")
     elif 1000 * median < 5:
-        said = "seems to be in kilometres, or scaled twice"
-        yield impossible(f"{far}: depth.npy {said}; write metres.")
+        yield impossible(f"{seems} kilometres, or scaled twice; write metres.")
     elif median > 20:
         yield doubtful(f"{far}, much for a wall: is depth.npy in metres?")
     place = look.poses[:, :3, 3]
@@ -133,9 +132,8 @@ def stillness(look: Look) -> Iterator[Finding]:
     """
     if not look.fits or look.planes == "ignored":
         return
-    poses = look.poses
-    number = len(distinct(poses))
-    if len(poses) < 2:
+    number = len(distinct(look.poses))
+    if len(look.poses) < 2:
         yield impossible("The recording holds one frame; record more poses.")
     elif number == 1:
         planes = (look.column(name) for name in ("normal_world", "offset"))
@@ -380,8 +378,7 @@ def two_cameras(look: Look) -> Iterator[Finding]:
     has 2.6.
     """
     # Repeats of a pose show the same, whatever it is.
-    moves = look.data.moves
-    chosen = distinct(look.scene.poses) if moves else np.arange(len(look.frames))
+    chosen = distinct(look.scene.poses) if look.data.moves else np.arange(len(look.frames))
     pattern = _patterns(look, chosen)
     if pattern is None or len(pattern) < 16:
         return
