@@ -9,7 +9,7 @@ from importing.checkerboard.rendered_board import BOARD, CAMERA, placement, proj
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.boards import Board, poses_of
 
-LARGER = replace(BOARD, square_length=1.01 * BOARD.square_length)
+LARGER = BOARD.model_copy(update={"square_length": 1.01 * BOARD.square_length})
 (FX, _, CX), (_, FY, CY), LAST = CAMERA.matrix
 LONGER = replace(CAMERA, matrix=((1.01 * FX, 0.0, CX), (0.0, 1.01 * FY, CY), LAST))
 

@@ -8,16 +8,18 @@ OpenCV estimates the camera intrinsics and the pose of the board from them.
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.robust import LEVEL, f_tail, sigma_from_mad
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.run import RefusedViewError
+from tofcorr.options import Options, PositiveNumber
 
 _FEWEST_CORNERS = 8
 """Fewer points of a board (no unit) do not place it: two tags, or a fifth of a small ChArUco board.
@@ -43,11 +45,11 @@ stops somewhere along a valley; so the root mean square tilt of the boards must 
 focal length and deviation be sane. Set by hand."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FlatBoard(ABC):
+class FlatBoard(Options, ABC):
     """A flat board with points that can be found in an image.
 
     Attributes:
+        kind: What the recording calls the target.
         columns: Inner corners, squares or tags in a row, as the kind counts them.
         rows: The same in a column.
         square_length: Side of a square or tag, metres: all points scale with it.
@@ -56,17 +58,16 @@ class FlatBoard(ABC):
             of a square or tag; 0: the kind's usual one.
     """
 
-    kind: ClassVar[str]
-    """What the recording calls the target."""
     called: ClassVar[str] = "{size}"
     """What messages call the board."""
     usual: ClassVar[tuple[str, float]] = ("", 0.0)
     """Dictionary and share of markers where none are given."""
-    columns: int
-    rows: int
-    square_length: float
+    kind: Any
+    columns: Annotated[int, Field(ge=3)]
+    rows: Annotated[int, Field(ge=3)]
+    square_length: PositiveNumber
     dictionary: str = ""
-    share: float = 0.0
+    share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.0
 
     @abstractmethod
     def corner_points(self) -> np.ndarray:
@@ -112,7 +113,7 @@ class FlatBoard(ABC):
 class Board(FlatBoard):
     """A checkerboard, described as OpenCV does: inner corners (where four squares meet)."""
 
-    kind = "checkerboard"
+    kind: Literal["checkerboard"] = "checkerboard"
 
     def corner_points(self) -> np.ndarray:
         """Return the inner corners in the board's frame, row by row, shape (N, 3), metres.
@@ -145,7 +146,7 @@ class Board(FlatBoard):
         """Return the board of one row and column fewer; OpenCV refuses fewer than 3 corners."""
         if min(self.columns, self.rows) <= 3:
             return None
-        return replace(self, columns=self.columns - 1, rows=self.rows - 1)
+        return self.model_copy(update={"columns": self.columns - 1, "rows": self.rows - 1})
 
     def _refined(self, image: np.ndarray, corners: np.ndarray) -> np.ndarray:
         """Refine corners on the logarithm of the counts around the board.
@@ -166,7 +167,7 @@ class Board(FlatBoard):
 class CharucoBoard(FlatBoard):
     """A ChArUco board: a checkerboard whose white squares carry markers, found even in part."""
 
-    kind = "charuco"
+    kind: Literal["charuco"] = "charuco"
     called = "ChArUco {size} ({dictionary})"
     usual = ("4X4_50", 0.75)
 
@@ -200,7 +201,7 @@ class AprilGrid(FlatBoard):
     The side of a tag is its black border's.
     """
 
-    kind = "apriltag"
+    kind: Literal["apriltag"] = "apriltag"
     called = "{size} tags ({dictionary})"
     usual = ("APRILTAG_36H11", 0.3)
 
@@ -235,28 +236,29 @@ class AprilGrid(FlatBoard):
         return found.reshape(-1, 2)
 
 
-BOARDS = {board.kind: board for board in (Board, CharucoBoard, AprilGrid)}
-"""The kinds of boards."""
+AnyBoard = Annotated[Board | CharucoBoard | AprilGrid, Field(discriminator="kind")]
+"""A board of a kind that is known."""
 
 
-def read_board(text: str) -> dict[str, Any]:
+def read_board(text: str) -> dict[str, str]:
     """Read `5x7`, `charuco:5x7:4X4_50:0.75` or `apriltag:6x6:APRILTAG_36H11:0.3`.
 
     That is `KIND:COLUMNSxROWS:DICTIONARY:SHARE`, of which the last two may be missing, or
     `COLUMNSxROWS` of a checkerboard.
 
     Returns:
-        The options of `CheckerboardOptions` that describe the board; None: the kind's usual value.
+        The fields of a board that the text gives.
 
     Raises:
         ConfigError: The text is something else.
     """
-    number, word = r"(\d+)", "(?::([^:]+))?"
-    match = re.fullmatch(f"(?:({'|'.join(BOARDS)}):)?{number}[xX]{number}{word}{word}", text)
-    if match is None or (match[1] in (None, Board.kind) and match[4] is not None):
+    kind, number, word = "(?:(checkerboard|charuco|apriltag):)?", r"(\d+)", "(?::([^:]+))?"
+    match = re.fullmatch(f"{kind}{number}[xX]{number}{word}{word}", text)
+    if match is None or (match[1] in (None, "checkerboard") and match[4] is not None):
         raise ConfigError(f"expected 5x7, charuco:5x7:4X4_50:0.75 or the like, got '{text[:60]}'.")
-    keys = ("board_kind", "board_columns", "board_rows", "board_dictionary", "board_share")
-    return dict(zip(keys, (match[1] or Board.kind, *match.groups()[1:]), strict=True))
+    keys = ("kind", "columns", "rows", "dictionary", "share")
+    given = zip(keys, (match[1] or "checkerboard", *match.groups()[1:]), strict=True)
+    return {key: value for key, value in given if value is not None}
 
 
 def _renderings(infrared: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -23,9 +23,8 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.checkerboard.boards import (
-    BOARDS,
+    AnyBoard,
     BoardPose,
-    FlatBoard,
     calibrate,
     calibration_warning,
     estimate_pose,
@@ -74,7 +73,6 @@ _DEGENERACY = (
 _SAME_VIEW = "are the two images of the same view?"
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-CornerCount = Annotated[int, Field(ge=3)]
 
 
 class CheckerboardOptions(Options):
@@ -84,13 +82,7 @@ class CheckerboardOptions(Options):
         depth_pattern: Names of the depth images, with `{view}` or wildcards.
         infrared_pattern: Names of the infrared images, in which the boards are found.
         amplitude_pattern: Names of the amplitude images; None: there are none.
-        board_kind: One of `tofcorr.importing.checkerboard.boards.BOARDS`.
-        board_columns: Inner corners in a row; squares or tags of other kinds.
-        board_rows: The same in a column.
-        board_dictionary: Of the markers; None: the kind's usual one.
-        board_share: Side of the markers, or space between tags, as a share of a side; None: the
-            kind's usual one.
-        square_length: Side of a square or tag, metres.
+        board: The board that they show.
         coding: How the numbers of the depth images are to be read.
         depth_kind: `z`: along the optical axis; `radial`: along the ray.
         saturation_counts: Infrared counts from which a pixel is saturated; None: never.
@@ -103,28 +95,13 @@ class CheckerboardOptions(Options):
     depth_pattern: str = "{view}_depth.png"
     infrared_pattern: str = "{view}_ir.png"
     amplitude_pattern: str | None = "{view}_ir.png"
-    board_kind: Literal["checkerboard", "charuco", "apriltag"] = "checkerboard"
-    board_columns: CornerCount
-    board_rows: CornerCount
-    board_dictionary: str | None = None
-    board_share: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
-    square_length: Positive
+    board: AnyBoard
     coding: DepthCoding = DepthCoding(invalid=())
     depth_kind: DepthKind = "z"
     saturation_counts: Positive | None = 65535.0
     margin_squares: Annotated[float, Field(gt=-1.0, le=2.0)] = 0.0
     max_reprojection_px: Positive = 0.5
     modulation_frequency: Positive | None = None
-
-    def board(self) -> FlatBoard:
-        """Return the board."""
-        return BOARDS[self.board_kind](
-            columns=self.board_columns,
-            rows=self.board_rows,
-            square_length=self.square_length,
-            dictionary=self.board_dictionary or "",
-            share=self.board_share or 0.0,
-        )
 
 
 class BoardView(NamedTuple):
@@ -179,7 +156,7 @@ class BoardImport:
         self, folder: Path, options: CheckerboardOptions, intrinsics: GivenIntrinsics | None
     ) -> None:
         self._folder, self._options, self._coding = folder, options, options.coding
-        self._intrinsics, self._board = intrinsics, options.board()
+        self._intrinsics, self._board = intrinsics, options.board
         patterns = {"depth": options.depth_pattern, "infrared": options.infrared_pattern}
         patterns |= {"amplitude": options.amplitude_pattern} if options.amplitude_pattern else {}
         self._files, self._alone = files_of_views(folder, patterns)
