@@ -317,15 +317,6 @@ def _size(node: yaml.Node, sizes: dict[int, int], where: str) -> int:
     return size
 
 
-def load_options(cls: type[OptionsT], path: Path | str) -> OptionsT:
-    """Read `path` as YAML and check it against the options class `cls`.
-
-    Raises:
-        ConfigError: The file cannot be read, or does not fit `cls`.
-    """
-    return cls.from_mapping(read_mapping(Path(path)), str(path))
-
-
 def resolve_options(
     cls: type[OptionsT],
     config: str | Path | Mapping[str, Any] | Options,
@@ -433,11 +424,6 @@ def configs_folder() -> Path:
     package = Path(__file__).resolve().parent
     inside = package / "configs"
     return inside if inside.is_dir() else package.parent / "configs"
-
-
-def shipped_folders() -> list[str]:
-    """Return the folders of shipped configurations: `train`, `evaluate`, ..."""
-    return sorted(path.name for path in configs_folder().glob("*") if path.is_dir())
 
 
 def shipped_names(folder: str) -> list[str]:

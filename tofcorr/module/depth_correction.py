@@ -33,7 +33,7 @@ from tofcorr.errors import CalibrationDataError, ConfigError, ExportError, State
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
-from tofcorr.options import load_options, one_line, resolve_options
+from tofcorr.options import one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Frames, Recordings, covered_domain, opened
 from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.judgement import report_text
@@ -465,7 +465,7 @@ class DepthCorrection(FrameCorrection):
     @classmethod
     def _from_run(cls, folder: Path) -> Self:
         config = folder / "config.yaml"
-        options = load_options(TrainingOptions, config) if config.is_file() else None
+        options = resolve_options(TrainingOptions, config) if config.is_file() else None
         state = load_calibration(folder / STATE_FILE)
         if options is not None and not state.error_model.same_coefficients(options.model):
             said = f"has other terms than {STATE_FILE} beside it. Copy it again, or remove it"

@@ -310,16 +310,14 @@ class BoardPose:
         translation: Shape (3,), metres.
         used: Which corners are used for the pose, shape (N,), bool.
         reprojection_rms: Root mean square reprojection error of the corners used, pixels.
-        plane_deviation: Standard deviation of the plane's position at the board's centre along
-            its normal, metres, propagated from the reprojection errors.
-        plane_covariance: Of n and d, shape (4, 4), propagated likewise.
+        plane_covariance: Of n and d, shape (4, 4), propagated from the reprojection errors. Errors
+            that all views share (focal length, square length) are not included.
     """
 
     rotation: np.ndarray
     translation: np.ndarray
     used: np.ndarray
     reprojection_rms: float
-    plane_deviation: float
     plane_covariance: np.ndarray
 
     def plane(self) -> tuple[np.ndarray, float]:
@@ -327,10 +325,6 @@ class BoardPose:
         normal = self.rotation[:, 2]
         offset = -float(normal @ self.translation)
         return (normal, offset) if offset > 0 else (-normal, -offset)
-
-    def centre(self, board: FlatBoard) -> np.ndarray:
-        """Return the centre of the board in the camera frame, shape (3,), metres."""
-        return self.rotation @ board.corner_points().mean(axis=0) + self.translation
 
     def distance(self, rays: np.ndarray) -> np.ndarray:
         """Return the distance along rays of shape (..., 3) at which they meet the plane, metres."""
@@ -429,7 +423,6 @@ def poses_of(
             translation=place,
             used=used,
             reprojection_rms=float(np.sqrt((errors**2).sum(axis=1).mean())),
-            plane_deviation=float(np.sqrt(rotation[:, 2] @ covariance[3:, 3:] @ rotation[:, 2])),
             plane_covariance=slope @ covariance @ slope.T,
         )
         if np.isfinite(pose.reprojection_rms):

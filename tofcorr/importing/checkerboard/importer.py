@@ -112,10 +112,8 @@ class BoardView(NamedTuple):
         ratio: Median of measured over true distance.
         kind_moments: Sum over pixels of v v', shape (4, 4), metres, with v = (1, D, D (1 - cos a),
             measured minus true radial distance) and a the angle to the optical axis.
-        reported: What `import.json` says of it. `plane_sd_mm` is the standard deviation of the
-            plane's position at the board's centre, along its normal, propagated from the corners;
-            errors that all views share (focal length, square length) are not included.
-            `depth_error_mm` is the median of measured minus true depth, of the kind recorded.
+        reported: What `import.json` says of it. `depth_error_mm` is the median of measured minus
+            true depth, of the kind recorded.
     """
 
     pose: BoardPose
@@ -155,7 +153,7 @@ class BoardImport:
     def __init__(
         self, folder: Path, options: CheckerboardOptions, intrinsics: GivenIntrinsics | None
     ) -> None:
-        self._folder, self._options, self._coding = folder, options, options.coding
+        self._options, self._coding = options, options.coding
         self._intrinsics, self._board = intrinsics, options.board
         patterns = {"depth": options.depth_pattern, "infrared": options.infrared_pattern}
         patterns |= {"amplitude": options.amplitude_pattern} if options.amplitude_pattern else {}
@@ -256,19 +254,13 @@ class BoardImport:
             if tilt > _LARGEST_TILT_DEG:
                 raise RefusedViewError(f"depth is {tilt:.0f} degrees off the board; {_SAME_VIEW}")
         columns = np.stack([np.ones_like(true), true, true * (1.0 - cosine), errors])
-        centre, files = pose.centre(self._board), self._files[view]
-        slant = abs(float(pose.plane()[0] @ centre)) / float(np.linalg.norm(centre))
         reported = {
             "view": view,
-            "depth_file": files["depth"].relative_to(self._folder).as_posix(),
-            "infrared_file": files["infrared"].relative_to(self._folder).as_posix(),
             "reprojection_rms_px": pose.reprojection_rms,
             "corners_used": int(pose.used.sum()),
             "board_pixels": int(area.sum()),
             "usable_pixels": int(seen.sum()),
             "distance_m": float(np.median(true)),
-            "incidence_deg": float(np.degrees(np.arccos(min(slant, 1.0)))),
-            "plane_sd_mm": 1000 * pose.plane_deviation,
             "depth_error_mm": 1000 * float(np.median(errors * along)),
         }
         return BoardView(pose, float(np.median(measured / true)), columns @ columns.T, reported)
