@@ -428,24 +428,25 @@ def _digest(archive: zipfile.ZipFile) -> str:
 
 
 class NewPath(click.Path):
-    """The name of a folder or file that a command makes anew; nothing may be there yet."""
+    """The name of a folder or file that a command makes anew; nothing may be there yet.
 
-    refuse: Callable[[Path], object] = staticmethod(refuse_existing)
-    called = "path"
+    Args:
+        refuse: Raises CalibrationDataError or ExportError for a path that cannot be written.
+        name: What the help calls it.
+    """
 
-    def __init__(self) -> None:
+    def __init__(
+        self, refuse: Callable[[Path], object] = refuse_existing, name: str = "path"
+    ) -> None:
         super().__init__(path_type=Path)
-        self.name = self.called
+        self._refuse, self.name = refuse, name
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        """Return the path; raise CalibrationDataError or ExportError if it cannot be written."""
+        """Return the path, if it can be written."""
         path = Path(str(super().convert(value, param, ctx)))
-        self.refuse(path)
+        self._refuse(path)
         return path
 
 
-class ReplacedFile(NewPath):
-    """The name of a file that a command writes; an older one is replaced."""
-
-    called = "file"
-    refuse = staticmethod(partial(file_to_replace, kind=ExportError))
+REPLACED_FILE = NewPath(partial(file_to_replace, kind=ExportError), "file")
+"""The name of a file that a command writes; an older one is replaced."""

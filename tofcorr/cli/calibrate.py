@@ -15,7 +15,7 @@ from tofcorr.cli.shared import (
     recording_option,
     run_option,
 )
-from tofcorr.files import NewPath, ReplacedFile
+from tofcorr.files import REPLACED_FILE, NewPath
 
 if TYPE_CHECKING:
     from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
@@ -129,7 +129,7 @@ def select_command(options: "SelectionOptions", recordings: tuple[Path, ...], **
 @recording_option("A few frames of any wall.", many=True)
 @option("--wall", _WALL, default="per_image", type=click.Choice(["per_image", "one", "recorded"]))
 @option("--threshold-mm", _DRIFTED, default=5.0)
-@option("--out", "JSON file to write.", type=ReplacedFile())
+@option("--out", "JSON file to write.", type=REPLACED_FILE)
 @force_option
 def check_command(run: Path, recordings: tuple[Path, ...], **given: Any) -> None:  # noqa: ANN401
     """Measure a calibration again on a few frames and say how far the camera has drifted.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tofcorr.cli.shared import LazyGroup, config_options, out_option
-from tofcorr.files import ReplacedFile
+from tofcorr.files import REPLACED_FILE
 from tofcorr.importing.command_line import intrinsics_options, number_list, option, take_intrinsics
 from tofcorr.importing.registry import IMPORTERS
 
@@ -41,7 +41,7 @@ _GUESS = "A guess of the camera's pose on the tool; else the tool's axes are the
 @option("--start", _START, **_POSE)
 @option("--start-distance", "To the wall there, metres; else the middle.", type=float)
 @option("--hand-eye", _GUESS, **_POSE)
-@out_option("CSV file of poses; an older one is replaced.", ReplacedFile())
+@out_option("CSV file of poses; an older one is replaced.", REPLACED_FILE)
 def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None:  # noqa: ANN401
     """Write tool poses that determine the hand-eye transform and the model best.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import torch
-from pydantic import AfterValidator, InstanceOf, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, InstanceOf, TypeAdapter
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
@@ -88,6 +88,10 @@ class _ModuleFile(CalibrationExtras):
     state: dict[str, Annotated[InstanceOf[Tensor], AfterValidator(_numbers)]]
 
 
+# report.json has null where there is no number.
+_Millimetres = Annotated[float, BeforeValidator(lambda one: math.nan if one is None else one)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ErrorMM:
     """Distances of points to their planes, millimetres; NaN without frames.
@@ -97,8 +101,8 @@ class ErrorMM:
         rms: Root mean square distance.
     """
 
-    mean_abs: float
-    rms: float
+    mean_abs: _Millimetres
+    rms: _Millimetres
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -145,14 +149,10 @@ class FitReport:
     def of(cls, told: Mapping[str, Any]) -> "FitReport":
         """Return the summary of what a training says of itself, the content of report.json."""
         half = "test" if told["frames"]["test"] else "train"
-        errors = {
-            stage: {name: math.nan if one is None else one for name, one in halves[half].items()}
-            for stage, halves in told["error_mm"].items()
-        }
         values = {
             **told,
             **told["hand_eye"],
-            **errors,
+            **{stage: halves[half] for stage, halves in told["error_mm"].items()},
             "held_out": half == "test",
             "train_frames": told["frames"]["train"],
             "test_frames": told["frames"]["test"],

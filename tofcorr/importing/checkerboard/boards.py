@@ -9,6 +9,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import compress
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import cv2
@@ -478,16 +479,14 @@ def calibrate(
         if most == 0 or all(map(np.array_equal, inliers, chosen)):
             break
         chosen, most = inliers, most - 1
-    keep = [
-        i
-        for i, error in enumerate(errors)
-        if (error[np.isfinite(error)] <= limit).mean() >= _SMALLEST_SHARE_OF_CORNERS
-    ]
-    if len(keep) == len(corner_sets):
+    shares = [(error[np.isfinite(error)] <= limit).mean() for error in errors]
+    fits = [share >= _SMALLEST_SHARE_OF_CORNERS for share in shares]
+    if all(fits):
         return camera, about
-    if len(keep) < _FEWEST_VIEWS:
-        raise CalibrationDataError(f"only {len(keep)} views fit one camera. Is the board flat?")
-    return _solve([corner_sets[i] for i in keep], [chosen[i] for i in keep], board, size)[:2]
+    if sum(fits) < _FEWEST_VIEWS:
+        raise CalibrationDataError(f"only {sum(fits)} views fit one camera. Is the board flat?")
+    corners, used = (list(compress(every, fits)) for every in (corner_sets, chosen))
+    return _solve(corners, used, board, size)[:2]
 
 
 def calibration_warning(camera: CameraIntrinsics, about: dict[str, Any]) -> str:
@@ -526,18 +525,17 @@ def _solve(
     if not (sound and sane.all()) or tilt < _SMALLEST_TILT_DEG:
         said = f"the board's tilts vary by {tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed)"
         raise CalibrationDataError(f"{said}; tilt it about both axes, or give the intrinsics.")
-    errors = [
-        np.linalg.norm(
-            cv2.projectPoints(points, turn, move, matrix, distortion)[0][:, 0] - own, axis=1
-        )
-        for own, turn, move in zip(corner_sets, rotations, translations, strict=True)
-    ]
     camera = CameraIntrinsics(
         width=size[0],
         height=size[1],
         matrix=tuple(map(tuple, matrix.tolist())),  # type: ignore[arg-type]
         distortion=tuple(distortion.tolist()),
     )
+    places = zip(corner_sets, rotations, translations, strict=True)
+    errors = [
+        np.linalg.norm(_project(points, camera, turn, move)[0] - own, axis=1)
+        for own, turn, move in places
+    ]
     seen = sum(int(np.isfinite(corners).all(axis=1).sum()) for corners in corner_sets)
     about = {
         "reprojection_rms_px": float(rms),
