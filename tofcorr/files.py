@@ -39,7 +39,8 @@ _LOG = logging.getLogger("tofcorr")
 _OURS = re.compile(
     r"\.(?:.+\.)?tofcorr-[0-9a-f]{8}\.part[^/]*|tofcorr-scratch-[0-9a-f]{8}", re.DOTALL
 )
-_BEGUN: dict[Path, Callable[[Path], object]] = {}
+_OfPath = Callable[[Path], object]
+_BEGUN: dict[Path, _OfPath] = {}
 """How to remove each file and folder that this process has begun, in the order of their making."""
 
 
@@ -199,9 +200,8 @@ def refuse_existing(path: Path) -> None:
     """
     _refuse_name(path, CalibrationDataError)
     if os.path.lexists(path):
-        raise CalibrationDataError(
-            f"{path}: exists already and is not overwritten; remove it or choose another name."
-        )
+        said = "exists already and is not overwritten; remove it or choose another name"
+        raise CalibrationDataError(f"{path}: {said}.")
 
 
 def file_to_replace(path: Path, kind: Kind) -> Path:
@@ -232,15 +232,12 @@ def file_to_replace(path: Path, kind: Kind) -> Path:
 def _refuse_name(path: Path, kind: Kind) -> None:
     """Refuse the name of an output that messages, logs and YAML cannot show."""
     if any(map(is_control, str(path))):
-        raise kind(
-            f"{path}: the name holds a control character, or is not text; choose another one."
-        )
+        said = "the name holds a control character, or is not text; choose another one"
+        raise kind(f"{path}: {said}.")
 
 
 @contextmanager
-def _begun(
-    path: Path, make: Callable[[], object], undo: Callable[[Path], object]
-) -> Iterator[None]:
+def _begun(path: Path, make: Callable[[], object], undo: _OfPath) -> Iterator[None]:
     """Make something, and undo it after the block, or when the program is stopped."""
     _BEGUN[path] = undo
     try:
@@ -435,9 +432,7 @@ class NewPath(click.Path):
         name: What the help calls it.
     """
 
-    def __init__(
-        self, refuse: Callable[[Path], object] = refuse_existing, name: str = "path"
-    ) -> None:
+    def __init__(self, refuse: _OfPath = refuse_existing, name: str = "path") -> None:
         super().__init__(path_type=Path)
         self._refuse, self.name = refuse, name
 

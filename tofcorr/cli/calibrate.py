@@ -82,12 +82,10 @@ def train_command(
 @config_options(_EVALUATION, "evaluate", "The models and how they are compared", "seed=1", "paper")
 @recording_option("Images: one row of the tables; may be given several times.", many=True)
 @out_option("Folder of the report; must be new.")
-@option("--device", "Where to compute; overrides the configuration.")
 @force_option
 def evaluate_command(
     options: "EvaluationOptions",
     recordings: tuple[Path, ...],
-    device: str | None,
     **given: Any,  # noqa: ANN401
 ) -> None:
     """Compare models on held-out images, in the paper's two tables.
@@ -100,8 +98,6 @@ def evaluate_command(
     """
     from tofcorr.comparison.evaluate import evaluate
 
-    if device:
-        options = options.model_copy(update={"device": device})
     click.echo(repr(evaluate(recordings, options, tell=partial(click.echo, err=True), **given)))
     click.echo(f"\nWritten to {given['out']}.")
 

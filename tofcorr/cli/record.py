@@ -1,7 +1,5 @@
 """The commands before there is a recording: propose poses, import what a robot recorded."""
 
-import csv
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -86,15 +84,12 @@ def _table(plan: "PosePlan", start: "np.ndarray") -> str:
     """Return the poses as CSV: world_from_tool, metres and quaternion, and what the camera sees."""
     from scipy.spatial.transform import Rotation
 
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    columns = ("tx", "ty", "tz", "qx", "qy", "qz", "qw", "distance_m", "tilt_deg", "roll_deg")
-    writer.writerow(columns)
+    lines = ["tx,ty,tz,qx,qy,qz,qw,distance_m,tilt_deg,roll_deg"]
     for pose, described in zip(start @ plan.start_from_tool.numpy(), plan.described, strict=True):
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
         numbers = [f"{value:.7f}" for value in (*pose[:3, 3], *quaternion)]
-        writer.writerow([*numbers, *(f"{value:.3f}" for value in described.tolist())])
-    return text.getvalue()
+        lines.append(",".join([*numbers, *(f"{value:.3f}" for value in described.tolist())]))
+    return "\n".join(lines) + "\n"
 
 
 @click.group(

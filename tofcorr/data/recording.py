@@ -418,9 +418,5 @@ def frame_conditions(table: FrameTable) -> Tensor:
 
 def planes_in_tool(recording: Recording) -> tuple[Tensor, Tensor]:
     """Return the target's plane in the tool frame: normals (N, 3), offsets (N,), float64."""
-    table = recording.frames
-    return plane_in_frame(
-        torch.from_numpy(table.normal_world),
-        torch.from_numpy(table.offset),
-        torch.from_numpy(table.world_from_tool),
-    )
+    names = "normal_world", "offset", "world_from_tool"
+    return plane_in_frame(*(torch.from_numpy(getattr(recording.frames, name)) for name in names))

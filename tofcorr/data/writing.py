@@ -220,8 +220,6 @@ class RecordingWriter:
         else:
             rows = table_text(self._rows)
             (folder / TABLE_FILE).write_text(rows, encoding="utf-8", newline="")
-        if self._num_frames == 0:
-            raise CalibrationDataError(f"{self.path}: a recording of no frame.")
         try:
             # Images were checked when they were appended.
             Recording.open(folder, check_contents=False)
@@ -284,9 +282,8 @@ def write_corrected(
     num_returns = num_valid = 0
     by = f"tofcorr {__version__}"
     with RecordingWriter.like(path, recording, corrected_by=by) as writer, torch.inference_mode():
-        for depth, amplitude, on_target, corrected, kept in _frames(
-            corrector, recording, chunk_pixels
-        ):
+        frames = _frames(corrector, recording, chunk_pixels)
+        for depth, amplitude, on_target, corrected, kept in frames:
             for i, frame in enumerate(corrected):
                 strength = None if amplitude is None else amplitude[i]
                 writer.append(frame, amplitude=strength, mask=kept[i])

@@ -338,9 +338,8 @@ class DepthCorrection(FrameCorrection):
             return cls._from_run(path)
         refuse_damaged(path, "a calibration or a module that tofcorr wrote")
         with zipfile.ZipFile(path) as archive:
-            is_scripted = any("/code/" in name for name in archive.namelist())
-        if is_scripted:
-            raise CalibrationDataError(f"{path}: holds nothing to fit: use torch.jit.load.")
+            if any("/code/" in name for name in archive.namelist()):
+                raise CalibrationDataError(f"{path}: holds nothing to fit: use torch.jit.load.")
         values = read_values(path, FORMAT)
         if values is None:
             return cls._from_calibration(load_calibration(path), None)
@@ -477,11 +476,8 @@ class DepthCorrection(FrameCorrection):
         """Build a module of a calibration; without options, with those that it says."""
         if options is None:
             residual = None if state.residual is None else {"network": state.residual.options}
-            options = TrainingOptions(
-                name=state.name,
-                model=state.error_model,
-                residual=residual,  # type: ignore[arg-type]
-            )
+            given = {"name": state.name, "model": state.error_model, "residual": residual}
+            options = TrainingOptions.model_validate(given)
         terms = options.model_copy(update={"model": state.error_model})
         module = cls(state.camera, terms, ranges=state.domain)
         module.options = options
@@ -511,12 +507,12 @@ def resolve_terms(terms: Terms) -> TrainingOptions:
     Raises:
         ConfigError: There is no such configuration, or a value is not allowed.
     """
-    if isinstance(terms, ErrorModelOptions):
-        return TrainingOptions(name=_name(terms), model=terms)
     if isinstance(terms, Sequence) and not isinstance(terms, str):
         given = [dict(term) if isinstance(term, Mapping) else term.to_mapping() for term in terms]
-        model = ErrorModelOptions.from_mapping({"terms": given}, "terms")
-        return TrainingOptions(name=_name(model), model=model)
+        terms = ErrorModelOptions.from_mapping({"terms": given}, "terms")
+    if isinstance(terms, ErrorModelOptions):
+        name = " + ".join(term.kind for term in terms.terms) or "constant"
+        return TrainingOptions(name=name, model=terms)
     return resolve_options(TrainingOptions, terms)
 
 
@@ -548,7 +544,3 @@ def open_dataset(recordings: Recordings, camera: CameraIntrinsics) -> Dataset:
         said = f"is of the camera {found}, the module was built for {camera}"
         raise CalibrationDataError(f"{dataset.first.path}: {said}: build one of recording.camera.")
     return dataset
-
-
-def _name(model: ErrorModelOptions) -> str:
-    return " + ".join(term.kind for term in model.terms) or "constant"

@@ -48,7 +48,7 @@ from tofcorr.importing.run import (
     camera_mapping,
     run_import,
 )
-from tofcorr.options import Options
+from tofcorr.options import Options, PositiveNumber
 
 _FEWEST_PIXELS = 50
 """Fewest board pixels with depth; a fifth of all board pixels must have it, too."""
@@ -71,8 +71,6 @@ _DEGENERACY = (
 )
 
 _SAME_VIEW = "are the two images of the same view?"
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class CheckerboardOptions(Options):
@@ -98,10 +96,10 @@ class CheckerboardOptions(Options):
     board: AnyBoard
     coding: DepthCoding = DepthCoding(invalid=())
     depth_kind: DepthKind = "z"
-    saturation_counts: Positive | None = 65535.0
+    saturation_counts: PositiveNumber | None = 65535.0
     margin_squares: Annotated[float, Field(gt=-1.0, le=2.0)] = 0.0
-    max_reprojection_px: Positive = 0.5
-    modulation_frequency: Positive | None = None
+    max_reprojection_px: PositiveNumber = 0.5
+    modulation_frequency: PositiveNumber | None = None
 
 
 class BoardView(NamedTuple):
