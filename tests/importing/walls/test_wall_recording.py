@@ -49,7 +49,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Imported:
 def test_planes_off_all_walls_that_no_mistake_explains_are_warned_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    undone = [("the columns mirrored", 300.0)]
+    undone = [("the columns mirrored", 300.0, 1.0)]
     monkeypatch.setattr(PosedImport, "_mistakes_undone", lambda *_: iter(undone))
     (warning,) = import_room(tmp_path / "walls", 16, 0.2).report["warnings"]
     assert "images show a wall, and planes are off by" in warning
