@@ -24,7 +24,7 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.observations import effect_inputs, observe
 from tofcorr.diagnosis.sums.study import absorbed_share
 from tofcorr.errors import CalibrationDataError
-from tofcorr.options import load_options
+from tofcorr.options import resolve_options
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.effects.base import EffectInputs
 from tofcorr.simulation.options import SimulatorOptions
@@ -42,7 +42,7 @@ MOVING = {
 
 def simulator_options(seed: int, effect: str) -> SimulatorOptions:
     """Return the simulator of a case, without its effects."""
-    values = load_options(SimulatorOptions, CONFIG).to_mapping()
+    values = resolve_options(SimulatorOptions, CONFIG).to_mapping()
     if effect in NEED_MOTION:
         values = {k: v | MOVING[k] if k in MOVING else v for k, v in values.items()}
     return SimulatorOptions.from_mapping(values | {"seed": seed}, str(CONFIG))

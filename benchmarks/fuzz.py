@@ -58,7 +58,7 @@ from tofcorr.importing.images import read_array, read_grey
 from tofcorr.importing.intrinsics import read_intrinsics
 from tofcorr.importing.pose_files import read_poses
 from tofcorr.importing.run import RefusedViewError
-from tofcorr.options import Options, load_options, resolve_options, shipped_names
+from tofcorr.options import Options, resolve_options, shipped_names
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 from tofcorr.simulation.options import SimulatorOptions
@@ -360,7 +360,7 @@ def archives(made: Path) -> list[Target]:
 
 
 def _simulated(path: Path) -> object:
-    options = load_options(SimulatorOptions, path)
+    options = resolve_options(SimulatorOptions, path)
     robot, camera = options.robot, options.camera
     frames = sum(shot.poses for shot in options.shots) + robot.repeat_poses * robot.repeat_frames
     if frames > 60 or camera.width * camera.height > 1000:  # only read, not run
@@ -397,7 +397,7 @@ def configurations(made: Path) -> list[Target]:
             # All keys with their defaults, so that those that no file names are changed too.
             file = f"{cls.config_folder}_{name}.yaml"
             content = dumped(file, resolve_options(cls, name).to_mapping())
-            found.append(Target(file, content, partial(load_options, cls), 2))
+            found.append(Target(file, content, partial(resolve_options, cls), 2))
     return found
 
 

@@ -82,7 +82,8 @@ _ALL = (
     Condition(*_BODY, column_rank=2),
     Condition("ambient", "ambient", "counts", "background light", "ambient", column_rank=4),
 )
-CONDITIONS: tuple[str, ...] = tuple(condition.name for condition in _ALL)
+_BY_NAME = {each.name: each for each in _ALL}
+CONDITIONS: tuple[str, ...] = tuple(_BY_NAME)
 """Names of the conditions, in the order of every conditions tensor."""
 
 OPTIONAL_CONDITIONS: tuple[Condition, ...] = tuple(
@@ -98,6 +99,3 @@ def condition(name: str) -> Condition:
         KeyError: There is no such condition.
     """
     return _BY_NAME[name]
-
-
-_BY_NAME = {each.name: each for each in _ALL}

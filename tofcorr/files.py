@@ -39,7 +39,8 @@ _LOG = logging.getLogger("tofcorr")
 _OURS = re.compile(
     r"\.(?:.+\.)?tofcorr-[0-9a-f]{8}\.part[^/]*|tofcorr-scratch-[0-9a-f]{8}", re.DOTALL
 )
-_BEGUN: dict[Path, Callable[[Path], object]] = {}
+_OfPath = Callable[[Path], object]
+_BEGUN: dict[Path, _OfPath] = {}
 """How to remove each file and folder that this process has begun, in the order of their making."""
 
 
@@ -199,9 +200,8 @@ def refuse_existing(path: Path) -> None:
     """
     _refuse_name(path, CalibrationDataError)
     if os.path.lexists(path):
-        raise CalibrationDataError(
-            f"{path}: exists already and is not overwritten; remove it or choose another name."
-        )
+        said = "exists already and is not overwritten; remove it or choose another name"
+        raise CalibrationDataError(f"{path}: {said}.")
 
 
 def file_to_replace(path: Path, kind: Kind) -> Path:
@@ -232,15 +232,12 @@ def file_to_replace(path: Path, kind: Kind) -> Path:
 def _refuse_name(path: Path, kind: Kind) -> None:
     """Refuse the name of an output that messages, logs and YAML cannot show."""
     if any(map(is_control, str(path))):
-        raise kind(
-            f"{path}: the name holds a control character, or is not text; choose another one."
-        )
+        said = "the name holds a control character, or is not text; choose another one"
+        raise kind(f"{path}: {said}.")
 
 
 @contextmanager
-def _begun(
-    path: Path, make: Callable[[], object], undo: Callable[[Path], object]
-) -> Iterator[None]:
+def _begun(path: Path, make: Callable[[], object], undo: _OfPath) -> Iterator[None]:
     """Make something, and undo it after the block, or when the program is stopped."""
     _BEGUN[path] = undo
     try:
@@ -428,24 +425,23 @@ def _digest(archive: zipfile.ZipFile) -> str:
 
 
 class NewPath(click.Path):
-    """The name of a folder or file that a command makes anew; nothing may be there yet."""
+    """The name of a folder or file that a command makes anew; nothing may be there yet.
 
-    refuse: Callable[[Path], object] = staticmethod(refuse_existing)
-    called = "path"
+    Args:
+        refuse: Raises CalibrationDataError or ExportError for a path that cannot be written.
+        name: What the help calls it.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, refuse: _OfPath = refuse_existing, name: str = "path") -> None:
         super().__init__(path_type=Path)
-        self.name = self.called
+        self._refuse, self.name = refuse, name
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        """Return the path; raise CalibrationDataError or ExportError if it cannot be written."""
+        """Return the path, if it can be written."""
         path = Path(str(super().convert(value, param, ctx)))
-        self.refuse(path)
+        self._refuse(path)
         return path
 
 
-class ReplacedFile(NewPath):
-    """The name of a file that a command writes; an older one is replaced."""
-
-    called = "file"
-    refuse = staticmethod(partial(file_to_replace, kind=ExportError))
+REPLACED_FILE = NewPath(partial(file_to_replace, kind=ExportError), "file")
+"""The name of a file that a command writes; an older one is replaced."""

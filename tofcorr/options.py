@@ -317,15 +317,6 @@ def _size(node: yaml.Node, sizes: dict[int, int], where: str) -> int:
     return size
 
 
-def load_options(cls: type[OptionsT], path: Path | str) -> OptionsT:
-    """Read `path` as YAML and check it against the options class `cls`.
-
-    Raises:
-        ConfigError: The file cannot be read, or does not fit `cls`.
-    """
-    return cls.from_mapping(read_mapping(Path(path)), str(path))
-
-
 def resolve_options(
     cls: type[OptionsT],
     config: str | Path | Mapping[str, Any] | Options,
@@ -338,17 +329,28 @@ def resolve_options(
         config: The name of a shipped configuration (`"ea"`) or a file, if text; a file, if a
             `Path`; otherwise keys and values, or options of `cls`.
         changes: `dotted.key=value`, such as `solver.max_iterations=30` or
-            `model.terms.0.degree=4`; values are YAML.
+            `model.terms.0.degree=4`; values are YAML, and an entry of a list is named by its index
+            from zero.
 
     Raises:
-        ConfigError: No such configuration, an unknown key, or a value that is not allowed.
+        ConfigError: No such configuration, an unknown key, a value that is not allowed, or a
+            change of another form or that leads into a value that has no entries.
     """
     if isinstance(config, cls) and not changes:
         return config
     values, where = _values_of(cls, config)
+    defaults = values
     if changes:
         where += " with " + one_line(", ".join(changes))
-        values = apply_changes(values, changes, _with_defaults(cls, values))
+        # For a change that leads into a mapping or list that `values` leaves out.
+        defaults = _with_defaults(cls, values)
+    for change in changes:
+        key, equals, text = change.partition("=")
+        names = key.split(".")
+        shown = f"'{one_line(change)}'"
+        if not equals or not all(names):
+            raise ConfigError(f"{shown}: expected KEY=VALUE, such as solver.max_iterations=30.")
+        values = _replaced(values, defaults, names, parse_yaml(text, shown))
     return cls.from_mapping(values, where)
 
 
@@ -373,31 +375,6 @@ def _with_defaults(cls: type[Options], values: Mapping[str, Any]) -> Mapping[str
         return cls.from_mapping(values, "").to_mapping()
     except ConfigError:
         return values
-
-
-def apply_changes(
-    values: Mapping[str, Any], changes: Iterable[str], defaults: Mapping[str, Any]
-) -> Any:  # noqa: ANN401 - YAML may hold anything
-    """Return `values` with single entries replaced; whether a key exists is not checked here.
-
-    Args:
-        values: Keys and values, as YAML gives them; not modified.
-        changes: `dotted.key=value`; the value is YAML, and an entry of a list is named by its
-            index from zero.
-        defaults: All keys with their defaults, for a change that leads into a mapping or list that
-            `values` leaves out.
-
-    Raises:
-        ConfigError: A change is not of this form, or leads into a value that has no entries.
-    """
-    for change in changes:
-        key, equals, text = change.partition("=")
-        names = key.split(".")
-        shown = f"'{one_line(change)}'"
-        if not equals or not all(names):
-            raise ConfigError(f"{shown}: expected KEY=VALUE, such as solver.max_iterations=30.")
-        values = _replaced(values, defaults, names, parse_yaml(text, shown))
-    return values
 
 
 def _replaced(here: Any, default: Any, names: list[str], value: object, above: str = "") -> Any:  # noqa: ANN401 - any YAML value
@@ -433,11 +410,6 @@ def configs_folder() -> Path:
     package = Path(__file__).resolve().parent
     inside = package / "configs"
     return inside if inside.is_dir() else package.parent / "configs"
-
-
-def shipped_folders() -> list[str]:
-    """Return the folders of shipped configurations: `train`, `evaluate`, ..."""
-    return sorted(path.name for path in configs_folder().glob("*") if path.is_dir())
 
 
 def shipped_names(folder: str) -> list[str]:

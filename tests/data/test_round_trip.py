@@ -88,12 +88,7 @@ def test_what_is_optional_may_be_left_out_and_is_none(tmp_path: Path) -> None:
     assert not (tmp_path / "bare" / "truth").exists()
 
 
-def test_truth_is_written_apart_whole_or_frame_by_frame(tmp_path: Path, folder: Path) -> None:
-    path = write_small_recording(
-        tmp_path / "first", truth={"distance": np.arange(3.0), "sensor": {"gain": 2.0}}
-    )
-    np.testing.assert_array_equal(np.load(path / "truth" / "distance.npy"), [0.0, 1.0, 2.0])
-    assert yaml.safe_load((path / "truth" / "sensor.yaml").read_text()) == {"gain": 2.0}
+def test_truth_is_written_apart(tmp_path: Path, folder: Path) -> None:
     copy = copied(Recording.open(folder), tmp_path / "copy")
     truth = np.load(copy.path / "truth" / "distance.npy")
     np.testing.assert_array_equal(truth, 2.0 * copy.depth)

@@ -20,7 +20,7 @@ from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.errors import CalibrationDataError
-from tofcorr.options import load_options
+from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 
@@ -59,7 +59,7 @@ def beside_pixels(nothing_missing: Recording) -> Callable[[str], Study]:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The demo recording with 12 poses."""
-    values = load_options(SimulatorOptions, DEMO).to_mapping()
+    values = resolve_options(SimulatorOptions, DEMO).to_mapping()
     shots = [{"target": "white", "poses": 5}, {"target": "checkerboard", "poses": 7}]
     path = tmp_path_factory.mktemp("demo") / "demo"
     simulate(SimulatorOptions.from_mapping(values | {"shots": shots}, "test"), path)

@@ -21,7 +21,7 @@ from tofcorr.diagnosis.report.figures import FIGURES, all_figures
 from tofcorr.diagnosis.report.result import DiagnosisResult, write_report
 from tofcorr.diagnosis.report.words import table_of_stages
 from tofcorr.observables.figures import drawings
-from tofcorr.options import load_options
+from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 
@@ -91,7 +91,7 @@ def test_the_page_needs_nothing_else(report: Path) -> None:
 
 
 def test_the_simulator_written_runs_and_repeats_the_effect(report: Path, tmp_path: Path) -> None:
-    options = load_options(SimulatorOptions, report / "simulator_with_effects.yaml")
+    options = resolve_options(SimulatorOptions, report / "simulator_with_effects.yaml")
     assert [effect["name"] for effect in options.effects] == ["integration_time"]
     simulate(options, tmp_path / "again", num_frames=3)
     assert Recording.open(tmp_path / "again").num_frames == 3
@@ -173,7 +173,7 @@ def test_the_command_writes_the_report_and_finds_what_the_function_finds(
 
 def test_the_shipped_configuration_is_what_happens_without_one() -> None:
     shipped = Path(__file__).parents[2] / "configs" / "diagnose" / "default.yaml"
-    assert load_options(DiagnosisOptions, shipped) == DiagnosisOptions()
+    assert resolve_options(DiagnosisOptions, shipped) == DiagnosisOptions()
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from docs.pages import PAGES, title
 from docs.shell import parsed, tofcorr_commands
 
 from tofcorr.cli.shared import ConfigName
-from tofcorr.files import NewPath, ReplacedFile
+from tofcorr.files import NewPath
 from tofcorr.options import shipped_names
 
 COMMANDS = [(page, line) for page in PAGES for line in tofcorr_commands(page)]
@@ -21,7 +21,7 @@ def files_need_not_exist(monkeypatch: pytest.MonkeyPatch) -> None:
     def convert(_: click.Path, value: str, *__: object) -> Path:
         return Path(value)
 
-    for kind in (click.Path, NewPath, ReplacedFile):
+    for kind in (click.Path, NewPath):
         monkeypatch.setattr(kind, "convert", convert)
 
 

@@ -9,7 +9,7 @@ import yaml
 from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.errors import ConfigError
-from tofcorr.options import Options, load_options, resolve_options, shipped_names
+from tofcorr.options import Options, resolve_options, shipped_names
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.training.calibration import TrainingOptions
 
@@ -26,7 +26,7 @@ SHIPPED = [
 @pytest.mark.parametrize(("cls", "name"), SHIPPED)
 def test_name_file_mapping_and_options_mean_the_same(cls: type[Options], name: str) -> None:
     path = CONFIGS / cls.config_folder / f"{name}.yaml"
-    expected = load_options(cls, path)
+    expected = resolve_options(cls, path)
     mapping = yaml.safe_load(path.read_text(encoding="utf-8"))
     for config in (name, str(path), path, mapping, expected):
         assert resolve_options(cls, config) == expected

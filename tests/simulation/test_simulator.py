@@ -11,7 +11,7 @@ from simulation.small import IMPERFECT, expected_frames, files_in, planned, smal
 
 from tofcorr.data.recording import iterate_frames
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
-from tofcorr.options import load_options
+from tofcorr.options import resolve_options
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.signal import demodulate, distance_from_phase
@@ -20,7 +20,7 @@ from tofcorr.simulation.simulator import SensorPipeline, simulate
 
 def test_the_same_options_give_the_same_bytes_those_in_truth_too(tmp_path: Path) -> None:
     simulate(small(sensor=IMPERFECT, seed=7, write_raw=True), tmp_path / "a")
-    simulate(load_options(SimulatorOptions, tmp_path / "a/truth/options.yaml"), tmp_path / "b")
+    simulate(resolve_options(SimulatorOptions, tmp_path / "a/truth/options.yaml"), tmp_path / "b")
     simulate(small(sensor=IMPERFECT, seed=8, write_raw=True), tmp_path / "c")
     first, same, other = (files_in(tmp_path / name) for name in "abc")
     assert first == same

@@ -15,7 +15,7 @@ from tofcorr.cli.shared import (
     recording_option,
     run_option,
 )
-from tofcorr.files import NewPath, ReplacedFile
+from tofcorr.files import REPLACED_FILE, NewPath
 
 if TYPE_CHECKING:
     from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
@@ -82,12 +82,10 @@ def train_command(
 @config_options(_EVALUATION, "evaluate", "The models and how they are compared", "seed=1", "paper")
 @recording_option("Images: one row of the tables; may be given several times.", many=True)
 @out_option("Folder of the report; must be new.")
-@option("--device", "Where to compute; overrides the configuration.")
 @force_option
 def evaluate_command(
     options: "EvaluationOptions",
     recordings: tuple[Path, ...],
-    device: str | None,
     **given: Any,  # noqa: ANN401
 ) -> None:
     """Compare models on held-out images, in the paper's two tables.
@@ -100,8 +98,6 @@ def evaluate_command(
     """
     from tofcorr.comparison.evaluate import evaluate
 
-    if device:
-        options = options.model_copy(update={"device": device})
     click.echo(repr(evaluate(recordings, options, tell=partial(click.echo, err=True), **given)))
     click.echo(f"\nWritten to {given['out']}.")
 
@@ -129,7 +125,7 @@ def select_command(options: "SelectionOptions", recordings: tuple[Path, ...], **
 @recording_option("A few frames of any wall.", many=True)
 @option("--wall", _WALL, default="per_image", type=click.Choice(["per_image", "one", "recorded"]))
 @option("--threshold-mm", _DRIFTED, default=5.0)
-@option("--out", "JSON file to write.", type=ReplacedFile())
+@option("--out", "JSON file to write.", type=REPLACED_FILE)
 @force_option
 def check_command(run: Path, recordings: tuple[Path, ...], **given: Any) -> None:  # noqa: ANN401
     """Measure a calibration again on a few frames and say how far the camera has drifted.

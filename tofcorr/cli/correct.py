@@ -12,7 +12,7 @@ import click
 from tofcorr.cli.shared import FOLDER, option, out_option, recording_option, run_option
 from tofcorr.correction.export.registry import FORMATS
 from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
-from tofcorr.files import NewPath, ReplacedFile
+from tofcorr.files import REPLACED_FILE, NewPath
 
 if TYPE_CHECKING:
     from tofcorr.correction.metadata import CorrectorMetadata
@@ -103,7 +103,7 @@ def _refuse_another_camera(
 @click.command()
 @run_option
 @option("--format", _FORMATS, "name", required=True, type=click.Choice(list(FORMATS)))
-@out_option("File to write; an older one is replaced.", ReplacedFile())
+@out_option("File to write; an older one is replaced.", REPLACED_FILE)
 @option("--device", "What pt2 is compiled for: cpu or cuda.", default="cpu")
 def export_command(run: Path, name: str, out: Path, device: str) -> None:
     """Write the corrector of a run, once it agrees with the calibration, or the camera's pose.

@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import MutableMapping
+from collections.abc import MutableMapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -152,34 +152,30 @@ def configs_command(name: str | None) -> None:
     have one of the same name, write FOLDER/NAME, such as train/ea. To edit one, save it to a file:
     tofcorr configs ea > mine.yaml
     """
-    from tofcorr.options import configs_folder, shipped_folders, shipped_names
-
-    folders = shipped_folders()
-    if name is not None and name not in folders:
-        click.echo(_file(name).read_text(encoding="utf-8"), nl=False)
-        return
-    listings = []
-    for folder in folders if name is None else [name]:
-        names = shipped_names(folder)
-        width = max(map(len, names), default=0)
-        texts = [(configs_folder() / folder / f"{one}.yaml").read_text("utf-8") for one in names]
-        lines = [text.partition("\n")[0].removeprefix("#").strip() for text in texts]
-        listed = (f"  {one:<{width}}  {line}" for one, line in zip(names, lines, strict=True))
-        listings.append("\n".join([f"{folder}:", *listed]))
-    click.echo("\n\n".join(listings))
-
-
-def _file(name: str) -> Path:
-    """Return the shipped file of a name, with or without its folder."""
     from tofcorr.errors import ConfigError
-    from tofcorr.options import configs_folder, did_you_mean, shipped_folders, shipped_names
+    from tofcorr.options import configs_folder, did_you_mean
 
-    every = [f"{folder}/{one}" for folder in shipped_folders() for one in shipped_names(folder)]
-    matches = [one for one in every if name in (one, one.partition("/")[2])]
+    files = sorted(configs_folder().glob("*/*.yaml"))
+    every = {f"{file.parent.name}/{file.stem}": file for file in files}
+    folders = dict.fromkeys(file.parent.name for file in files)
+    if name is None or name in folders:
+        listed = [_listing(folder, files) for folder in folders if name in (None, folder)]
+        click.echo("\n\n".join(listed))
+        return
+    matches = [one for one, file in every.items() if name in (one, file.stem)]
     if len(matches) > 1:
         raise ConfigError(f"'{name}' stands for {' and '.join(matches)}; name one of them.")
     if not matches:
-        known = [*every, *(one.partition("/")[2] for one in every)]
-        said = f"no configuration '{name}' is shipped.{did_you_mean(name, known)}"
-        raise ConfigError(f"{said} List: tofcorr configs")
-    return configs_folder() / f"{matches[0]}.yaml"
+        hint = did_you_mean(name, [*every, *(file.stem for file in files)])
+        raise ConfigError(f"no configuration '{name}' is shipped.{hint} List: tofcorr configs")
+    click.echo(every[matches[0]].read_text(encoding="utf-8"), nl=False)
+
+
+def _listing(folder: str, files: Sequence[Path]) -> str:
+    """Return the names of a folder's configurations, each with its first line."""
+    own = [file for file in files if file.parent.name == folder]
+    width = max(len(file.stem) for file in own)
+    texts = [file.read_text(encoding="utf-8").partition("\n")[0] for file in own]
+    lines = [text.removeprefix("#").strip() for text in texts]
+    listed = (f"  {one.stem:<{width}}  {line}" for one, line in zip(own, lines, strict=True))
+    return "\n".join([f"{folder}:", *listed])

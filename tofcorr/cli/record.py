@@ -1,14 +1,12 @@
 """The commands before there is a recording: propose poses, import what a robot recorded."""
 
-import csv
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from tofcorr.cli.shared import LazyGroup, config_options, out_option
-from tofcorr.files import ReplacedFile
+from tofcorr.files import REPLACED_FILE
 from tofcorr.importing.command_line import intrinsics_options, number_list, option, take_intrinsics
 from tofcorr.importing.registry import IMPORTERS
 
@@ -41,7 +39,7 @@ _GUESS = "A guess of the camera's pose on the tool; else the tool's axes are the
 @option("--start", _START, **_POSE)
 @option("--start-distance", "To the wall there, metres; else the middle.", type=float)
 @option("--hand-eye", _GUESS, **_POSE)
-@out_option("CSV file of poses; an older one is replaced.", ReplacedFile())
+@out_option("CSV file of poses; an older one is replaced.", REPLACED_FILE)
 def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None:  # noqa: ANN401
     """Write tool poses that determine the hand-eye transform and the model best.
 
@@ -86,15 +84,12 @@ def _table(plan: "PosePlan", start: "np.ndarray") -> str:
     """Return the poses as CSV: world_from_tool, metres and quaternion, and what the camera sees."""
     from scipy.spatial.transform import Rotation
 
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    columns = ("tx", "ty", "tz", "qx", "qy", "qz", "qw", "distance_m", "tilt_deg", "roll_deg")
-    writer.writerow(columns)
+    lines = ["tx,ty,tz,qx,qy,qz,qw,distance_m,tilt_deg,roll_deg"]
     for pose, described in zip(start @ plan.start_from_tool.numpy(), plan.described, strict=True):
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
         numbers = [f"{value:.7f}" for value in (*pose[:3, 3], *quaternion)]
-        writer.writerow([*numbers, *(f"{value:.3f}" for value in described.tolist())])
-    return text.getvalue()
+        lines.append(",".join([*numbers, *(f"{value:.3f}" for value in described.tolist())]))
+    return "\n".join(lines) + "\n"
 
 
 @click.group(

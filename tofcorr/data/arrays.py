@@ -71,10 +71,8 @@ class ImageArray:
         for place in np.argwhere(wrong)[:1]:
             frame, *sample, row, column = place
             where = [f"frame {indices[frame]}", *(f"A{k}" for k in sample)]
-            raise CalibrationDataError(
-                f"{self.file(folder)}: {', '.join(where)}, row {row}, column {column}: "
-                f"{frames[tuple(place)]:.6g}; {self.expected}."
-            )
+            said = f"row {row}, column {column}: {frames[tuple(place)]:.6g}; {self.expected}"
+            raise CalibrationDataError(f"{self.file(folder)}: {', '.join(where)}, {said}.")
 
 
 _DISTANCE = "expected metres; NaN or zero where there was no return"

@@ -1,6 +1,6 @@
 """One recording folder: header, images opened memory-mapped and checked, frames in batches."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -48,19 +48,13 @@ def read_header(path: Path) -> Header:
         CalibrationDataError: The file is missing or breaks the format; the message names the key.
     """
     values = read_mapping(path, CalibrationDataError)
-    _refuse_misspelt(values, path)
-    return Header.from_mapping(values, str(path), CalibrationDataError)
-
-
-def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
-    """Refuse an unknown key that resembles a known key which is missing."""
     absent = [key for key in Header.model_fields if key not in values]
-    for key in values:
-        close = get_close_matches(str(key), absent, n=1, cutoff=0.8)
-        if key not in Header.model_fields and close:
-            raise CalibrationDataError(
-                f"{path}: '{key}' is not a known key. Did you mean '{close[0]}'?"
-            )
+    for key in values.keys() - Header.model_fields.keys():
+        # Keys of other tools are allowed, unless one resembles a known key which is missing.
+        for close in get_close_matches(str(key), absent, n=1, cutoff=0.8):
+            said = f"'{key}' is not a known key. Did you mean '{close}'?"
+            raise CalibrationDataError(f"{path}: {said}")
+    return Header.from_mapping(values, str(path), CalibrationDataError)
 
 
 STANDSTILL = 5e-5
@@ -207,9 +201,8 @@ class Recording:
         if name in COLUMN_OF:
             empty = value == "" if name == "pose_id" else np.isnan(value)
             for frame in np.flatnonzero(empty)[:1]:
-                raise CalibrationDataError(
-                    f"{self._where(name)} is empty for frame {frame}; {needed_by} needs it."
-                )
+                where = f"{self._where(name)} is empty for frame {frame}"
+                raise CalibrationDataError(f"{where}; {needed_by} needs it.")
         return value
 
     def _where(self, name: str) -> str:
@@ -225,10 +218,8 @@ class Recording:
         for name in present:
             count = len(getattr(self, name))
             if count != self.num_frames:
-                file = self.path / f"{name}.npy"
-                raise CalibrationDataError(
-                    f"{file}: has {count} frames; frames.csv has {self.num_frames} rows."
-                )
+                said = f"has {count} frames; frames.csv has {self.num_frames} rows"
+                raise CalibrationDataError(f"{self.path / name}.npy: {said}.")
         for name in present if contents else ():
             pixels, every = self.camera.height * self.camera.width, np.arange(self.num_frames)
             for indices in frame_chunks(every, pixels, CHUNK_PIXELS):
@@ -427,9 +418,5 @@ def frame_conditions(table: FrameTable) -> Tensor:
 
 def planes_in_tool(recording: Recording) -> tuple[Tensor, Tensor]:
     """Return the target's plane in the tool frame: normals (N, 3), offsets (N,), float64."""
-    table = recording.frames
-    return plane_in_frame(
-        torch.from_numpy(table.normal_world),
-        torch.from_numpy(table.offset),
-        torch.from_numpy(table.world_from_tool),
-    )
+    names = "normal_world", "offset", "world_from_tool"
+    return plane_in_frame(*(torch.from_numpy(getattr(recording.frames, name)) for name in names))

@@ -107,7 +107,8 @@ def read_table(path: Path) -> FrameTable:
     needed = [*REQUIRED_COLUMNS, *(COVARIANCE if has_covariance else ())]
     missing = [name for name in needed if name not in cells]
     if missing:
-        raise CalibrationDataError(f"{path}: column {_names(missing)} is missing.")
+        listed = ", ".join(map(repr, missing))
+        raise CalibrationDataError(f"{path}: column {listed} is missing.")
     if not cells["frame"]:
         raise CalibrationDataError(f"{path}: a recording of no frame.")
     for frame, (cell, name) in enumerate(zip(cells["frame"], cells["target"], strict=True)):
@@ -237,9 +238,9 @@ def _read_cells(path: Path) -> dict[str, list[str]]:
     names = [name.strip() for name in lines[0]]
     if len(names) == 1 and ";" in names[0]:
         raise CalibrationDataError(f"{path}: columns are separated by ';'; commas are needed.")
-    doubled = sorted({name for name in names if name and names.count(name) > 1})
-    if doubled:
-        raise CalibrationDataError(f"{path}: column {_names(doubled)} appears twice.")
+    for name in names:
+        if name and names.count(name) > 1:
+            raise CalibrationDataError(f"{path}: column '{name}' appears twice.")
     for frame, line in enumerate(lines[1:]):
         if len(line) != len(names):
             raise CalibrationDataError(f"{path}: frame {frame}: {len(line)} of {len(names)} cells.")
@@ -272,10 +273,5 @@ def _number(cell: str) -> float:
 
 def _wrong(path: Path, frame: int, column: str, expected: str, got: str) -> CalibrationDataError:
     shown = repr(got[:40]) if got else "an empty cell"
-    return CalibrationDataError(
-        f"{path}: frame {frame}, column '{column}': expected {expected}, got {shown}."
-    )
-
-
-def _names(columns: Sequence[str]) -> str:
-    return ", ".join(f"'{column}'" for column in columns)
+    said = f"expected {expected}, got {shown}"
+    return CalibrationDataError(f"{path}: frame {frame}, column '{column}': {said}.")

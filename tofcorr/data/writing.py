@@ -151,15 +151,12 @@ class RecordingWriter:
             self._rows.append(row)
         self._num_frames += 1
 
-    def add_truth(self, name: str, value: np.ndarray | Mapping[str, Any]) -> None:
-        """Write `truth/NAME.npy` (an array) or `truth/NAME.yaml` (keys and values)."""
+    def add_truth(self, name: str, value: Mapping[str, Any]) -> None:
+        """Write `truth/NAME.yaml`, keys and values."""
         folder = self._folder / "truth"
         with writing_to(self.path):
             folder.mkdir(exist_ok=True)
-            if isinstance(value, Mapping):
-                (folder / f"{name}.yaml").write_text(dump_yaml(value), encoding="utf-8")
-            else:
-                np.save(folder / f"{name}.npy", np.asarray(value), allow_pickle=False)
+            (folder / f"{name}.yaml").write_text(dump_yaml(value), encoding="utf-8")
 
     def __enter__(self) -> Self:
         """Return the writer."""
@@ -223,8 +220,6 @@ class RecordingWriter:
         else:
             rows = table_text(self._rows)
             (folder / TABLE_FILE).write_text(rows, encoding="utf-8", newline="")
-        if self._num_frames == 0:
-            raise CalibrationDataError(f"{self.path}: a recording of no frame.")
         try:
             # Images were checked when they were appended.
             Recording.open(folder, check_contents=False)
@@ -237,14 +232,12 @@ def write_recording(
     path: Path | str,
     *,
     rows: FrameTable | Iterable[FrameRow],
-    truth: Mapping[str, np.ndarray | Mapping[str, Any]] | None = None,
     **given: Any,  # noqa: ANN401 - as for RecordingWriter
 ) -> None:
     """Write a recording whose arrays are in memory or memory-mapped.
 
-    The first axis of each array (`depth`, `amplitude`, `mask`, `raw`) is the frame. `truth` goes to
-    `truth/`, arrays as `.npy` and mappings as `.yaml`. The other arguments and the errors are those
-    of `RecordingWriter`.
+    The first axis of each array (`depth`, `amplitude`, `mask`, `raw`) is the frame. The
+    other arguments and the errors are those of `RecordingWriter`.
     """
     rows = rows.rows() if isinstance(rows, FrameTable) else list(rows)
     images = {name: given.pop(name, None) for name in IMAGE_ARRAYS}
@@ -255,8 +248,6 @@ def write_recording(
     with RecordingWriter(path, **given) as writer:
         for frame, row in enumerate(rows):
             writer.append(row=row, **{name: array[frame] for name, array in images.items()})
-        for name, value in (truth or {}).items():
-            writer.add_truth(name, value)
 
 
 Corrector = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -291,9 +282,8 @@ def write_corrected(
     num_returns = num_valid = 0
     by = f"tofcorr {__version__}"
     with RecordingWriter.like(path, recording, corrected_by=by) as writer, torch.inference_mode():
-        for depth, amplitude, on_target, corrected, kept in _frames(
-            corrector, recording, chunk_pixels
-        ):
+        frames = _frames(corrector, recording, chunk_pixels)
+        for depth, amplitude, on_target, corrected, kept in frames:
             for i, frame in enumerate(corrected):
                 strength = None if amplitude is None else amplitude[i]
                 writer.append(frame, amplitude=strength, mask=kept[i])
@@ -340,10 +330,9 @@ def _frames(
         corrected depth; where the correction is valid on the target: each of shape (B, H, W).
     """
     if recording.corrected_by is not None:
-        raise CalibrationDataError(
-            f"{recording.path}: its depth was corrected already, by {recording.corrected_by}; "
-            "correct the recording that it was made from."
-        )
+        said = f"its depth was corrected already, by {recording.corrected_by}"
+        advice = "correct the recording that it was made from"
+        raise CalibrationDataError(f"{recording.path}: {said}; {advice}.")
     with bar(recording.num_frames, "correcting") as advance:
         pixels, every = recording.depth[0].size, np.arange(recording.num_frames)
         for chunk in frame_chunks(every, pixels, most):

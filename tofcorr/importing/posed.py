@@ -8,7 +8,7 @@ whether one of them explains it.
 import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -133,7 +133,7 @@ class PosedImport:
             findings={
                 "paired_by": chosen.paired_by,
                 "stops": len(np.unique(chosen.stop[chosen.stop >= 0])),
-                "lag": None if lag is None else lag.to_mapping(),
+                "lag": lag and asdict(lag),
                 **found.to_mapping(),
             },
             warnings=[

@@ -54,11 +54,6 @@ class Lag:
     standard_error: float = 0.0
     correlation: float = float("nan")
 
-    def to_mapping(self) -> dict[str, float]:
-        """Return what `import.json` says of the lag."""
-        digits = {"seconds": 5, "standard_error": 5, "correlation": 3}
-        return {name: round(getattr(self, name), most) for name, most in digits.items()}
-
 
 def pair(
     names: Sequence[str],

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import torch
-from pydantic import AfterValidator, InstanceOf, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, InstanceOf, TypeAdapter
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
@@ -33,7 +33,7 @@ from tofcorr.errors import CalibrationDataError, ConfigError, ExportError, State
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
-from tofcorr.options import load_options, one_line, resolve_options
+from tofcorr.options import one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Frames, Recordings, covered_domain, opened
 from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.judgement import report_text
@@ -88,6 +88,10 @@ class _ModuleFile(CalibrationExtras):
     state: dict[str, Annotated[InstanceOf[Tensor], AfterValidator(_numbers)]]
 
 
+# report.json has null where there is no number.
+_Millimetres = Annotated[float, BeforeValidator(lambda one: math.nan if one is None else one)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class ErrorMM:
     """Distances of points to their planes, millimetres; NaN without frames.
@@ -97,8 +101,8 @@ class ErrorMM:
         rms: Root mean square distance.
     """
 
-    mean_abs: float
-    rms: float
+    mean_abs: _Millimetres
+    rms: _Millimetres
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -145,14 +149,10 @@ class FitReport:
     def of(cls, told: Mapping[str, Any]) -> "FitReport":
         """Return the summary of what a training says of itself, the content of report.json."""
         half = "test" if told["frames"]["test"] else "train"
-        errors = {
-            stage: {name: math.nan if one is None else one for name, one in halves[half].items()}
-            for stage, halves in told["error_mm"].items()
-        }
         values = {
             **told,
             **told["hand_eye"],
-            **errors,
+            **{stage: halves[half] for stage, halves in told["error_mm"].items()},
             "held_out": half == "test",
             "train_frames": told["frames"]["train"],
             "test_frames": told["frames"]["test"],
@@ -338,9 +338,8 @@ class DepthCorrection(FrameCorrection):
             return cls._from_run(path)
         refuse_damaged(path, "a calibration or a module that tofcorr wrote")
         with zipfile.ZipFile(path) as archive:
-            is_scripted = any("/code/" in name for name in archive.namelist())
-        if is_scripted:
-            raise CalibrationDataError(f"{path}: holds nothing to fit: use torch.jit.load.")
+            if any("/code/" in name for name in archive.namelist()):
+                raise CalibrationDataError(f"{path}: holds nothing to fit: use torch.jit.load.")
         values = read_values(path, FORMAT)
         if values is None:
             return cls._from_calibration(load_calibration(path), None)
@@ -465,7 +464,7 @@ class DepthCorrection(FrameCorrection):
     @classmethod
     def _from_run(cls, folder: Path) -> Self:
         config = folder / "config.yaml"
-        options = load_options(TrainingOptions, config) if config.is_file() else None
+        options = resolve_options(TrainingOptions, config) if config.is_file() else None
         state = load_calibration(folder / STATE_FILE)
         if options is not None and not state.error_model.same_coefficients(options.model):
             said = f"has other terms than {STATE_FILE} beside it. Copy it again, or remove it"
@@ -477,11 +476,8 @@ class DepthCorrection(FrameCorrection):
         """Build a module of a calibration; without options, with those that it says."""
         if options is None:
             residual = None if state.residual is None else {"network": state.residual.options}
-            options = TrainingOptions(
-                name=state.name,
-                model=state.error_model,
-                residual=residual,  # type: ignore[arg-type]
-            )
+            given = {"name": state.name, "model": state.error_model, "residual": residual}
+            options = TrainingOptions.model_validate(given)
         terms = options.model_copy(update={"model": state.error_model})
         module = cls(state.camera, terms, ranges=state.domain)
         module.options = options
@@ -511,12 +507,12 @@ def resolve_terms(terms: Terms) -> TrainingOptions:
     Raises:
         ConfigError: There is no such configuration, or a value is not allowed.
     """
-    if isinstance(terms, ErrorModelOptions):
-        return TrainingOptions(name=_name(terms), model=terms)
     if isinstance(terms, Sequence) and not isinstance(terms, str):
         given = [dict(term) if isinstance(term, Mapping) else term.to_mapping() for term in terms]
-        model = ErrorModelOptions.from_mapping({"terms": given}, "terms")
-        return TrainingOptions(name=_name(model), model=model)
+        terms = ErrorModelOptions.from_mapping({"terms": given}, "terms")
+    if isinstance(terms, ErrorModelOptions):
+        name = " + ".join(term.kind for term in terms.terms) or "constant"
+        return TrainingOptions(name=name, model=terms)
     return resolve_options(TrainingOptions, terms)
 
 
@@ -548,7 +544,3 @@ def open_dataset(recordings: Recordings, camera: CameraIntrinsics) -> Dataset:
         said = f"is of the camera {found}, the module was built for {camera}"
         raise CalibrationDataError(f"{dataset.first.path}: {said}: build one of recording.camera.")
     return dataset
-
-
-def _name(model: ErrorModelOptions) -> str:
-    return " + ".join(term.kind for term in model.terms) or "constant"

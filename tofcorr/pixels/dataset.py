@@ -167,9 +167,7 @@ class Dataset:
     ) -> Iterator[FrameBatch]:
         """Yield frames by their global numbers, in order, in batches of bounded size."""
         for recording, start, local in self.by_recording(frames):
-            for batch in iterate_frames(
-                recording, local, chunk_pixels, device=device, image_dtype=image_dtype
-            ):
+            for batch in iterate_frames(recording, local, chunk_pixels, device, image_dtype):
                 numbered = replace(batch, indices=batch.indices + start)
                 if self.exclude is not None:
                     numbered = replace(numbered, valid=batch.valid & ~self.exclude(numbered))
@@ -329,13 +327,8 @@ def covered_domain(dataset: Dataset, frames: Frames) -> Domain:
         advice = "check mask.npy, saturation_amplitude and the unit of depth.npy (metres)"
         said = f"no pixel of the {len(frames)} frames asked for is usable; {advice}"
         raise CalibrationDataError(f"{first.path}: {said}.")
-    return domain_from(
-        first.camera,
-        distance,
-        amplitude if dataset.has_amplitude else None,
-        first.modulation_frequency,
-        dataset.conditions(frames),
-    )
+    light = amplitude if dataset.has_amplitude else None, first.modulation_frequency
+    return domain_from(first.camera, distance, *light, dataset.conditions(frames))
 
 
 def domain_from(

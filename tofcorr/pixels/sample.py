@@ -96,15 +96,9 @@ def draw_pixels(dataset: Dataset, frames: Frames, number: int, seed: int) -> Fra
         for k, frame in enumerate(batch.indices.tolist()):
             usable = batch.valid[k].flatten().nonzero()[:, 0]
             chosen = usable[torch.randperm(len(usable), generator=generator)[:per_frame]]
-            drawn.append(
-                (
-                    torch.full_like(chosen, place_of[frame]),
-                    rays[chosen],
-                    batch.normal_tool[k].expand(len(chosen), 3),
-                    batch.offset_tool[k].expand(len(chosen)),
-                    *pixels_of_image(batch, k, chosen),
-                )
-            )
+            count, own = len(chosen), torch.full_like(chosen, place_of[frame])
+            plane = batch.normal_tool[k].expand(count, 3), batch.offset_tool[k].expand(count)
+            drawn.append((own, rays[chosen], *plane, *pixels_of_image(batch, k, chosen)))
     own, ray, normal, offset, *pixels = (torch.cat(column) for column in zip(*drawn, strict=True))
     return FramePixels(own, Pixels(*pixels), ray, normal, offset)
 
@@ -224,9 +218,8 @@ def estimate_noise(dataset: Dataset, frames: Frames) -> DistanceNoise:
     _, group, count = np.unique(poses, return_inverse=True, return_counts=True)
     repeated = frames[count[group] > 1]
     if len(repeated):
-        parts = [
-            _repeat_differences(dataset, frames[group == k]) for k in np.flatnonzero(count > 1)
-        ]
+        sets = (frames[group == k] for k in np.flatnonzero(count > 1))
+        parts = [_repeat_differences(dataset, own) for own in sets]
     else:
         camera = dataset.first.camera
         # Two million pixels, in eight images at least: more would hardly change the result.

@@ -335,9 +335,7 @@ class SensorModel(DescribedModule):
         if self.dropouts is not None:
             light = frames.amplitude.detach()
             if noise:
-                drawn = torch.rand(
-                    light.shape, generator=generator, dtype=light.dtype, device=light.device
-                )
+                drawn = torch.empty_like(light).uniform_(generator=generator)
                 valid = valid & (drawn >= self.dropouts.probability(light))
             saturated = self.dropouts.saturated(light)
             # float16 ends at 65504, below the level of a camera that counts to 65535.
@@ -380,9 +378,7 @@ class SensorModel(DescribedModule):
         conditions = with_means(known, self.base.mean_conditions)
         error = self.base(at.distance, frames.amplitude, conditions)
         if of_frame is None:
-            of_frame = self.effects.frame_shift(
-                known, len(frames.distance), self.eye.ray_directions
-            )
+            of_frame = self.effects.frame_shift(known, len(frames.distance), frames.rays)
         error = error + of_frame.to(error.dtype).reshape(-1, 1, 1)
         error = error + self.effects.shift(Group.DELAY, at)
         at = replace(at, distance=at.distance + error) if one_by_one else frames

@@ -11,7 +11,7 @@ import numpy as np
 from importing.posed_scene import unit_rays
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.checkerboard.boards import Board
+from tofcorr.importing.checkerboard.boards import Board, BoardPose
 
 BOARD = Board(columns=5, rows=7, square_length=0.03)
 LENS = (0.06, -0.12, 0.0008, -0.0005, 0.02)
@@ -100,6 +100,11 @@ def infrared(where: Placement, camera: CameraIntrinsics = CAMERA) -> np.ndarray:
         total += _reflectivity(squares) * -cosine / distance**2
     blurred = cv2.GaussianBlur(total / _SAMPLES, (0, 0), _LENS_BLUR_PIXELS)
     return np.clip(3000 * blurred + 60, 0, 65535).astype(np.uint16)
+
+
+def centre(pose: BoardPose, board: Board) -> np.ndarray:
+    """Where a pose puts the centre of a board, camera frame."""
+    return pose.rotation @ board.corner_points().mean(axis=0) + pose.translation
 
 
 def _centred(sample: int) -> float:

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from importing.checkerboard.rendered_board import BOARD, CAMERA, placement, project
+from importing.checkerboard.rendered_board import BOARD, CAMERA, centre, placement, project
 
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.boards import Board, poses_of
 
-LARGER = replace(BOARD, square_length=1.01 * BOARD.square_length)
+LARGER = BOARD.model_copy(update={"square_length": 1.01 * BOARD.square_length})
 (FX, _, CX), (_, FY, CY), LAST = CAMERA.matrix
 LONGER = replace(CAMERA, matrix=((1.01 * FX, 0.0, CX), (0.0, 1.01 * FY, CY), LAST))
 
@@ -29,5 +29,5 @@ def test_larger_squares_and_a_longer_focal_length_hide_in_the_slope(
         given = poses_of(corners, BOARD, CAMERA, every)[0]
         other = poses_of(corners, board, camera, every)[0]
         assert other.reprojection_rms < (1 + worse) * given.reprojection_rms
-        farther = other.centre(board)[2] / given.centre(BOARD)[2]
+        farther = centre(other, board)[2] / centre(given, BOARD)[2]
         assert farther == pytest.approx(1.01, abs=exact)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from importing.checkerboard.rendered_board import angle_deg
+from importing.checkerboard.rendered_board import BOARD, angle_deg
 from optional import present
 
 from tofcorr.data.recording import Recording
@@ -20,9 +20,8 @@ INTRINSICS = intrinsics_from_numbers(
 
 def import_views(real_data: Path, wildcard: str, out: Path) -> tuple[dict[str, Any], Recording]:
     depth, infrared = f"{wildcard}_sync_depth.png", f"{wildcard}_sync_ir.png"
-    board = {"board_columns": 5, "board_rows": 7, "square_length": 0.03}
-    names = {"infrared_pattern": infrared, "amplitude_pattern": infrared}
-    options = CheckerboardOptions(depth_pattern=depth, **names, **board)
+    names = {"depth_pattern": depth, "infrared_pattern": infrared, "amplitude_pattern": infrared}
+    options = CheckerboardOptions.from_mapping({**names, "board": BOARD}, "")
     folder = real_data / "kinect2_checkerboard"
     report = import_checkerboard(folder, out, options, INTRINSICS)
     return report, Recording.open(out)

@@ -1,5 +1,6 @@
 """The board's plane follows from its corners, and doubtful ones are refused."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -8,6 +9,7 @@ from importing.checkerboard.rendered_board import (
     BOARD,
     CAMERA,
     Placement,
+    centre,
     placement,
     project,
     rays,
@@ -62,8 +64,9 @@ def test_the_stated_deviation_of_the_plane_is_the_scatter_under_noise() -> None:
     for _ in range(150):
         corners = project(where) + generator.normal(0, 0.08, (35, 2))
         pose = estimate_pose(corners, BOARD, CAMERA, 1.0)
-        placed.append(where.normal @ pose.centre(BOARD) + where.offset)
-        stated.append(pose.plane_deviation)
+        at = np.append(centre(pose, BOARD), 1.0)
+        placed.append(at @ [*where.normal, where.offset])
+        stated.append(math.sqrt(at @ pose.plane_covariance @ at))
     # A standard deviation from 150 draws is known to 6 %: three of those on either side.
     assert np.std(placed) == pytest.approx(np.mean(stated), rel=0.2)
 

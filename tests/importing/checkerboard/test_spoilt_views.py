@@ -80,7 +80,7 @@ def leave_two(folder: Path) -> None:
         (spoil_all_eight_bit, {}, r"none of 6 views can be imported.*8 bits"),
         (leave_two, {"board": "6x8"}, "but one of 5x7: count inner corners, not squares"),
         (leave, {"board": "5by7"}, "expected 5x7"),
-        (leave, {"board": "2x7"}, "board_columns"),
+        (leave, {"board": "2x7"}, "columns"),
         (leave, {"lens": ()}, "in one way: --intrinsics FILE"),
         (leave, {"lens": (*FOCAL, "--calibrate")}, "in one way"),
         (leave, {"lens": ("--focal", "290")}, "--focal and --centre go together"),

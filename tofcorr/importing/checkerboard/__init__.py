@@ -63,8 +63,7 @@ def import_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, A
     from tofcorr.importing.checkerboard.importer import CheckerboardOptions, import_checkerboard
 
     intrinsics = take_intrinsics(given)
-    given |= read_board(given.pop("board"))
-    given["square_length"] = given.pop("square_mm") / 1000
+    given["board"] = read_board(given["board"]) | {"square_length": given["square_mm"] / 1000}
     own = {key: given[key] for key in CheckerboardOptions.model_fields if key in given}
     options = CheckerboardOptions.from_mapping(own, command_name())
     return import_checkerboard(folder, out, options, intrinsics)

@@ -8,16 +8,19 @@ OpenCV estimates the camera intrinsics and the pose of the board from them.
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from itertools import compress
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.robust import LEVEL, f_tail, sigma_from_mad
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.run import RefusedViewError
+from tofcorr.options import Options, PositiveNumber
 
 _FEWEST_CORNERS = 8
 """Fewer points of a board (no unit) do not place it: two tags, or a fifth of a small ChArUco board.
@@ -43,11 +46,11 @@ stops somewhere along a valley; so the root mean square tilt of the boards must 
 focal length and deviation be sane. Set by hand."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FlatBoard(ABC):
+class FlatBoard(Options, ABC):
     """A flat board with points that can be found in an image.
 
     Attributes:
+        kind: What the recording calls the target.
         columns: Inner corners, squares or tags in a row, as the kind counts them.
         rows: The same in a column.
         square_length: Side of a square or tag, metres: all points scale with it.
@@ -56,17 +59,16 @@ class FlatBoard(ABC):
             of a square or tag; 0: the kind's usual one.
     """
 
-    kind: ClassVar[str]
-    """What the recording calls the target."""
     called: ClassVar[str] = "{size}"
     """What messages call the board."""
     usual: ClassVar[tuple[str, float]] = ("", 0.0)
     """Dictionary and share of markers where none are given."""
-    columns: int
-    rows: int
-    square_length: float
+    kind: Any
+    columns: Annotated[int, Field(ge=3)]
+    rows: Annotated[int, Field(ge=3)]
+    square_length: PositiveNumber
     dictionary: str = ""
-    share: float = 0.0
+    share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.0
 
     @abstractmethod
     def corner_points(self) -> np.ndarray:
@@ -112,7 +114,7 @@ class FlatBoard(ABC):
 class Board(FlatBoard):
     """A checkerboard, described as OpenCV does: inner corners (where four squares meet)."""
 
-    kind = "checkerboard"
+    kind: Literal["checkerboard"] = "checkerboard"
 
     def corner_points(self) -> np.ndarray:
         """Return the inner corners in the board's frame, row by row, shape (N, 3), metres.
@@ -145,7 +147,7 @@ class Board(FlatBoard):
         """Return the board of one row and column fewer; OpenCV refuses fewer than 3 corners."""
         if min(self.columns, self.rows) <= 3:
             return None
-        return replace(self, columns=self.columns - 1, rows=self.rows - 1)
+        return self.model_copy(update={"columns": self.columns - 1, "rows": self.rows - 1})
 
     def _refined(self, image: np.ndarray, corners: np.ndarray) -> np.ndarray:
         """Refine corners on the logarithm of the counts around the board.
@@ -166,7 +168,7 @@ class Board(FlatBoard):
 class CharucoBoard(FlatBoard):
     """A ChArUco board: a checkerboard whose white squares carry markers, found even in part."""
 
-    kind = "charuco"
+    kind: Literal["charuco"] = "charuco"
     called = "ChArUco {size} ({dictionary})"
     usual = ("4X4_50", 0.75)
 
@@ -200,7 +202,7 @@ class AprilGrid(FlatBoard):
     The side of a tag is its black border's.
     """
 
-    kind = "apriltag"
+    kind: Literal["apriltag"] = "apriltag"
     called = "{size} tags ({dictionary})"
     usual = ("APRILTAG_36H11", 0.3)
 
@@ -235,28 +237,29 @@ class AprilGrid(FlatBoard):
         return found.reshape(-1, 2)
 
 
-BOARDS = {board.kind: board for board in (Board, CharucoBoard, AprilGrid)}
-"""The kinds of boards."""
+AnyBoard = Annotated[Board | CharucoBoard | AprilGrid, Field(discriminator="kind")]
+"""A board of a kind that is known."""
 
 
-def read_board(text: str) -> dict[str, Any]:
+def read_board(text: str) -> dict[str, str]:
     """Read `5x7`, `charuco:5x7:4X4_50:0.75` or `apriltag:6x6:APRILTAG_36H11:0.3`.
 
     That is `KIND:COLUMNSxROWS:DICTIONARY:SHARE`, of which the last two may be missing, or
     `COLUMNSxROWS` of a checkerboard.
 
     Returns:
-        The options of `CheckerboardOptions` that describe the board; None: the kind's usual value.
+        The fields of a board that the text gives.
 
     Raises:
         ConfigError: The text is something else.
     """
-    number, word = r"(\d+)", "(?::([^:]+))?"
-    match = re.fullmatch(f"(?:({'|'.join(BOARDS)}):)?{number}[xX]{number}{word}{word}", text)
-    if match is None or (match[1] in (None, Board.kind) and match[4] is not None):
+    kind, number, word = "(?:(checkerboard|charuco|apriltag):)?", r"(\d+)", "(?::([^:]+))?"
+    match = re.fullmatch(f"{kind}{number}[xX]{number}{word}{word}", text)
+    if match is None or (match[1] in (None, "checkerboard") and match[4] is not None):
         raise ConfigError(f"expected 5x7, charuco:5x7:4X4_50:0.75 or the like, got '{text[:60]}'.")
-    keys = ("board_kind", "board_columns", "board_rows", "board_dictionary", "board_share")
-    return dict(zip(keys, (match[1] or Board.kind, *match.groups()[1:]), strict=True))
+    keys = ("kind", "columns", "rows", "dictionary", "share")
+    given = zip(keys, (match[1] or "checkerboard", *match.groups()[1:]), strict=True)
+    return {key: value for key, value in given if value is not None}
 
 
 def _renderings(infrared: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
@@ -308,16 +311,14 @@ class BoardPose:
         translation: Shape (3,), metres.
         used: Which corners are used for the pose, shape (N,), bool.
         reprojection_rms: Root mean square reprojection error of the corners used, pixels.
-        plane_deviation: Standard deviation of the plane's position at the board's centre along
-            its normal, metres, propagated from the reprojection errors.
-        plane_covariance: Of n and d, shape (4, 4), propagated likewise.
+        plane_covariance: Of n and d, shape (4, 4), propagated from the reprojection errors. Errors
+            that all views share (focal length, square length) are not included.
     """
 
     rotation: np.ndarray
     translation: np.ndarray
     used: np.ndarray
     reprojection_rms: float
-    plane_deviation: float
     plane_covariance: np.ndarray
 
     def plane(self) -> tuple[np.ndarray, float]:
@@ -325,10 +326,6 @@ class BoardPose:
         normal = self.rotation[:, 2]
         offset = -float(normal @ self.translation)
         return (normal, offset) if offset > 0 else (-normal, -offset)
-
-    def centre(self, board: FlatBoard) -> np.ndarray:
-        """Return the centre of the board in the camera frame, shape (3,), metres."""
-        return self.rotation @ board.corner_points().mean(axis=0) + self.translation
 
     def distance(self, rays: np.ndarray) -> np.ndarray:
         """Return the distance along rays of shape (..., 3) at which they meet the plane, metres."""
@@ -427,7 +424,6 @@ def poses_of(
             translation=place,
             used=used,
             reprojection_rms=float(np.sqrt((errors**2).sum(axis=1).mean())),
-            plane_deviation=float(np.sqrt(rotation[:, 2] @ covariance[3:, 3:] @ rotation[:, 2])),
             plane_covariance=slope @ covariance @ slope.T,
         )
         if np.isfinite(pose.reprojection_rms):
@@ -483,16 +479,14 @@ def calibrate(
         if most == 0 or all(map(np.array_equal, inliers, chosen)):
             break
         chosen, most = inliers, most - 1
-    keep = [
-        i
-        for i, error in enumerate(errors)
-        if (error[np.isfinite(error)] <= limit).mean() >= _SMALLEST_SHARE_OF_CORNERS
-    ]
-    if len(keep) == len(corner_sets):
+    shares = [(error[np.isfinite(error)] <= limit).mean() for error in errors]
+    fits = [share >= _SMALLEST_SHARE_OF_CORNERS for share in shares]
+    if all(fits):
         return camera, about
-    if len(keep) < _FEWEST_VIEWS:
-        raise CalibrationDataError(f"only {len(keep)} views fit one camera. Is the board flat?")
-    return _solve([corner_sets[i] for i in keep], [chosen[i] for i in keep], board, size)[:2]
+    if sum(fits) < _FEWEST_VIEWS:
+        raise CalibrationDataError(f"only {sum(fits)} views fit one camera. Is the board flat?")
+    corners, used = (list(compress(every, fits)) for every in (corner_sets, chosen))
+    return _solve(corners, used, board, size)[:2]
 
 
 def calibration_warning(camera: CameraIntrinsics, about: dict[str, Any]) -> str:
@@ -531,18 +525,17 @@ def _solve(
     if not (sound and sane.all()) or tilt < _SMALLEST_TILT_DEG:
         said = f"the board's tilts vary by {tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed)"
         raise CalibrationDataError(f"{said}; tilt it about both axes, or give the intrinsics.")
-    errors = [
-        np.linalg.norm(
-            cv2.projectPoints(points, turn, move, matrix, distortion)[0][:, 0] - own, axis=1
-        )
-        for own, turn, move in zip(corner_sets, rotations, translations, strict=True)
-    ]
     camera = CameraIntrinsics(
         width=size[0],
         height=size[1],
         matrix=tuple(map(tuple, matrix.tolist())),  # type: ignore[arg-type]
         distortion=tuple(distortion.tolist()),
     )
+    places = zip(corner_sets, rotations, translations, strict=True)
+    errors = [
+        np.linalg.norm(_project(points, camera, turn, move)[0] - own, axis=1)
+        for own, turn, move in places
+    ]
     seen = sum(int(np.isfinite(corners).all(axis=1).sum()) for corners in corner_sets)
     about = {
         "reprojection_rms_px": float(rms),

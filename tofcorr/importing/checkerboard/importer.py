@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -23,9 +23,8 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.checkerboard.boards import (
-    BOARDS,
+    AnyBoard,
     BoardPose,
-    FlatBoard,
     calibrate,
     calibration_warning,
     estimate_pose,
@@ -49,7 +48,7 @@ from tofcorr.importing.run import (
     camera_mapping,
     run_import,
 )
-from tofcorr.options import Options
+from tofcorr.options import Options, PositiveNumber
 
 _FEWEST_PIXELS = 50
 """Fewest board pixels with depth; a fifth of all board pixels must have it, too."""
@@ -73,9 +72,6 @@ _DEGENERACY = (
 
 _SAME_VIEW = "are the two images of the same view?"
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-CornerCount = Annotated[int, Field(ge=3)]
-
 
 class CheckerboardOptions(Options):
     """How to read a folder of checkerboard images.
@@ -84,13 +80,7 @@ class CheckerboardOptions(Options):
         depth_pattern: Names of the depth images, with `{view}` or wildcards.
         infrared_pattern: Names of the infrared images, in which the boards are found.
         amplitude_pattern: Names of the amplitude images; None: there are none.
-        board_kind: One of `tofcorr.importing.checkerboard.boards.BOARDS`.
-        board_columns: Inner corners in a row; squares or tags of other kinds.
-        board_rows: The same in a column.
-        board_dictionary: Of the markers; None: the kind's usual one.
-        board_share: Side of the markers, or space between tags, as a share of a side; None: the
-            kind's usual one.
-        square_length: Side of a square or tag, metres.
+        board: The board that they show.
         coding: How the numbers of the depth images are to be read.
         depth_kind: `z`: along the optical axis; `radial`: along the ray.
         saturation_counts: Infrared counts from which a pixel is saturated; None: never.
@@ -103,28 +93,13 @@ class CheckerboardOptions(Options):
     depth_pattern: str = "{view}_depth.png"
     infrared_pattern: str = "{view}_ir.png"
     amplitude_pattern: str | None = "{view}_ir.png"
-    board_kind: Literal["checkerboard", "charuco", "apriltag"] = "checkerboard"
-    board_columns: CornerCount
-    board_rows: CornerCount
-    board_dictionary: str | None = None
-    board_share: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
-    square_length: Positive
+    board: AnyBoard
     coding: DepthCoding = DepthCoding(invalid=())
     depth_kind: DepthKind = "z"
-    saturation_counts: Positive | None = 65535.0
+    saturation_counts: PositiveNumber | None = 65535.0
     margin_squares: Annotated[float, Field(gt=-1.0, le=2.0)] = 0.0
-    max_reprojection_px: Positive = 0.5
-    modulation_frequency: Positive | None = None
-
-    def board(self) -> FlatBoard:
-        """Return the board."""
-        return BOARDS[self.board_kind](
-            columns=self.board_columns,
-            rows=self.board_rows,
-            square_length=self.square_length,
-            dictionary=self.board_dictionary or "",
-            share=self.board_share or 0.0,
-        )
+    max_reprojection_px: PositiveNumber = 0.5
+    modulation_frequency: PositiveNumber | None = None
 
 
 class BoardView(NamedTuple):
@@ -135,10 +110,8 @@ class BoardView(NamedTuple):
         ratio: Median of measured over true distance.
         kind_moments: Sum over pixels of v v', shape (4, 4), metres, with v = (1, D, D (1 - cos a),
             measured minus true radial distance) and a the angle to the optical axis.
-        reported: What `import.json` says of it. `plane_sd_mm` is the standard deviation of the
-            plane's position at the board's centre, along its normal, propagated from the corners;
-            errors that all views share (focal length, square length) are not included.
-            `depth_error_mm` is the median of measured minus true depth, of the kind recorded.
+        reported: What `import.json` says of it. `depth_error_mm` is the median of measured minus
+            true depth, of the kind recorded.
     """
 
     pose: BoardPose
@@ -178,8 +151,8 @@ class BoardImport:
     def __init__(
         self, folder: Path, options: CheckerboardOptions, intrinsics: GivenIntrinsics | None
     ) -> None:
-        self._folder, self._options, self._coding = folder, options, options.coding
-        self._intrinsics, self._board = intrinsics, options.board()
+        self._options, self._coding = options, options.coding
+        self._intrinsics, self._board = intrinsics, options.board
         patterns = {"depth": options.depth_pattern, "infrared": options.infrared_pattern}
         patterns |= {"amplitude": options.amplitude_pattern} if options.amplitude_pattern else {}
         self._files, self._alone = files_of_views(folder, patterns)
@@ -279,19 +252,13 @@ class BoardImport:
             if tilt > _LARGEST_TILT_DEG:
                 raise RefusedViewError(f"depth is {tilt:.0f} degrees off the board; {_SAME_VIEW}")
         columns = np.stack([np.ones_like(true), true, true * (1.0 - cosine), errors])
-        centre, files = pose.centre(self._board), self._files[view]
-        slant = abs(float(pose.plane()[0] @ centre)) / float(np.linalg.norm(centre))
         reported = {
             "view": view,
-            "depth_file": files["depth"].relative_to(self._folder).as_posix(),
-            "infrared_file": files["infrared"].relative_to(self._folder).as_posix(),
             "reprojection_rms_px": pose.reprojection_rms,
             "corners_used": int(pose.used.sum()),
             "board_pixels": int(area.sum()),
             "usable_pixels": int(seen.sum()),
             "distance_m": float(np.median(true)),
-            "incidence_deg": float(np.degrees(np.arccos(min(slant, 1.0)))),
-            "plane_sd_mm": 1000 * pose.plane_deviation,
             "depth_error_mm": 1000 * float(np.median(errors * along)),
         }
         return BoardView(pose, float(np.median(measured / true)), columns @ columns.T, reported)

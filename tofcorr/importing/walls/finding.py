@@ -20,8 +20,6 @@ class FoundWalls:
     Attributes:
         names: `wall 1` is the one of most pixels; or what the recording called it.
         walls: Unit normal towards the camera, and d of n . x + d = 0 in metres, shape (G, 4).
-        images: How many images show each wall, shape (G,).
-        share: Share of those images' pixels that lie on it, shape (G,).
         image: The image of each view, shape (V,), increasing.
         wall: Its wall, shape (V,).
         gradient: Its plane g . x = 1 fitted in the image, camera frame, shape (V, 3); None: every
@@ -38,8 +36,6 @@ class FoundWalls:
     """Misfit from which a mistake is suspected: twice what an uncalibrated camera leaves."""
     names: list[str]
     walls: np.ndarray
-    images: np.ndarray
-    share: np.ndarray
     image: np.ndarray
     wall: np.ndarray
     gradient: np.ndarray | None
@@ -60,11 +56,9 @@ class FoundWalls:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the walls for a report."""
-        keys = ("name", "normal_world", "offset_m", "images", "share")
-        each = (self.walls[:, :3], self.walls[:, 3], self.images, self.share)
-        rows = zip(self.names, *(part.tolist() for part in each), strict=True)
+        each = zip(self.names, self.walls.tolist(), strict=True)
         return {
-            "walls": [dict(zip(keys, row, strict=True)) for row in rows],
+            "walls": [{"name": k, "normal_world": w[:3], "offset_m": w[3]} for k, w in each],
             "tool_from_camera": self.tool_from_camera.tolist(),
             "deviation_mm": self.deviation_mm,
         }
@@ -119,7 +113,6 @@ def walls_of_planes(
         support = torch.bincount(joint.wall[on_wall], planes.support[on_wall], len(joint.walls))
         joint = joint.reordered(support.argsort(descending=True, stable=True))
     called = _names(joint) if given is None else [str(name) for name in given]
-    members = [joint.wall == k for k in range(len(called))]
     views = on_wall.nonzero()[:, 0].tolist()
     views.sort(key=lambda k: (int(planes.image[k]), int(joint.wall[k])))
     deviation, far = 1000 * joint.deviation, FoundWalls.OFF_WALL_MM
@@ -127,8 +120,6 @@ def walls_of_planes(
     return FoundWalls(
         names=called,
         walls=joint.walls.numpy(),
-        images=np.array([int(own.sum()) for own in members]),
-        share=np.array([float(planes.support[own].mean()) for own in members]),
         image=planes.image[views].numpy(),
         wall=joint.wall[views].numpy(),
         gradient=None if given is not None else planes.gradient[views].numpy(),
