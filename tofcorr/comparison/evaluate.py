@@ -181,8 +181,10 @@ class EvaluationResult:
     def _views_table(self) -> Table:
         rows = []
         for one, of in product(self.sets, VIEWS):
-            errors = (one.values["half"][f"{of}_mm"][column] for column in self.options.columns)
-            cells = [f"{error[0]:.2f}" for error in errors]
+            errors = one.values["half"][f"{of}_mm"]
+            if of == VIEWS[-1] and errors == one.values["half"]["rms_z_mm"]:
+                continue  # No plane has a covariance.
+            cells = [f"{errors[column][0]:.2f}" for column in self.options.columns]
             rows.append([f"{one.name}: {of.replace('_', ' ')}", *cells])
         note = "Between views: offset and tilts of whole images, beyond any model of a pixel."
         return self._table("Parts of the half's RMS error of the z depth, mm", rows, note)

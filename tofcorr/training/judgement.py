@@ -252,7 +252,7 @@ def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) ->
 _POSE = "  {target:<14}{distance_m:6.2f} m, tilted {tilt_deg:.0f} deg, rolled by {roll_by_deg:+.0f}"
 _VIEWS = (
     "{:<8} RMS along z {rms_z:.2f}: {between_views:.2f} between views (offset and tilts of whole "
-    "images), {within_views:.2f} within; {within_prior:.2f} with planes within their covariance"
+    "images), {within_views:.2f} within"
 )
 
 
@@ -276,6 +276,8 @@ def report_text(report: Mapping[str, Any]) -> str:
     for half, own in report["views_mm"].items():
         if own["rms_z"] is not None:
             lines.append(_VIEWS.format(half.replace("test", "held out"), **own))
+            if own["within_prior"] != own["rms_z"]:  # Else no plane has a covariance.
+                lines[-1] += f"; {own['within_prior']:.2f} with planes within their covariance"
     if advice := report["advice"]:
         largest = f"{advice['sigma_mm_or_mrad']:.2f} mm (or mrad), of {advice['direction']}"
         expects = advice["worst_sigma_mm_or_mrad"]
