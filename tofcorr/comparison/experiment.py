@@ -110,7 +110,7 @@ class Experiment:
             splits = {kind: without_frames(own, left_out) for kind, own in splits.items()}
         self.splits = splits
         self.fitter = ModelFitter(dataset, self.options, left_out)
-        self.warnings = self.fitter.warnings
+        self.warnings = self.fitter.warnings  # The same list: fits to come add theirs.
         self.warnings += left_out_words(left_out)
         self.hand_eye = dict[str, list[list[float]]]()
         by_column = dict[str, dict[str, FrameErrors]]

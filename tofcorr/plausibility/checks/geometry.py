@@ -32,12 +32,7 @@ from tofcorr.plausibility.finding import (
     in_words,
     note,
 )
-from tofcorr.plausibility.linear import (
-    Estimate,
-    length_scale,
-    places_on_wall,
-    pose_drift,
-)
+from tofcorr.plausibility.linear import Estimate, length_scale, places_on_wall, pose_drift
 from tofcorr.plausibility.look import Look
 from tofcorr.plausibility.mounting import remounting
 
@@ -231,7 +226,7 @@ def _wrong_camera(found: dict[str, Estimate]) -> Finding | None:
     return Finding(severity, f"{said}: {ask}, as these are?", spoils=True, check=check)
 
 
-def _target(look: Look, shape: "dict[str, Estimate]") -> Iterator[Finding]:
+def _target(look: Look, shape: dict[str, Estimate]) -> Iterator[Finding]:
     """Judge whether the target is bent, or its rim reads wrong, by what spoils a fit."""
     curved, rim = shape["curvature"], shape["rim"]
     places = np.hypot(*places_on_wall(look.of_camera))[look.of_camera.used]
