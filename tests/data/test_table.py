@@ -106,9 +106,10 @@ def test_covariances_of_planes_survive_the_table_and_others_are_refused(tmp_path
     path.write_text(table_text([FrameRow(**plane, plane_covariance=one) for one in known]))
     np.testing.assert_array_equal(read_table(path).plane_covariance, known)
     text = path.read_text()
-    path.write_text(text.replace(",nz_d,", ",other,"))
-    with pytest.raises(CalibrationDataError, match="column 'nz_d' is missing"):
-        read_table(path)
+    for lost in ("nx_nx", "nz_d"):
+        path.write_text(text.replace(f",{lost},", ",other,"))
+        with pytest.raises(CalibrationDataError, match=f"column '{lost}' is missing"):
+            read_table(path)
     path.write_text(text.replace(repr(float(known[1, 3, 3])), "-1.0"))
     with pytest.raises(CalibrationDataError, match="frame 1: nx_nx to d_d are no covariance"):
         read_table(path)

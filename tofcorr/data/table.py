@@ -103,7 +103,7 @@ def read_table(path: Path) -> FrameTable:
             and frame.
     """
     cells = _read_cells(path)
-    has_covariance = COVARIANCE[0] in cells
+    has_covariance = not cells.keys().isdisjoint(COVARIANCE)
     needed = [*REQUIRED_COLUMNS, *(COVARIANCE if has_covariance else ())]
     missing = [name for name in needed if name not in cells]
     if missing:
