@@ -32,6 +32,7 @@ PURPOSES = {
     "correction": "calibration, runtime corrector, exports",
     "error_terms": "E = D + P + I (+ conditions), one term a file",
     "geometry": "rays, planes, rigid transforms",
+    "pages": "one dress for every page and picture",
     "conditions": "names of a frame's circumstances",
     "options": "configurations: frozen, checked",
     "files": "whole or not at all; damage is noticed",
@@ -54,7 +55,16 @@ GROUPS = {
     "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
     "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
-    "ground": ("conditions", "digits", "files", "options", "progress", "errors", "version"),
+    "ground": (
+        "pages",
+        "conditions",
+        "digits",
+        "files",
+        "options",
+        "progress",
+        "errors",
+        "version",
+    ),
 }
 _GROUP_OF = {room: group for group, rooms in GROUPS.items() for room in rooms}
 

@@ -15,8 +15,9 @@ def command(config: Path, recording: Path, out: Path) -> None:
     from matplotlib.figure import Figure
 
     import tofcorr
+    from tofcorr.pages.drawing import BLUE, RED, save_figure
     from tofcorr.pixels.sample import PixelSample
-    from tofcorr.training.figures import draw_profile, save_figure
+    from tofcorr.training.figures import draw_profile
 
     found = tofcorr.train(recording, config).calibration
     stages = {name: found.stages[name] for name in ("before", "after")}
@@ -27,7 +28,7 @@ def command(config: Path, recording: Path, out: Path) -> None:
         covariate = sample.covariate_named(name)
         x = sample.covariates[covariate]
         ends = float(np.nanmin(x)), float(np.nanmax(x))
-        for stage, colour in (("before", "tab:red"), ("after", "tab:blue")):
+        for stage, colour in (("before", RED), ("after", BLUE)):
             draw_profile(axes, x, sample.errors_mm[stage], ends, colour, stage)
         axes.axhline(0, color="0.4", linewidth=0.8)
         axes.set_xlabel(covariate)

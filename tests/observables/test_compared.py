@@ -12,7 +12,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.figures import drawings
 from tofcorr.observables.pairs import PoseSums, permutation_p, sign_flip_p
-from tofcorr.plausibility.page import WIDTH
+from tofcorr.pages.drawing import WIDTH
 
 REAL = Camera(times=2.0, threshold=120.0, filter_px=0.7, base_share=0.003, gain=0.93)
 ONES = np.ones((20, 1))

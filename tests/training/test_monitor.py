@@ -15,7 +15,6 @@ from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
-from tofcorr.training.figures import coloured
 
 
 @pytest.fixture(scope="module")
@@ -91,11 +90,6 @@ def test_curves_are_means_of_the_sampled_errors_in_bins_of_their_covariate(
     for event in events:
         inside = np.digitize(x, edges) == np.digitize(event.step / 1e3, edges)
         assert event.value == pytest.approx(error[inside].mean(), rel=1e-4, abs=1e-4)
-
-
-def test_colours_run_from_blue_to_red_and_unused_pixels_are_grey() -> None:
-    image = coloured(np.array([[-9.0, 0.0, 9.0, np.nan]]), limit=2.0)
-    assert image[0].tolist() == [[33, 102, 172], [247, 247, 247], [178, 24, 43], [190, 190, 190]]
 
 
 def test_errors_are_measured_minus_true_along_the_ray(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_figures_are_returned_and_an_unknown_covariate_is_refused(trained: Train
     for name in ("distance", "amplitude", "row", "column", "angle of incidence"):
         assert isinstance(trained.result.plot_profile(name), Figure)
     (errors,) = trained.result.plot_residuals().axes
-    assert "red too far" in errors.get_title("left")
+    assert "orange too far" in errors.get_title("left")
     with pytest.raises(CalibrationDataError, match=r"'heat'.*distance, row, column, amplitude"):
         trained.result.plot_profile("heat")
 

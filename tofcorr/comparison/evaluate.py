@@ -22,10 +22,10 @@ from tofcorr.comparison.options import (
 from tofcorr.comparison.statistics import Estimate, Table
 from tofcorr.files import staged_folder, write_json
 from tofcorr.options import dump_yaml, resolve_options
+from tofcorr.pages.drawing import save_figure
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import LOG, event_writer
-from tofcorr.training.figures import save_figure
 from tofcorr.training.report import number_or_none
 from tofcorr.version import __version__
 

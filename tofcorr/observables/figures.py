@@ -12,12 +12,14 @@ from tofcorr.observables.compare import Observables
 from tofcorr.observables.measure import LEAST_VARIANCE, DropoutMeasurement, NoiseMeasurement
 from tofcorr.observables.pairs import Interval, Pair
 from tofcorr.observables.read import log_of, quotient
-from tofcorr.plausibility.page import (
+from tofcorr.pages.drawing import (
     BLUE,
     FAINT,
     GREY,
     RED,
+    SIGNED,
     WIDTH,
+    image_map,
     line_across,
     panels,
     plain_look,
@@ -129,11 +131,8 @@ def dropout_figure(observables: Observables) -> Figure:
     highest = max(100 * float(np.nanmax(each.map)) for _, each, *_ in shown) or 1.0
     maps = parts[-1].subplots(1, len(shown), squeeze=False)[0]
     for axes, (name, dropouts, _, share) in zip(maps, shown, strict=True):
-        axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
+        image_map(axes, 100 * dropouts.map, "missing, %", (0.0, highest), "magma_r")
         axes.set_title(f"{name}: {100 * share:.2f} % missing", fontsize=9)
-        axes.set_axis_off()
-    bar = parts[-1].colorbar(maps[-1].images[0], ax=maps)
-    bar.set_label("missing, %", fontsize=9)
     return figure
 
 
@@ -168,10 +167,8 @@ def amplitude_figure(observables: Observables) -> Figure:
     shape = observables.real_dropouts.map.shape
     tiles = 100 * np.expm1(_tile_means(both.real.pixel[lit], np.log(real / sim / ratio), shape))
     limit = max(float(np.nanmax(np.abs(tiles))), 1.0)
-    image = lower.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit)
+    image_map(lower, tiles, "recording brighter, %", (-limit, limit), SIGNED)
     lower.set_title("ratio over the image, less its mean", fontsize=10)
-    lower.set_axis_off()
-    figure.colorbar(image, ax=lower).set_label("recording brighter, %")
     return figure
 
 

@@ -62,7 +62,7 @@ def inspect(
             `out` does not end in .html, exists or cannot be written.
     """
     if out is not None:
-        from tofcorr.plausibility.page import refuse_page
+        from tofcorr.pages.page import refuse_page
 
         refuse_page(Path(out))
     data = Dataset(opened(recordings))

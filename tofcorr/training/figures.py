@@ -1,6 +1,5 @@
 """Figures of a calibration: profiles of errors and frames, as numbers, as colours, and drawn."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,14 +11,6 @@ from tofcorr.training.calibration import Calibration
 if TYPE_CHECKING:  # Matplotlib takes longer to import than a short fit.
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-_COLOURS = {"before": "tab:red", "hand_eye_only": "tab:orange", "after": "tab:blue"}
-# Colours from too near to too far, of 255, in equal steps: the diverging scale of ColorBrewer
-# (RdBu). Pixels that are not used are grey, which is no colour of it.
-_SCALE = np.array(
-    [(33, 102, 172), (146, 197, 222), (247, 247, 247), (244, 165, 130), (178, 24, 43)]
-)
-
 
 Ends = tuple[float, float]
 """Range of a covariate."""
@@ -51,15 +42,6 @@ def profile(
     return (edges[1:] + edges[:-1]) / 2, mean, spread
 
 
-def coloured(image: np.ndarray, limit: float) -> np.ndarray:
-    """Return an image of errors (H, W) in colours, shape (H, W, 3), uint8; NaN is grey."""
-    place = (np.clip(image / limit, -1, 1) + 1) / 2 * (len(_SCALE) - 1)
-    known, steps = np.isfinite(image), np.arange(len(_SCALE))
-    channels = [np.interp(np.where(known, place, 0.0), steps, one) for one in _SCALE.T]
-    shown = np.where(known[..., None], np.stack(channels, axis=-1), 190)
-    return shown.round().astype(np.uint8)
-
-
 def error_picture(calibration: Calibration) -> tuple[np.ndarray, str]:
     """Return errors of some frames before, after, and after once more on a finer scale, in colours.
 
@@ -67,6 +49,8 @@ def error_picture(calibration: Calibration) -> tuple[np.ndarray, str]:
         One row a frame, from the best corrected to the worst, shape (H, W, 3), uint8; and what it
         shows, in Markdown. Pictures narrower than 600 pixels are enlarged by a whole factor.
     """
+    from tofcorr.pages.drawing import coloured
+
     data, stages, titles = calibration.data, calibration.stages, []
     gap, columns = max(data.first.camera.height // 25, 1), {"before": [], "after": []}
     for frame in frames_to_show(calibration):
@@ -84,7 +68,7 @@ def error_picture(calibration: Calibration) -> tuple[np.ndarray, str]:
     picture = np.concatenate([coloured(*one) for one in shown], axis=1)
     factor = -(-600 // picture.shape[1])
     words = (
-        "Errors along the ray: blue too near, red too far, grey not used. Left: before, up to "
+        "Errors along the ray: purple too near, orange too far, grey not used. Left: before, up to "
         f"{common:.1f} mm; middle: after; right: after, up to {own:.2f} mm. From top to bottom:\n\n"
     )
     return picture.repeat(factor, axis=0).repeat(factor, axis=1), words + "\n".join(titles)
@@ -98,45 +82,35 @@ def frames_to_show(calibration: Calibration) -> np.ndarray:
     return thinned(errors.frames[used][order], 5)
 
 
-def save_figure(figure: "Figure", path: Path) -> np.ndarray:
-    """Write a figure as PNG; return it as an image, shape (H, W, 3), uint8: it is drawn once."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    canvas = FigureCanvasAgg(figure)
-    canvas.print_png(path)
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
 def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) -> "Figure":
     """Draw mean and standard deviation of the error against one covariate.
 
-    Left: all stages. Right: after correction, fitted and held-out frames separately.
+    Above: all stages. Below: after correction, fitted and held-out frames separately.
 
     Args:
         sample: The pixels.
         covariate: One of its covariates.
         held_out: Global numbers of the frames held out; may be empty.
     """
-    from matplotlib.figure import Figure
+    from tofcorr.pages.drawing import BLUE, GREY, PALE, RED, line_across, panels
 
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    panels = figure.subplots(1, 2)
+    figure, found = panels(5, 2)
     x, last = sample.covariates[covariate], list(sample.errors_mm.values())[-1]
     ends, tested = without_strays(x), np.isin(sample.frame, held_out)
+    colours = {"before": RED, "hand_eye_only": GREY}
     for stage, error in sample.errors_mm.items():
         label = stage.replace("hand_eye", "hand-eye").replace("_", " ")
-        draw_profile(panels[0], x, error, ends, _COLOURS.get(stage, "k"), label)
-    halves = (~tested, "tab:blue", "fitted"), (tested, "tab:green", "held out")
-    for chosen, colour, label in halves:
+        draw_profile(found[0], x, error, ends, colours.get(stage, BLUE), label)
+    for chosen, colour, label in ((~tested, PALE, "fitted"), (tested, BLUE, "held out")):
         if chosen.any():
-            draw_profile(panels[1], x[chosen], last[chosen], ends, colour, label)
+            draw_profile(found[1], x[chosen], last[chosen], ends, colour, label)
     titles = "All stages: mean, and one standard deviation", "After correction"
-    for axes, title in zip(panels, titles, strict=True):
-        axes.axhline(0, color="0.4")
-        axes.set(title=title, xlabel=covariate, ylabel="error along the ray [mm]")
+    for axes, title in zip(found, titles, strict=True):
+        line_across(axes)
+        axes.set(xlabel=covariate, ylabel="error along the ray [mm]")
+        axes.set_title(title, fontsize=10)
         # The best place would be found by looking at every point.
-        axes.legend(loc="upper right", fontsize="small")
-        axes.grid(color="0.9")
+        axes.legend(loc="upper right", fontsize=9, frameon=False)
     return figure
 
 
@@ -153,7 +127,7 @@ def draw_profile(
         colour: Of line and band.
         label: Of the line.
     """
-    from tofcorr.plausibility.page import FAINT
+    from tofcorr.pages.drawing import FAINT
 
     middle, mean, spread = profile(x, error, ends)
     axes.plot(middle, mean, color=colour, label=label)

@@ -28,14 +28,27 @@ from tofcorr.diagnosis.report.words import (
 from tofcorr.diagnosis.sums.study import LEAST_LEFT, Study, absorbed_share, left_over
 from tofcorr.estimation.robust import LEVEL
 from tofcorr.observables.figures import drawings as observable_drawings
-from tofcorr.plausibility.page import BLUE, FAINT, GREY, RED, line_across, panels, plain_look
+from tofcorr.pages.drawing import (
+    BLUE,
+    FAINT,
+    GREY,
+    LIGHT,
+    PALE,
+    RED,
+    SIGNED,
+    TINT,
+    image_map,
+    line_across,
+    panels,
+    plain_look,
+)
 
 if TYPE_CHECKING:
     from tofcorr.diagnosis.report.result import DiagnosisResult
 
 STAGE_COLOURS = {"as_given": GREY, "recalibrated": RED, "with_effects": BLUE}
 """The colour of a stage in every figure."""
-_KIND_COLOURS = {"parameter": GREY, "effect": RED, "unexplained": "#bbbbbb"}
+_KIND_COLOURS = {"parameter": GREY, "effect": RED, "unexplained": LIGHT}
 
 
 def all_figures(result: "DiagnosisResult") -> dict[str, Figure]:
@@ -63,7 +76,7 @@ def stage_bars(result: "DiagnosisResult") -> Figure:
     if steps:  # The last one is the stage with the effects.
         bars[-1:] = steps
     if result.degraded is not None:
-        bars.append(("degraded frames", result.degraded.gap, "#8fbbd9"))
+        bars.append(("degraded frames", result.degraded.gap, PALE))
     label, limits = "gap, mm (root mean square, noise taken off)", (-math.inf, math.inf)
     figure, axes = _bars(bars, 1e3, label, lambda size: f"{mm(size)} mm", limits)
     floor = 1e3 * result.gap.floor
@@ -155,14 +168,11 @@ def image_maps(result: "DiagnosisResult") -> Figure:
         tiles = 1e3 * stage.tiles
         # A least limit, so that noise does not look like structure.
         limit = max(float(np.nanmax(np.abs(tiles), initial=0.0)), 0.5)
-        shown = axes.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto")
+        image_map(axes, tiles, "mean residual, mm", (-limit, limit), SIGNED)
+        axes.set_aspect("auto")
         axes.set_title(STAGE_WORDS[stage.name], color=STAGE_COLOURS[stage.name], fontsize=9)
-        axes.set_axis_off()
         rows, columns = np.nonzero(stage.tile_p_values <= LEVEL)
-        axes.plot(columns, rows, "k.", markersize=3)
-        bar = figure.colorbar(shown, ax=axes, orientation="horizontal", label="mean residual, mm")
-        bar.ax.locator_params(nbins=5)
-        plain_look(bar.ax)
+        axes.plot(columns, rows, "o", color="0.1", markersize=2)  # Dark on dark pages too.
     return figure
 
 
@@ -223,7 +233,7 @@ def absorption_map(result: "DiagnosisResult") -> Figure:
     """Draw the share of each effect that calibration absorbs, then that other effects absorb."""
     names, table = tuple(result.evidence.study.effects), absorption_table(result.evidence.study)
     figure, (axes,) = panels(5)
-    axes.set_facecolor("#f3e9e9")
+    axes.set_facecolor(TINT)
     shown = axes.imshow(table, cmap="Greys", vmin=0, vmax=1, aspect="auto")
     axes.axvline(0.5, color="white", linewidth=3)
     axes.set_xticks(range(len(names) + 1), ["calibration", *names], rotation=90)

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -303,10 +302,8 @@ def write_report(result: DiagnosisResult, folder: Path) -> None:
 
 def render(result: DiagnosisResult) -> str:
     """Return the page: one HTML file that needs nothing else."""
-    from markupsafe import Markup
-
     from tofcorr.diagnosis.report.figures import all_figures
-    from tofcorr.plausibility.page import page_text
+    from tofcorr.pages.page import page_text
 
     study, named = result.evidence.study, result.evidence.named
     filters = {
@@ -326,13 +323,11 @@ def render(result: DiagnosisResult) -> str:
         "p_of_draws": lambda p: p_words(p, LEAST_P),
         "with_digits": _with_digits,
     }
-    style = files("tofcorr.diagnosis.report").joinpath("report.css").read_text("utf-8")
     return page_text(
         "tofcorr.diagnosis.report",
         "report.html.j2",
         all_figures(result),
         filters,
-        style=Markup(style),
         **result.to_mapping(),
         result=result,
         study=study,

@@ -1,0 +1,1 @@
+"""Pages for people: one dress, one file each, nothing fetched from elsewhere."""
