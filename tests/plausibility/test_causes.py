@@ -1,6 +1,7 @@
 """No cause is named that is not there: units, turned zones, amplitudes, and lengths."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,25 @@ def test_dark_squares_that_fill_the_view_are_no_other_exposure(tmp_path: Path) -
     near = {"distance_m": [0.15, 0.4], "farthest_pixel_m": 0.8, "tilt_deg": 30.0}
     data = simulated_wall(tmp_path / "near", 1029, (("checkerboard", 24),), QUIET, robot=near)
     assert not [one for one in inspect(data.first.path).findings if one.check == "exposure"]
+
+
+@pytest.mark.parametrize(
+    ("light", "longer", "check"),
+    [(0.02, 1.0, "room"), (0.0, 1.05, "focal length"), (0.0, 1.0, None)],
+)
+def test_light_of_a_room_is_told_from_a_focal_length(
+    tmp_path: Path, light: float, longer: float, check: str | None
+) -> None:
+    # Both bend tilted walls; light of a room was headed "the focal length were 6 % shorter".
+    lit = [{"name": "multipath", "room_x0_y0": light}]
+    shots = (("white", 16), ("checkerboard", 24))
+    simulated_wall(tmp_path / "wall", 41, shots, QUIET, effects=lit)
+    parts = Parts.read(tmp_path / "wall")
+    matrix = np.diag([longer, longer, 1.0]) @ np.array(parts.header["camera"].matrix)
+    matrix[:2, 2] /= longer
+    camera = replace(parts.header["camera"], matrix=tuple(map(tuple, matrix.tolist())))
+    found = inspect(parts.changed(camera=camera).write(tmp_path / "changed")).findings
+    assert [one.check for one in found if one.severity == "doubtful"] == ([check] if check else [])
 
 
 @pytest.mark.parametrize(("robot", "camera"), [(1.03, 1.0), (1.0, 1 / 1.03), (1 / 1.05, 1.0)])

@@ -267,6 +267,8 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
         - `curvature`: of the target along two directions on it, and mixed, 1/m: its points lie that
           many metres off its plane at a metre from its middle. With it, all of the above but `bend`
           are estimated together: `left` of `kind` is what no error of a camera explains;
+        - `room`: how far a target 1 m off and seen head on reads too near, metres, by light of one
+          brightness everywhere on it; too far is negative;
         - `rim`: how far the four ends of what is seen of the target, along these directions, read
           too near, metres; it falls to a third within a tenth of the width.
     """
@@ -288,7 +290,14 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
         "bend": [(-square, zero), (zero, -square)],
     }
     blocks = {name: problem.by_moves(own, declared) for name, own in moves.items()}
-    found = {name: problem.added(block)[0] for name, block in blocks.items()}
+    # Light by way of a room, of one brightness everywhere on the target: relative to the direct
+    # light it grows with the square of the distance and with the tilt, and bends walls as a focal
+    # length does.
+    lit = np.abs(problem.cosine).clip(_GRAZING)
+    room = (problem.cosine * problem.distance**2 / lit)[..., None]
+    with_room = problem.with_columns(room)
+    found = {name: with_room.added(block)[0] for name, block in blocks.items()}
+    found["room"] = problem.added(room)[0]
     other = np.log(problem.rays[..., 2]) * (-1 if declared == "radial" else 1)
     kind = (problem.cosine * problem.distance * other)[..., None]
     s, t = places_on_wall(problem)

@@ -232,6 +232,9 @@ def _target(look: Look, shape: dict[str, Estimate]) -> Iterator[Finding]:
     places = np.hypot(*places_on_wall(look.of_camera))[look.of_camera.used]
     half_width = float(np.quantile(places, 0.9))
     sag, rising = np.abs(curved.value) * half_width**2, np.abs(rim.value)
+    # Light that comes by another way comes later.
+    (later,), problem = -shape["room"].value, look.of_camera
+    typical = float(np.median((problem.distance**2 / np.abs(problem.cosine))[problem.used]))
     if ((rising > SPOILS) & (rising > SIGMAS * rim.error)).any():
         where = f"{1e3 * float(rising.max()):.0f} mm off at one end, from wherever it is seen"
         yield doubtful(f"The target lies {where}: a second reflection? Mask it.", check="rim")
@@ -239,6 +242,11 @@ def _target(look: Look, shape: dict[str, Estimate]) -> Iterator[Finding]:
         where = f"{1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of its middle"
         said = f"The target is bent by {where}, from wherever it is seen"
         yield doubtful(f"{said}: use a flat one, or mask it.", spoils=True, check="target")
+    elif later > max(SPOILS / typical, SIGMAS * shape["room"].size_error):
+        off = f"{1e3 * later * typical:.0f} mm too far"
+        said = f"The room lights the target too (multipath): it reads {off}"
+        advice = "move it away from bright walls, or cover these"
+        yield doubtful(f"{said}, more where far or tilted; {advice}.", check="room")
 
 
 def drift(look: Look) -> Iterator[Finding]:
