@@ -58,7 +58,8 @@ def test_network_is_kept_and_helps_where_the_truth_is_outside_every_polynomial(
 ) -> None:
     assert wavy_fit.model.error.residual is not None
     assert "was kept" in str(wavy_fit.residual)
-    assert held_out(wavy, wavy_fit) < 0.7 * held_out(wavy, fitted(wavy, CORE))
+    # The waves are shorter than the radius: it must become shorter along the distance alone.
+    assert held_out(wavy, wavy_fit) < 0.2 * held_out(wavy, fitted(wavy, CORE))
 
 
 def test_network_is_dropped_where_the_core_is_the_truth(tmp_path: Path) -> None:

@@ -19,14 +19,15 @@ class ResidualNetworkOptions(DescribedOptions):
 
     Attributes:
         width: Neurons: how many places the network learns about.
-        bound_mm: The network never adds more than this.
+        bound_mm: The network never adds more than this; null: it has no bound, and is zero where
+            it has seen nothing all the same.
         radius: How far a place is felt, in half-widths of the ranges of distance, log amplitude,
-            rows and columns; a fit may stretch it. On views of a Kinect v2, 1.5 and 2 err as much.
+            rows and columns; a fit may change it along each. On a Kinect v2 1.5 and 2 err alike.
         seed: Seed of the places at the start; a fit puts them where it has seen pixels.
     """
 
     width: PositiveInt = Field(default=256, le=1024)
-    bound_mm: PositiveFloat = 20.0
+    bound_mm: PositiveFloat | None = None
     radius: PositiveFloat = 1.5
     seed: NonNegativeInt = 0
 
@@ -38,7 +39,7 @@ class ResidualNetworkOptions(DescribedOptions):
 
 
 class ResidualNetwork(DescribedModule):
-    r"""Radial functions around places that were seen: bounded, and zero far from all of them.
+    r"""Radial functions around places that were seen, zero far from all of them.
 
     .. math:: R = \Big[ f(D) f(I) \sum_k w_k\, \phi(|s (x - x_k)|) \Big]_{-b}^{b}, \qquad
         \phi(d) = (1 - d)_+^5 (5 d + 1)
@@ -46,8 +47,8 @@ class ResidualNetwork(DescribedModule):
     with :math:`x = (D, \ln I, r, c)`, all on the scale of their ranges, and reciprocal radii s.
     Wendland's function (1995) is positive definite in five dimensions and zero from 1 on: at a
     radius from every place :math:`x_k`, where the network has learnt nothing, it adds nothing.
-    The fades f do the same outside the calibrated ranges. Untrained weights w are zero, so that
-    an untrained network predicts exactly nothing.
+    The fades f do the same outside the calibrated ranges; the bound b is optional. Untrained
+    weights w are zero, so that an untrained network predicts exactly nothing.
 
     Args:
         options: Width and bound.
@@ -81,7 +82,7 @@ class ResidualNetwork(DescribedModule):
             numbers = [getattr(interval, name) for interval in intervals]
             self.register_buffer(name, torch.tensor(numbers, dtype=torch.float64))
         self.margin: float = _FADE
-        self.bound: float = options.bound_mm / 1000
+        self.bound: float = (options.bound_mm or torch.inf) / 1000
         self.width: int = options.width
         generator = torch.Generator().manual_seed(options.seed)
         places = 2 * torch.rand(options.width, 4, generator=generator, dtype=torch.float64) - 1

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.error_terms.model import ErrorModel
@@ -83,7 +83,7 @@ def with_strengths(
     penalties: Sequence[Penalty],
     moments: ImageMoments,
     start: Parameters,
-    folds: Sequence[Sequence[int]],
+    folds: Sequence[Bool[Tensor, "N"]],
 ) -> list[Penalty]:
     """Choose the strengths that are "auto" by cross-validation, one penalty after the other.
 
@@ -94,7 +94,7 @@ def with_strengths(
         penalties: Those of the model.
         moments: Of the images to fit.
         start: Where to start the fit around which the problem is linearised.
-        folds: The images held out, positions in `moments`, fold by fold.
+        folds: The images held out, masks, fold by fold.
     """
     unknown = [k for k, penalty in enumerate(penalties) if penalty.strength == "auto"]
     if not unknown:
@@ -110,9 +110,7 @@ def with_strengths(
     def held_out(tried: list[Penalty]) -> float:
         """Return the loss of the images of each fold under the fit to all others."""
         total = 0.0
-        for fold in folds:
-            test = torch.zeros(len(weights), dtype=torch.bool)
-            test[torch.as_tensor(fold, dtype=torch.long)] = True
+        for test in folds:
             kept, without = (equations.of(which).total() for which in (~test, test))
             prior = smoothness(tried, float(weights[~test].sum()), around)
             kept = kept.plus(None if prior is None else prior.equations(around))

@@ -8,6 +8,7 @@ a network must do better there on average and in the tail, in mean absolute and 
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 import torch
@@ -23,9 +24,10 @@ from tofcorr.estimation.solvers import minimise
 from tofcorr.fit.problem import Core, Problem, ResidualOptions
 from tofcorr.pixels.sample import FramePixels, draw_pixels
 
-# How many times longer the radius is along distance, log amplitude, rows and columns. Held-out runs
-# choose: an error that does not depend on an input is learnt from all of its values.
-_STRETCHES = ((1, 1, 1, 1), (1, 1, 4, 4), (1, 4, 1, 1), (1, 4, 4, 4))
+# The radius is tried shorter and longer along distance, log amplitude, and rows with columns: an
+# error that does not depend on an input is learnt from all of its values, and then the same pixels
+# show a finer curve along the others.
+_STEPS = tuple(product(((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 1)), (1 / 4, 4)))
 
 
 def fit_residual(
@@ -44,13 +46,9 @@ def fit_residual(
         The decision in one sentence; the network, fitted to all images, None if it was dropped;
         hand-eye and coefficients that go with it.
     """
-    frames = np.sort(problem.frames)
-    sample = draw_pixels(problem.dataset, frames, options.pixels, options.network.seed)
-    groups = problem.dataset.pose_groups()[frames]
-    pose = torch.from_numpy(np.unique(groups, return_inverse=True)[1])
-    number = int(pose.max()) + 1
-    folds = min(options.folds, number)
-
+    sample = draw_pixels(problem.dataset, problem.frames, options.pixels, options.network.seed)
+    pose = problem.poses()
+    folds = min(options.folds, number := int(pose.max()) + 1)
     untrained = partial(ResidualNetwork, options.network, problem.domain)
 
     def held_out(stretch: Sequence[float]) -> Tensor:
@@ -69,16 +67,18 @@ def fit_residual(
                 found[row, :, seen > 0] = (torch.stack(sums) / seen)[:, seen > 0]
         return found[:, :, found[0, 0].isfinite()]
 
-    tried = [held_out(stretch) for stretch in _STRETCHES]
-    chosen = min(range(len(tried)), key=lambda k: float(tried[k][1, 1].mean()))
-    if not gate(tried[0][1], tried[chosen][1]) < LEVEL:
-        chosen = 0
+    stretch, measured = (1.0,) * 4, held_out((1.0,) * 4)
+    for along, longer in _STEPS:
+        other = tuple(one * longer**k for one, k in zip(stretch, along, strict=True))
+        if gate(measured[1], (its := held_out(other))[1]) < LEVEL:
+            stretch, measured = other, its
     # The first is no choice; of another the probability is that of the best tried (Bonferroni).
-    p_value = min(1.0, (len(tried) if chosen else 1) * gate(*tried[chosen]))
+    tried = 1 if stretch == (1.0,) * 4 else 1 + len(_STEPS)
+    p_value = min(1.0, tried * gate(*measured))
     network, best = None, core.solution.parameters
     if options.keep == "always" or p_value < LEVEL:
-        network, best = _train(core, error, sample, untrained(_STRETCHES[chosen]), options)
-    (mean, square), (its_mean, its_square) = tried[chosen].mean(dim=2).tolist()
+        network, best = _train(core, error, sample, untrained(stretch), options)
+    (mean, square), (its_mean, its_square) = measured.mean(dim=2).tolist()
     kept = f"The residual network was {'dropped' if network is None else 'kept'}: held-out runs of"
     found = f"{1e3 * its_square**0.5:.2f} mm RMS and {1e3 * its_mean:.2f} mm mean absolute error"
     bare = f"{1e3 * square**0.5:.2f} and {1e3 * mean:.2f} without (p = {p_value:.3g})"
