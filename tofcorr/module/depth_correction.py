@@ -339,7 +339,9 @@ class DepthCorrection(FrameCorrection):
         refuse_damaged(path, "a calibration or a module that tofcorr wrote")
         with zipfile.ZipFile(path) as archive:
             if any("/code/" in name for name in archive.namelist()):
-                raise CalibrationDataError(f"{path}: holds nothing to fit: use torch.jit.load.")
+                raise CalibrationDataError(
+                    f"{path}: holds nothing to fit: use tofcorr.load_corrector."
+                )
         values = read_values(path, FORMAT)
         if values is None:
             return cls._from_calibration(load_calibration(path), None)
