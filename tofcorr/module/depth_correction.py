@@ -378,7 +378,7 @@ class DepthCorrection(FrameCorrection):
 
     def description(self) -> dict[str, Any]:
         """Return what a state must agree on to be loaded."""
-        return {"dtype": str(self.error_model.constant.dtype), **self.error_model.description()}
+        return self.error_model.description()
 
     def get_extra_state(self) -> Tensor:
         """Return description and labels as JSON in a tensor of bytes."""
@@ -392,7 +392,7 @@ class DepthCorrection(FrameCorrection):
 
     def _description_in(self, state: Tensor) -> dict[str, Any]:
         """Return the description that stands beside the labels."""
-        return decode(state)["description"]
+        return {k: v for k, v in decode(state)["description"].items() if k != "dtype"}
 
     def extra_repr(self) -> str:
         """Return the model's name, image size, depth kind and range, for printing."""
