@@ -7,12 +7,17 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from module.modules import frames, module_of, with_missing
+from kinds_of_terms import KINDS
+from module.modules import CAMERA, frames, module_of, with_missing
 from torch.func import functional_call, stack_module_state
 
+from tofcorr.errors import ConfigError, FrameError
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.rays import ray_directions
 from tofcorr.module.depth_correction import DepthCorrection
 
 TERMS = "distance_polynomial", "amplitude_polynomial", "integration_time"
@@ -95,3 +100,33 @@ def test_four_cameras_in_one_batch_are_four_modules() -> None:
     )
     expected = torch.stack([m(*one) for m, *one in zip(modules, depth, amplitude, strict=True)])
     assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_correction_of_a_crop_is_the_crop_of_the_correction(kind: str, depth_kind: Any) -> None:
+    module = module_of(kind, depth_kind=depth_kind)
+    part = module.crop(1, 2, 3, 4).crop(1, 0, 2, 4)
+    depth, amplitude = frames()
+    window = (..., slice(2, 4), slice(2, 6))
+    of_part = part(depth[window], amplitude[window])
+    assert torch.equal(of_part, module(depth, amplitude)[window])
+    expected = module.points(depth, amplitude)[..., 2:4, 2:6, :]
+    assert torch.equal(part.points(depth[window], amplitude[window]), expected)
+    assert [id(one) for one in part.parameters()] == [id(one) for one in module.parameters()]
+    rays = ray_directions(part.camera)
+    torch.testing.assert_close(part.geometry.ray_directions, rays, rtol=0, atol=1e-12)
+    with pytest.raises(ConfigError, match="this module is a crop, and shares its parameters"):
+        part.to_state()
+    with pytest.raises(FrameError, match="a crop of rows 4 to 5, columns 0 to 6: the image has 5"):
+        module.crop(4, 0, 2, 7)
+
+
+def test_pixels_of_a_binned_camera_look_between_those_of_the_camera() -> None:
+    camera = CameraIntrinsics(width=7, height=4, matrix=CAMERA.matrix)
+    rays, binned = ray_directions(camera), ray_directions(camera.bin(2))
+    places = rays[..., :2] / rays[..., 2:]
+    expected = places[:, :6].unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2))
+    torch.testing.assert_close(binned[..., :2] / binned[..., 2:], expected)
+    again = camera.resize(8, 14).resize(4, 7).matrix_tensor()
+    torch.testing.assert_close(again, camera.matrix_tensor())

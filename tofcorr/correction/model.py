@@ -3,6 +3,7 @@
 In float64 it is the reference: the runtime is folded from it, every export must agree with it.
 """
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -166,6 +167,16 @@ class CameraGeometry(nn.Module):
         self.register_buffer("ray_directions", ray_directions(camera).clone())
         self.register_buffer("radial_of_depth", torch.ones(size, dtype=torch.float64))
         self.set_depth_kind(depth_kind)
+
+    def cropped(self, top: int, left: int, camera: CameraIntrinsics) -> "CameraGeometry":
+        """Return the geometry of a part of the image; the rays are those of this one."""
+        part = copy.copy(self)
+        part._buffers = dict(self._buffers)
+        for name in ("ray_directions", "radial_of_depth"):
+            image = getattr(self, name)
+            part._buffers[name] = image[top : top + camera.height, left : left + camera.width]
+        part._buffers["matrix"] = camera.matrix_tensor().to(self.matrix)
+        return part
 
     @torch.no_grad()
     def set_depth_kind(self, depth_kind: DepthKind) -> None:
