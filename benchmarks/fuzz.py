@@ -47,7 +47,6 @@ from benchmarks.timing import write
 from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.lookup import read_lut
-from tofcorr.correction.metadata import load_corrector
 from tofcorr.correction.state import load_calibration
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -58,6 +57,7 @@ from tofcorr.importing.images import read_array, read_grey
 from tofcorr.importing.intrinsics import read_intrinsics
 from tofcorr.importing.pose_files import read_poses
 from tofcorr.importing.run import RefusedViewError
+from tofcorr.module.loading import load_corrector
 from tofcorr.options import Options, resolve_options, shipped_names
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
@@ -352,7 +352,7 @@ def archives(made: Path) -> list[Target]:
     readers: dict[str, Callable[[Path], Any]] = {
         "run/state.pt": _state,
         "module.pt": lambda path: tofcorr.DepthCorrection.load(path)(*FRAMES),
-        "run/corrector.ts": lambda path: load_corrector(path)[0](*FRAMES),
+        "run/corrector.ts": lambda path: load_corrector(path)(*FRAMES),
         "corrector.npz": lambda path: read_lut(path)(*(one.numpy() for one in FRAMES)),
     }
     named = {made / name: read for name, read in readers.items()}

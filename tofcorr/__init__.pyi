@@ -18,6 +18,7 @@ from tofcorr.errors import StateError as StateError
 from tofcorr.errors import TofcorrError as TofcorrError
 from tofcorr.geometry.camera import CameraIntrinsics as CameraIntrinsics
 from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
+from tofcorr.module.loading import load_corrector as load_corrector
 from tofcorr.plausibility.examine import inspect as inspect
 from tofcorr.plausibility.finding import Inspection as Inspection
 from tofcorr.sensor.degrade import degrade as degrade

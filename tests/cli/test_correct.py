@@ -178,10 +178,10 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
     torch.save({"weight": torch.ones(2)}, pickled)
     cases = [
         (tmp_path / "none.ts", source, "none.ts: there is no such file"),
-        (tmp_path, source, "is a folder; expected the corrector.ts of a run"),
+        (tmp_path, source, "state.pt: there is no such file"),
         (corrector, garbage, "garbage.ts: is a file; a recording is a folder"),
-        (garbage, source, "garbage.ts: is not the corrector.ts of a run"),
-        (pickled, source, "weights.pt: not a TorchScript module"),
+        (garbage, source, "garbage.ts: is not a file of tofcorr train or export"),
+        (pickled, source, "weights.pt: is not a calibration"),
         (nameless, source, "nameless.ts: without a corrector's metadata"),
         (along_axis, source, "depth is of kind 'radial', but"),
         (corrector, turned, "frames are 5x7 pixels, but"),

@@ -18,10 +18,10 @@ from correction.export.states import ACCURACY, EYE_TO_HAND, TRANSFORMS, calibrat
 
 import tofcorr
 from tofcorr.correction.lookup import read_lut
-from tofcorr.correction.metadata import load_corrector
 from tofcorr.correction.state import load_calibration, save_calibration
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import FrameNames
+from tofcorr.module.loading import load_corrector
 
 Change = Callable[[dict[str, Any]], Any]
 
@@ -145,7 +145,7 @@ def test_a_corrector_with_one_changed_byte_is_refused(tmp_path: Path) -> None:
     content = path.read_bytes()
     at = content.index(b"data/0") + 100
     path.write_bytes(content[:at] + bytes([content[at] ^ 64]) + content[at + 1 :])
-    with pytest.raises(CalibrationDataError, match="is damaged; expected the corrector"):
+    with pytest.raises(CalibrationDataError, match="is damaged; expected a file of tofcorr"):
         load_corrector(path)
 
 

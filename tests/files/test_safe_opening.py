@@ -16,12 +16,12 @@ from small_recordings import write_small_recording
 from torch import Tensor, nn
 
 from tofcorr.correction.lookup import read_lut
-from tofcorr.correction.metadata import load_corrector
 from tofcorr.correction.state import load_calibration
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError, TofcorrError
 from tofcorr.files import open_regular
 from tofcorr.importing.images import read_array
+from tofcorr.module.loading import load_corrector
 from tofcorr.options import read_text
 
 READERS: dict[str, Callable[[Path], object]] = {
@@ -78,7 +78,7 @@ def test_the_corrector_built_anew_is_that_of_the_file(tmp_path: Path) -> None:
     depth, amplitude = (torch.from_numpy(one.astype(np.float32)) for one in frame())
     depth /= 1000
     for own, theirs in zip(
-        load_corrector(model)[0](depth, amplitude),
+        load_corrector(model)(depth, amplitude),
         torch.jit.load(str(model))(depth, amplitude),
         strict=True,
     ):

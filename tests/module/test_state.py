@@ -1,5 +1,6 @@
 """The state of a module holds all that its output depends on."""
 
+import copy
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -68,13 +69,25 @@ def test_the_state_of_other_terms_is_refused_and_changes_nothing(kind: str) -> N
     torch.testing.assert_close(everything(module), before, rtol=0, atol=0)
 
 
-def test_the_state_of_another_image_size_or_dtype_is_refused() -> None:
+def test_the_state_of_another_image_size_is_refused() -> None:
     module = module_of("distance_polynomial")
     small = DepthCorrection(replace(CAMERA, height=4), options_of("distance_polynomial"))
     with pytest.raises(StateError, match=r"'image size' is \[4, 7\]"):
         module.load_state_dict(small.state_dict())
-    with pytest.raises(StateError, match=r"'dtype' is torch\.float32"):
-        module.load_state_dict(module_of("distance_polynomial", dtype=torch.float32).state_dict())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_state_of_another_dtype_is_cast_as_by_torch(kind: str) -> None:
+    single, double = (module_of(kind, dtype=dtype) for dtype in (torch.float32, torch.float64))
+    for source, target in ((single, double), (double, single)):
+        other = DepthCorrection(OTHER_CAMERA, options_of(kind), ranges=OTHER_DOMAIN)
+        dtype = target.error_model.constant.dtype
+        other.to(dtype).load_state_dict(source.state_dict())
+        depth, amplitude = frames()
+        found = other(depth, amplitude, **conditions((2,)))
+        assert torch.equal(
+            found, copy.deepcopy(source).to(dtype)(depth, amplitude, **conditions((2,)))
+        )
 
 
 def test_every_value_of_a_state_is_a_tensor() -> None:

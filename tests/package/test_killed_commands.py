@@ -26,8 +26,8 @@ import yaml
 import tofcorr
 from benchmarks import tiny
 from tofcorr.correction.lookup import read_lut
-from tofcorr.correction.metadata import load_corrector
 from tofcorr.data.recording import Recording
+from tofcorr.module.loading import load_corrector
 from tofcorr.sensor.sensor_file import read_sensor
 
 KILLS = int(os.environ.get("TOFCORR_KILLS", "1"))

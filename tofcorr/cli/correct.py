@@ -1,6 +1,5 @@
 """The commands that use a calibration: correct whole recordings, export it for robots."""
 
-import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,9 +22,11 @@ _FORMATS = " ".join(f"{one.name} ({one.ending}): {one.summary}." for one in FORM
 
 
 @click.command()
-@option("--model", "The corrector.ts of a run.", required=True, type=FOLDER)
+@option(
+    "--model", "A run, its corrector.ts, or another file that corrects.", required=True, type=FOLDER
+)
 @recording_option("Folder of the recording to correct.")
-@option("--trust-model", "Run the code of a model that holds no calibration.", is_flag=True)
+@option("--trust-model", "Run the program of a .ts or .pt2 whose origin you know.", is_flag=True)
 @option("--out", "Folder of the corrected recording, made anew.", type=NewPath())
 @option("--ply", _CLOUDS, type=NewPath())
 def correct_command(
@@ -38,9 +39,9 @@ def correct_command(
     Raw samples are left out: they would disagree with the corrected depth. Point clouds are in the
     camera's frame, metres: x right, y down, z forward.
     """
-    from tofcorr.correction.metadata import load_corrector
     from tofcorr.data.recording import Recording
     from tofcorr.data.writing import write_corrected, write_point_clouds
+    from tofcorr.module.loading import load_corrector
 
     if out is None and ply is None:
         raise click.UsageError("Nothing to write: give --out, --ply, or both.")
@@ -48,8 +49,8 @@ def correct_command(
         raise click.UsageError("--out and --ply name the same folder; choose another for one.")
     # Contents are checked as the frames pass by; the recording may be larger than memory.
     recording = Recording.open(recording_path, check_contents=False)
-    corrector, metadata = load_corrector(model, trusted=trust_model)
-    _refuse_another_camera(metadata, recording, model)
+    corrector = load_corrector(model, trust=trust_model)
+    _refuse_another_camera(corrector.known, recording, model)
     with _refused_by(model):
         if out is not None:
             share = write_corrected(corrector, recording, out)
@@ -68,11 +69,12 @@ def _refused_by(model: Path) -> Iterator[None]:
     """Turn the corrector's own refusals into one sentence."""
     import torch
 
+    scripted = getattr(getattr(torch, "jit", None), "Error", ValueError)
     try:
         yield
     except TofcorrError:  # Of the recording or the folder: it is one sentence already.
         raise
-    except (RuntimeError, ValueError, torch.jit.Error) as error:
+    except (RuntimeError, ValueError, scripted) as error:
         # TorchScript puts the message behind its traceback, after such as builtins.ValueError.
         last = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
         said = re.sub(r"^[A-Za-z_][\w.]*: ", "", last)
@@ -116,29 +118,12 @@ def export_command(run: Path, name: str, out: Path, device: str) -> None:
     from tofcorr.correction.corrector import DepthCorrector
     from tofcorr.correction.export import export
     from tofcorr.correction.state import STATE_FILE, load_calibration
+    from tofcorr.training.judgement import verdict_of_run
 
     if device != "cpu" and not (FORMATS[name].for_device and torch.cuda.is_available()):
         compiled = " and ".join(one.name for one in FORMATS.values() if one.for_device)
         raise ConfigError(f"--device {device}: only for {compiled}, on a machine that has it.")
-    verdict = _verdict(run)
+    verdict = verdict_of_run(run)
     state = load_calibration(run / STATE_FILE)
     export(name, DepthCorrector.from_state(state).to(device), out, state)
     click.echo(f"{out}: the calibration {state.name} of {run} as {name}. {verdict}".rstrip())
-
-
-def _verdict(run: Path) -> str:
-    """Return what the report of a run says of it; nothing without one.
-
-    Raises:
-        CalibrationDataError: `tofcorr train` gave it no corrector.ts: it is not to be used.
-    """
-    from tofcorr.training.judgement import DO_NOT_USE, verdict_text
-
-    file = run / "report.json"
-    if not file.is_file():
-        return ""
-    report = json.loads(file.read_text(encoding="utf-8"))
-    if report["verdict"] == DO_NOT_USE and not (run / "corrector.ts").exists():
-        said = f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']}"
-        raise CalibrationDataError(f"{said} Train with --force, if so.")
-    return verdict_text(report)

@@ -71,6 +71,7 @@ class DepthCorrector(nn.Module):
         self.height: int = state.camera.height
         self.width: int = state.camera.width
         self.strip_pixels: int = _STRIP_PIXELS
+        self.in_strips: bool = True
         self.weight: float = _WEIGHT
         self.is_z: bool = state.depth_kind == "z"
         self.radial_range = RuntimeRange(limits.radial_distance, positive=True)
@@ -108,9 +109,8 @@ class DepthCorrector(nn.Module):
         depth, amplitude = depth.contiguous(), amplitude.contiguous()
         corrected = torch.empty_like(depth)
         valid = torch.empty_like(depth, dtype=torch.bool)
-        # Only scripted code asks for the size: an exported graph must hold for any batch.
-        scripted = torch.jit.is_scripting()  # pyright: ignore[reportPrivateImportUsage]
-        if scripted and depth.numel() > self.strip_pixels and not depth.is_cuda:
+        # Without strips nothing asks for the size: an exported graph must hold for any batch.
+        if self.in_strips and depth.numel() > self.strip_pixels and not depth.is_cuda:
             self.correct_in_strips(depth, amplitude, corrected, valid)
         else:
             self.correct(depth, amplitude, self.error.offset, 0, corrected, valid)
@@ -118,7 +118,6 @@ class DepthCorrector(nn.Module):
             valid.zero_()
         return corrected, valid
 
-    @torch.jit.export
     def set_conditions(
         self,
         timestamp_s: float | None = None,
@@ -146,18 +145,15 @@ class DepthCorrector(nn.Module):
                 values[k] = value * self.si_per_unit[k]
         self.conditions_inside = self.error.set_conditions(values.to(self.radial_of_z.device))
 
-    @torch.jit.export
     def points(self, depth: Tensor, amplitude: Tensor) -> Tensor:
         """Return corrected points in the camera frame, shape (..., H, W, 3), metres."""
         corrected, _ = self.forward(depth, amplitude)
         return corrected.unsqueeze(-1) * self.points_at_one
 
-    @torch.jit.export
     def points_tool(self, depth: Tensor, amplitude: Tensor) -> Tensor:
         """Return corrected points in the tool frame, shape (..., H, W, 3), metres."""
         return transformed(self.tool_from_camera, self.points(depth, amplitude))
 
-    @torch.jit.export
     def sigma(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         """Return how uncertain the corrected depth is, by noise and by calibration, metres.
 
@@ -171,7 +167,6 @@ class DepthCorrector(nn.Module):
         noise, calibration = self.uncertainty(radial, amplitude, rows, columns)
         return noise / self.radial_of_z, calibration / self.radial_of_z
 
-    @torch.jit.export
     def metadata(self) -> str:
         """Return camera, model, validity range and versions as JSON text."""
         return self.metadata_text

@@ -3,10 +3,12 @@
 In float64 it is the reference: the runtime is folded from it, every export must agree with it.
 """
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS
@@ -166,6 +168,16 @@ class CameraGeometry(nn.Module):
         self.register_buffer("radial_of_depth", torch.ones(size, dtype=torch.float64))
         self.set_depth_kind(depth_kind)
 
+    def cropped(self, top: int, left: int, camera: CameraIntrinsics) -> "CameraGeometry":
+        """Return the geometry of a part of the image; the rays are those of this one."""
+        part = copy.copy(self)
+        part._buffers = dict(self._buffers)
+        for name in ("ray_directions", "radial_of_depth"):
+            image = getattr(self, name)
+            part._buffers[name] = image[top : top + camera.height, left : left + camera.width]
+        part._buffers["matrix"] = camera.matrix_tensor().to(self.matrix)
+        return part
+
     @torch.no_grad()
     def set_depth_kind(self, depth_kind: DepthKind) -> None:
         """State what depth means."""
@@ -290,7 +302,12 @@ class FrameCorrection(DescribedModule):
         self.ranges.set(domain, saturation_amplitude, error_model)
 
     def forward(
-        self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition
+        self,
+        depth: Tensor,
+        amplitude: Amplitude = None,
+        *,
+        fill: float = torch.nan,
+        **conditions: Condition,
     ) -> Tensor:
         """Return corrected depth.
 
@@ -300,16 +317,22 @@ class FrameCorrection(DescribedModule):
             **conditions: `timestamp_s`, `integration_time_us`, `room_temperature_c`,
                 `body_temperature_c`, `ambient`: one number, or one for each frame (...). What is
                 not given is taken as the mean of the calibration.
+            fill: What to give where there is no return, such as 0 before a network.
 
         Returns:
-            A new tensor of the shape and dtype of `depth`, metres; NaN where there is no return.
+            A new tensor of the shape and dtype of `depth`, metres; `fill` where there is no return.
 
         Raises:
             FrameError: The frames are of another size or dtype, or amplitudes are missing.
         """
         error, seen = self._error(depth, amplitude, conditions)
         corrected = depth.to(error.dtype) - error
-        return torch.where(seen, corrected, torch.nan).to(depth.dtype)
+        if dist.is_available() and dist.is_initialized():
+            # DistributedDataParallel waits for a gradient of every parameter that it may train, of
+            # the hand-eye transform and of conditions that were not given, too: it is zero.
+            trained = [one.sum() for one in self.parameters() if one.requires_grad]
+            corrected = corrected + 0.0 * sum(trained)
+        return torch.where(seen, corrected, fill).to(depth.dtype)
 
     def error(self, depth: Tensor, amplitude: Amplitude = None, **conditions: Condition) -> Tensor:
         """Return the predicted error, measured - true: depth - error is the corrected depth.

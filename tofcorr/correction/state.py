@@ -3,6 +3,7 @@
 import io
 import math
 import platform
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -33,6 +34,8 @@ STATE_FILE = "state.pt"
 """Its name in a run folder."""
 
 _FORMAT = "tofcorr-state"
+_EMBEDDED = "/calibration.pt"
+"""How the archive of a program calls the calibration that it holds; once it was below `extra`."""
 _WHAT = "a calibration that tofcorr train wrote"
 
 _Three = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
@@ -292,9 +295,32 @@ def values_of(form: str, values: dict[str, Any]) -> bytes:
     return sealed(content)
 
 
-def calibration_bytes(state: CalibrationState) -> bytes:
-    """Return a calibration as `save_calibration` writes it."""
-    return values_of(_FORMAT, state.model_dump())
+def with_calibration(archive: io.BytesIO, state: CalibrationState) -> bytes:
+    """Return the archive of a program, sealed, with the calibration from which it can be rebuilt.
+
+    It stands beside the code; `held_calibration` reads it and runs none.
+    """
+    with zipfile.ZipFile(archive, "a") as file:
+        root = file.namelist()[0].partition("/")[0]
+        # Of the earliest date that zip knows, as the seal.
+        file.writestr(
+            zipfile.ZipInfo(f"{root}/tofcorr{_EMBEDDED}"), values_of(_FORMAT, state.model_dump())
+        )
+    return sealed(archive)
+
+
+def held_calibration(path: Path) -> CalibrationState | None:
+    """Return the calibration that a program holds, or that stands beside it in a run folder.
+
+    Raises:
+        CalibrationDataError: It is damaged.
+    """
+    with zipfile.ZipFile(path) as archive:
+        inside = [archive.read(name) for name in archive.namelist() if name.endswith(_EMBEDDED)]
+    if inside:
+        return load_calibration(path, inside[0])
+    beside = path.with_name(STATE_FILE)
+    return load_calibration(beside) if beside.exists() else None
 
 
 def save_values(path: Path | str, form: str, values: dict[str, Any], kind: Kind) -> None:

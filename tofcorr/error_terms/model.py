@@ -1,5 +1,6 @@
 """The whole error model: one constant and its terms."""
 
+import copy
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -105,6 +106,20 @@ class ErrorModel(DescribedModule):
         self.residual: ResidualNetwork | None = None
         self.height: int = domain.height
         self.width: int = domain.width
+        self.origin: tuple[int, int] = (0, 0)
+        self.is_part: bool = False
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> "ErrorModel":
+        """Return the model of a part of the image; it shares the parameters with this one."""
+        part = copy.copy(self)
+        part._modules = dict(self._modules)
+        part.height, part.width, part.is_part = height, width, True
+        part.origin = self.origin[0] + top, self.origin[1] + left
+        if self.fixed_pattern is not None:
+            part.fixed_pattern = copy.copy(self.fixed_pattern)
+            offset = self.fixed_pattern.offset[top : top + height, left : left + width]
+            part.fixed_pattern._buffers = {"offset": offset}
+        return part
 
     def description(self) -> dict[str, Any]:
         """Return image size, terms and residual network."""
@@ -160,8 +175,9 @@ class ErrorModel(DescribedModule):
 
     def pixel_grid(self) -> tuple[Tensor, Tensor]:
         """Return rows (H, 1) and columns (1, W) in pixels."""
-        rows = torch.arange(self.height).to(self.constant)[:, None]
-        return rows, torch.arange(self.width).to(self.constant)[None, :]
+        sizes = zip(self.origin, (self.height, self.width), strict=True)
+        rows, columns = (torch.arange(o, o + size).to(self.constant) for o, size in sizes)
+        return rows[:, None], columns[None, :]
 
     def pixel_error(self) -> Tensor:
         """Return the sum of constant, pixel terms and fixed pattern, shape (H, W), metres."""

@@ -7,6 +7,7 @@ import torch
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from torch import Tensor
 
+from tofcorr.errors import FrameError
 from tofcorr.options import Number, OpenOptions, Options, Size
 
 DepthKind = Literal["radial", "z"]
@@ -73,6 +74,47 @@ class CameraIntrinsics:
             "K": [list(row) for row in self.matrix],
             "distortion": list(self.distortion),
         }
+
+    def crop(self, top: int, left: int, height: int, width: int) -> "CameraIntrinsics":
+        """Return the camera of a part of the image, from row `top` and column `left` on.
+
+        Raises:
+            FrameError: The part is not inside the image.
+        """
+        inside = 0 <= top < top + height <= self.height and 0 <= left < left + width <= self.width
+        if not inside:
+            part = f"rows {top} to {top + height - 1}, columns {left} to {left + width - 1}"
+            raise FrameError(
+                f"a crop of {part}: the image has {self.height} x {self.width} pixels."
+            )
+        return self._scaled(height, width, (1.0, 1.0), (float(left), float(top)))
+
+    def resize(self, height: int, width: int) -> "CameraIntrinsics":
+        """Return the camera of the image resized, with its outer edges kept.
+
+        Pixel centres are integers, so pixel u of the old image lies at (u + 1/2) s - 1/2.
+        """
+        scale = width / self.width, height / self.height
+        return self._scaled(height, width, scale, tuple((1 / s - 1) / 2 for s in scale))
+
+    def bin(self, number: int) -> "CameraIntrinsics":
+        """Return the camera whose pixels are the means of squares of `number` x `number` pixels.
+
+        What the last rows and columns lack of a square is cut off.
+        """
+        height, width = self.height // number, self.width // number
+        return self.crop(0, 0, number * height, number * width).resize(height, width)
+
+    def _scaled(
+        self, height: int, width: int, scale: tuple[float, ...], origin: tuple[float, ...]
+    ) -> "CameraIntrinsics":
+        """Return the camera in pixels (u - origin) scale."""
+        (fx, skew, cx), (_, fy, cy), last = self.matrix
+        (sx, sy), (u, v) = scale, origin
+        matrix = ((sx * fx, sx * skew, sx * (cx - u)), (0.0, sy * fy, sy * (cy - v)), last)
+        return CameraIntrinsics(
+            width=width, height=height, matrix=matrix, distortion=self.distortion
+        )
 
     def matrix_tensor(self) -> Tensor:
         """Return the pinhole matrix, shape (3, 3), float64."""

@@ -238,6 +238,29 @@ class DepthCorrection(FrameCorrection):
         self.extras = CalibrationExtras()
         self.to(dtype)
 
+    def crop(self, top: int, left: int, height: int, width: int) -> Self:
+        """Return the module for a part of the image: it corrects a crop as this one does the whole.
+
+        It shares all parameters with this module, so that random crops train them. Call this one's
+        `save`, `fit` and `export`.
+
+        Args:
+            top: First row.
+            left: First column.
+            height: Number of rows.
+            width: Number of columns.
+
+        Raises:
+            FrameError: The part is not inside the image.
+        """
+        part = copy.copy(self)
+        part._modules = dict(self._modules)
+        part.camera = self.camera.crop(top, left, height, width)
+        part.domain = replace(self.domain, height=height, width=width)
+        part.error_model = self.error_model.cropped(top, left, height, width)
+        part.geometry = self.geometry.cropped(top, left, part.camera)
+        return part
+
     def batches(
         self, recordings: Recordings, frames: Frames | None = None, frames_per_batch: int = 8
     ) -> Iterator[FrameBatch]:
@@ -279,6 +302,7 @@ class DepthCorrection(FrameCorrection):
             CalibrationDataError: The recordings are of another camera, or cannot support the model.
             ConfigError: A change is not allowed.
         """
+        self._refuse_crop()
         dataset = open_dataset(recordings, self.camera)
         options = resolve_options(TrainingOptions, self.options, changes)
         data, options, inspection, left_out = inspected(dataset, options, force=force)
@@ -323,6 +347,7 @@ class DepthCorrection(FrameCorrection):
         Raises:
             ExportError: The file cannot be written.
         """
+        self._refuse_crop()
         values = {"state": self.state_dict(), **self.extras.model_dump()}
         save_values(file, FORMAT, values, ExportError)
 
@@ -339,7 +364,9 @@ class DepthCorrection(FrameCorrection):
         refuse_damaged(path, "a calibration or a module that tofcorr wrote")
         with zipfile.ZipFile(path) as archive:
             if any("/code/" in name for name in archive.namelist()):
-                raise CalibrationDataError(f"{path}: holds nothing to fit: use torch.jit.load.")
+                raise CalibrationDataError(
+                    f"{path}: holds nothing to fit: use tofcorr.load_corrector."
+                )
         values = read_values(path, FORMAT)
         if values is None:
             return cls._from_calibration(load_calibration(path), None)
@@ -360,7 +387,12 @@ class DepthCorrection(FrameCorrection):
         export(name, DepthCorrector.from_state(state), file, state)
 
     def to_state(self) -> CalibrationState:
-        """Return the module as a calibration, which exporters read."""
+        """Return the module as a calibration, which exporters read.
+
+        Raises:
+            ConfigError: It is a crop of another module.
+        """
+        self._refuse_crop()
         return CalibrationState.of(
             self.error_model,
             name=self.options.name,
@@ -370,13 +402,18 @@ class DepthCorrection(FrameCorrection):
             **dict(self.extras),
         )
 
+    def _refuse_crop(self) -> None:
+        if self.error_model.is_part:
+            advice = "fit, save and export the module that it was cropped from"
+            raise ConfigError(f"this module is a crop, and shares its parameters: {advice}.")
+
     def labels(self) -> Labels:
         """Return what the module says of itself besides its numbers."""
         return Labels.model_validate(self, from_attributes=True)
 
     def description(self) -> dict[str, Any]:
         """Return what a state must agree on to be loaded."""
-        return {"dtype": str(self.error_model.constant.dtype), **self.error_model.description()}
+        return self.error_model.description()
 
     def get_extra_state(self) -> Tensor:
         """Return description and labels as JSON in a tensor of bytes."""
@@ -390,7 +427,7 @@ class DepthCorrection(FrameCorrection):
 
     def _description_in(self, state: Tensor) -> dict[str, Any]:
         """Return the description that stands beside the labels."""
-        return decode(state)["description"]
+        return {k: v for k, v in decode(state)["description"].items() if k != "dtype"}
 
     def extra_repr(self) -> str:
         """Return the model's name, image size, depth kind and range, for printing."""

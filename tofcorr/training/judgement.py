@@ -1,11 +1,14 @@
 """What a training says of itself: what it leaves out, verdict, warnings, text of the report."""
 
+import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
@@ -320,3 +323,19 @@ def _hand_eye_lines(report: Mapping[str, Any]) -> Iterator[str]:
     moved = ((math.hypot(*one["translation_mm"]), one["error"]) for one in report["assumptions"])
     if said := ", ".join(f"{size:.1f} mm for {error}" for size, error in moved):
         yield f"  what ± leaves out: {said}"
+
+
+def verdict_of_run(run: Path) -> str:
+    """Return what the report of a run says of it; nothing without one.
+
+    Raises:
+        CalibrationDataError: `tofcorr train` gave it no corrector.ts: it is not to be used.
+    """
+    file = run / "report.json"
+    if not file.is_file():
+        return ""
+    report = json.loads(file.read_text(encoding="utf-8"))
+    if report["verdict"] == DO_NOT_USE and not (run / "corrector.ts").exists():
+        said = f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']}"
+        raise CalibrationDataError(f"{said} Train with --force, if so.")
+    return verdict_text(report)

@@ -133,7 +133,10 @@ class TrainingResult:
         if reference is not None:
             save_reference(folder / REFERENCE_FILE, reference, state)
         if self.force or self.report["verdict"] != DO_NOT_USE:
-            export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
+            try:
+                export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
+            except ConfigError as missing:  # Of TorchScript in this torch.
+                _LOG.warning("corrector.ts was not written: %s", missing)
         self.write_report(folder)
         text = dump_yaml(options.to_mapping(), last="model")
         (folder / "config.yaml").write_text(text, encoding="utf-8")

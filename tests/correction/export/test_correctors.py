@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,8 @@ from torch import Generator, Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
-from tofcorr.correction.lookup import read_lut
 from tofcorr.errors import ExportError
+from tofcorr.module.loading import load_corrector
 
 Frames = tuple[Tensor, Tensor]
 WITHOUT_ONNX = any(
@@ -34,20 +33,6 @@ def frames(generator: Generator) -> Frames:
     depth = 0.4 + 2.8 * torch.rand(3, 5, 7, generator=generator)
     depth[0, 0, :2] = torch.tensor([torch.nan, 0.0])
     return depth, 5 + 1000 * torch.rand(3, 5, 7, generator=generator)
-
-
-def by_table(path: Path, depth: Tensor, amplitude: Tensor) -> list[Tensor]:
-    return [torch.from_numpy(one) for one in read_lut(path)(depth.numpy(), amplitude.numpy())]
-
-
-def loaded(name: str) -> Callable[..., Any]:
-    """Return what corrects frames by the file of a format."""
-    if name == "lut":
-        return by_table
-    if name == "torchscript":
-        return lambda path, *given: torch.jit.load(str(path))(*given)
-    load = getattr(import_module(f"tofcorr.correction.export.{name}"), f"load_{name}")
-    return lambda path, *given: load(path)(*given)
 
 
 @pytest.mark.filterwarnings("ignore")  # The exporters' own dependencies warn of each other.
@@ -68,8 +53,10 @@ def test_a_file_corrects_as_the_model(
 ) -> None:
     state = calibration(np.eye(4), depth_kind=depth_kind)
     write(name, state, tmp_path / f"corrector.{ending}")
-    corrected, valid = loaded(name)(tmp_path / f"corrector.{ending}", *frames)
+    corrector = load_corrector(tmp_path / f"corrector.{ending}", trust=True)
+    corrected, valid = corrector(*frames)
     expected, expected_valid = state.corrected(*frames)
+    assert json.loads(corrector.metadata())["depth_kind"] == depth_kind
     assert corrected.dtype == torch.float32
     torch.testing.assert_close(corrected.double(), expected, rtol=0, atol=tolerance, equal_nan=True)
     assert torch.equal(valid, expected_valid)
@@ -126,7 +113,7 @@ def test_compiled_code_reads_no_other_frame(frames: Frames, tmp_path: Path) -> N
     for name in ("cropped", "float64"):
         change, message = REFUSED[name]
         with pytest.raises(ValueError, match=message):
-            loaded("pt2")(tmp_path / "corrector.pt2", *change(*frames))
+            load_corrector(tmp_path / "corrector.pt2", trust=True)(*change(*frames))
 
 
 def test_points_in_the_tool_frame_are_those_of_the_camera_moved(frames: Frames) -> None:

@@ -1,7 +1,6 @@
 """The corrector as a look-up table in an NPZ file."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,8 @@ from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.lookup import FORMAT, LookupTable, digest_of, interpolate, read_lut
+from tofcorr.correction.loaded import LoadedCorrector
+from tofcorr.correction.lookup import FORMAT, digest_of, interpolate, read_lut
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING, Interval
 from tofcorr.errors import ConfigError
@@ -48,7 +48,23 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
     with staged_file(path) as part:
         with part.open("wb") as file:
             np.savez_compressed(file, **arrays, metadata=np.array(json.dumps(metadata)))
-        require_parity(_on_tensors(read_lut(part)), reference, TOLERANCE)
+        require_parity(load_lut(part), reference, TOLERANCE)
+
+
+def load_lut(path: Path | str) -> LoadedCorrector:
+    """Load a table for tensors on any device; `read_lut` reads it for NumPy.
+
+    Raises:
+        CalibrationDataError: There is no such file, or it is not such a table.
+    """
+    table = read_lut(path)
+
+    def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        found = table(depth.cpu().numpy(), amplitude.cpu().numpy())
+        corrected, valid = (torch.from_numpy(one).to(depth.device) for one in found)
+        return corrected, valid
+
+    return LoadedCorrector(correct, lambda: json.dumps(table.metadata), path)
 
 
 def _tabulate(state: CalibrationState) -> np.ndarray:
@@ -81,11 +97,3 @@ def _tabulate(state: CalibrationState) -> np.ndarray:
         if np.abs(found - wanted).max() < TOLERANCE / 4:
             break
     return table
-
-
-def _on_tensors(table: LookupTable) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
-        corrected, valid = table(depth.numpy(), amplitude.numpy())
-        return torch.from_numpy(corrected), torch.from_numpy(valid)
-
-    return correct

@@ -1,9 +1,9 @@
 """The corrector as ONNX, for robots without torch."""
 
+import copy
 import io
 import logging
 import warnings
-from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -13,8 +13,10 @@ from torch import Tensor
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.export.registry import format_named
+from tofcorr.correction.loaded import LoadedCorrector
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files import staged_file
+from tofcorr.errors import CalibrationDataError
+from tofcorr.files import open_regular, reading, staged_file
 
 _METADATA_KEY = "tofcorr"
 
@@ -40,32 +42,45 @@ def export_onnx(corrector: DepthCorrector, path: Path | str, reference: Calibrat
         require_parity(load_onnx(part), reference)
 
 
-def load_onnx(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Load an ONNX file and return `corrected, valid = correct(depth, amplitude)`.
-
-    Frames may be (H, W) or (B, H, W).
+def load_onnx(path: Path | str) -> LoadedCorrector:
+    """Load an ONNX file; it is data, of which nothing is run but ONNX's own operators.
 
     Raises:
         ConfigError: The optional packages are not installed.
+        CalibrationDataError: There is no such file, or it is not such a corrector.
     """
     format_named("onnx").require_packages()
     from onnxruntime import InferenceSession
+    from onnxruntime.capi import (
+        onnxruntime_pybind11_state as refusals,  # pyright: ignore[reportAttributeAccessIssue]
+    )
 
-    session = InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    refused = refusals.Fail, refusals.InvalidProtobuf, refusals.InvalidGraph
+    with reading(path), open_regular(path) as file:
+        try:
+            # Of bytes: a path would let the file name others to be read.
+            session = InferenceSession(file.read(), providers=["CPUExecutionProvider"])
+        except (*refused, refusals.InvalidArgument, refusals.RuntimeException):
+            said = f"{path}: is not an ONNX file of tofcorr export, or is damaged."
+            raise CalibrationDataError(said) from None
+    names = {given.name for given in session.get_inputs()}
 
     def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
-        frames = (depth, amplitude) if depth.dim() == 3 else (depth[None], amplitude[None])
-        names = ("depth", "amplitude")
-        # A model that does not read the amplitude has no such input.
-        known = {given.name for given in session.get_inputs()}
-        feed = {n: f.cpu().numpy() for n, f in zip(names, frames, strict=True) if n in known}
-        corrected, valid = map(torch.from_numpy, session.run(["corrected", "valid"], feed))
+        frames = {"depth": depth, "amplitude": amplitude}
+        # A model that does not read the amplitude has no such input; all take batches.
+        size = (-1, *depth.shape[-2:])
+        feed = {name: frames[name].cpu().reshape(size).numpy() for name in names}
+        found = session.run(["corrected", "valid"], feed)
+        corrected, valid = (torch.from_numpy(one).to(depth.device) for one in found)
         return corrected.view(depth.shape), valid.view(depth.shape)
 
-    return correct
+    held = session.get_modelmeta().custom_metadata_map
+    return LoadedCorrector(correct, lambda: held.get(_METADATA_KEY, ""), path)
 
 
 def _write(corrector: DepthCorrector, path: Path) -> None:
+    corrector = copy.copy(corrector)
+    corrector.in_strips = False
     frames = torch.ones(2, corrector.height, corrector.width)
     batch = torch.export.Dim("batch", min=1)
     # The exporter reports its steps to standard output and as warnings, for developers only.

@@ -1,16 +1,13 @@
 """Compares an exported corrector with the float64 model."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
+from tofcorr.correction.loaded import Correct
 from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING
 from tofcorr.errors import ExportError
-
-Correct = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:

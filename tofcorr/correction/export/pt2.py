@@ -1,21 +1,27 @@
 """The corrector compiled ahead of time by AOTInductor: one fused pass over the pixels."""
 
 import copy
-import json
+import io
 import shutil
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch._inductor.package.package import load_package, package_aoti
 
-from tofcorr.correction.corrector import DepthCorrector, RuntimeRange, check_frames, separated
+from tofcorr.correction.corrector import (
+    DepthCorrector,
+    RuntimeRange,
+    check_frames,
+    separated,
+)
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.state import CalibrationState
-from tofcorr.errors import ConfigError
+from tofcorr.correction.loaded import LoadedCorrector
+from tofcorr.correction.state import CalibrationState, with_calibration
+from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.files import scratch_folder, staged_file
+from tofcorr.options import one_line
 
 _METADATA_KEY = "tofcorr"
 _FRAME, _BATCH = "model", "batch"
@@ -48,31 +54,36 @@ def export_pt2(corrector: DepthCorrector, path: Path | str, reference: Calibrati
     with staged_file(path) as part, scratch_folder() as work:
         built = work / "corrector.pt2"
         _compile(corrector, built)
-        shutil.copyfile(built, part)
+        part.write_bytes(with_calibration(io.BytesIO(built.read_bytes()), reference))
         require_parity(load_pt2(part), reference)
 
 
-def load_pt2(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Load a `.pt2` and return `corrected, valid = correct(depth, amplitude)`.
+def load_pt2(path: Path | str) -> LoadedCorrector:
+    """Load a `.pt2`, which runs its code, for frames (H, W) or (B, H, W) on any device.
 
-    Frames may be (H, W) or (B, H, W) on any device; results are on the device of the frames. The
-    compiled code does not look at what it is given: others than frames of the camera in float32
+    The compiled code does not look at what it is given: others than frames of the camera in float32
     are refused here, with a ValueError.
+
+    Raises:
+        CalibrationDataError: It cannot be loaded; it may be compiled for another processor.
     """
-    frame, batch = (load_package(str(path), name) for name in (_FRAME, _BATCH))
+    try:
+        frame, batch = (load_package(str(path), name) for name in (_FRAME, _BATCH))
+    except (RuntimeError, ValueError, LookupError, OSError) as error:
+        why = one_line(" ".join(str(error).split()))
+        said = "not a package of tofcorr export, or of another machine"
+        raise CalibrationDataError(f"{path}: {said} ({why}).") from None
     metadata = frame.get_metadata()
     device = torch.device(metadata.get("AOTI_DEVICE_KEY", "cpu"))
-    camera = json.loads(metadata[_METADATA_KEY])["camera"]
 
     def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
-        check_frames(depth, amplitude, camera["height"], camera["width"])
         # The package's own call would go through pytrees, which takes as long as a small frame.
         run = (frame if depth.dim() == 2 else batch).loader.run
         given = [tensor.to(device).contiguous() for tensor in (depth, amplitude)]
         corrected, valid = run(given)
         return corrected.to(depth.device), valid.view(torch.bool).to(depth.device)
 
-    return correct
+    return LoadedCorrector(correct, lambda: metadata[_METADATA_KEY], path)
 
 
 class CompilableCorrector(nn.Module):
@@ -91,6 +102,7 @@ class CompilableCorrector(nn.Module):
     def __init__(self, corrector: DepthCorrector) -> None:
         super().__init__()
         self.corrector = copy.deepcopy(corrector)
+        self.corrector.in_strips = False
         for module in self.corrector.modules():
             if isinstance(module, RuntimeRange):
                 # The normalised amplitude is compared with its range; a rounding would show there.

@@ -21,6 +21,9 @@ class Format:
         packages: Packages that writing or reading it needs besides the required ones.
         extra: The extra of tofcorr that installs them.
         for_device: Whether the file is compiled for one device, `cpu` or `cuda`.
+        record: What the name of a record in its archives holds, by which `tofcorr.load_corrector`
+            knows them; empty: no archive, or no corrector.
+        runs_code: Whether loading the file runs what stands in it.
     """
 
     name: str
@@ -29,6 +32,8 @@ class Format:
     packages: tuple[str, ...] = ()
     extra: str = ""
     for_device: bool = False
+    record: str = ""
+    runs_code: bool = False
 
     def require_packages(self) -> None:
         """Refuse to go on without the packages that the format needs.
@@ -45,11 +50,18 @@ class Format:
 _ONNX = ("onnx", "onnxscript", "onnxruntime")
 
 _FORMATS = (
-    Format("torchscript", ".ts", "any machine with torch"),
-    Format("pt2", ".pt2", "the fastest; compiled for this kind of processor", for_device=True),
+    Format("torchscript", ".ts", "any machine with torch", record="/code/", runs_code=True),
+    Format(
+        "pt2",
+        ".pt2",
+        "the fastest; compiled for this kind of processor",
+        for_device=True,
+        record="/aotinductor/",
+        runs_code=True,
+    ),
     Format("onnx", ".onnx", "without torch", packages=_ONNX, extra="onnx"),
     Format("c", ".c", "without any library: C99 for robots and controllers, compiled there"),
-    Format("lut", ".npz", "table for NumPy, to 0.1 mm"),
+    Format("lut", ".npz", "table for NumPy, to 0.1 mm", record="radial_of_z.npy"),
     Format("urdf", ".xacro", "the camera's pose as a fixed joint of a robot description"),
     Format("tf", ".yaml", "the camera's pose for ROS, with the commands that publish it"),
     Format("easy_handeye", ".yaml, or .calib for easy_handeye2", "the camera's pose for ROS"),

@@ -1,16 +1,25 @@
 """The corrector as TorchScript: the file that a robot loads with torch alone."""
 
 import io
+import platform
+import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.metadata import EMBEDDED
-from tofcorr.correction.state import CalibrationState, calibration_bytes
-from tofcorr.files import sealed, staged_file
+from tofcorr.correction.loaded import LoadedCorrector
+from tofcorr.correction.state import CalibrationState, with_calibration
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.files import staged_file
+
+_UNSUPPORTED = (3, 14)
+"""From this Python on torch says that TorchScript is not supported and may break."""
+_METHODS = ("set_conditions", "points", "points_tool", "sigma", "metadata")
+"""What the file offers besides `forward`."""
 
 
 def export_torchscript(
@@ -24,17 +33,44 @@ def export_torchscript(
         reference: The calibration that it must agree with.
 
     Raises:
+        ConfigError: This torch, or this Python, has no TorchScript.
         ExportError: The scripted module differs from the float64 model, or the file cannot be
             written; nothing is written.
     """
+    jit = _torchscript()
+    for name in _METHODS:
+        jit.export(getattr(DepthCorrector, name))
     with staged_file(path) as part:
+        content = io.BytesIO()
         with warnings.catch_warnings():
             # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
             warnings.filterwarnings("ignore", message=".*torch.jit")
-            content = io.BytesIO()
-            # Beside the code: `tofcorr correct` builds the corrector from it and runs no code.
-            own = {EMBEDDED: calibration_bytes(reference)}
-            torch.jit.save(torch.jit.script(corrector), content, _extra_files=own)
-            part.write_bytes(sealed(content))
-            loaded = torch.jit.load(str(part))
-        require_parity(loaded, reference)
+            jit.save(jit.script(corrector), content)
+        part.write_bytes(with_calibration(content, reference))
+        require_parity(load_torchscript(part), reference)
+
+
+def load_torchscript(path: Path | str) -> LoadedCorrector:
+    """Load a TorchScript file for the CPU, which runs its code.
+
+    Raises:
+        ConfigError: This torch, or this Python, has no TorchScript.
+        CalibrationDataError: It is no TorchScript file, or no corrector.
+    """
+    jit = _torchscript()
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*torch.jit")
+            module = jit.load(str(path), map_location="cpu")
+    except (RuntimeError, ValueError, OSError, EOFError):
+        raise CalibrationDataError(f"{path}: not a TorchScript module.") from None
+    return LoadedCorrector(module, lambda: str(module.metadata()), path)
+
+
+def _torchscript() -> Any:  # noqa: ANN401 - a module that later versions of torch may lack
+    jit: Any = getattr(torch, "jit", None)
+    if not hasattr(jit, "script") or sys.version_info >= _UNSUPPORTED:
+        version = f"torch {torch.__version__} on Python {platform.python_version()}"
+        advice = "Export pt2, onnx or lut; tofcorr.load_corrector opens those, and the run folder"
+        raise ConfigError(f"{version} has no TorchScript. {advice}.")
+    return jit
