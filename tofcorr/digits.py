@@ -1,6 +1,7 @@
 """Numbers with no more digits than their intervals leave known."""
 
 import math
+from collections.abc import Sequence
 
 # An interval's half-width is at least so many of the units it is written in: 0.8 is written in
 # tenths, 2.1 too, 12 in ones, 40 in tens. The rounding rule of the Particle Data Group: two digits
@@ -40,6 +41,35 @@ def known(value: float, interval: tuple[float, float], most: int = 1, sign: str 
 def known_interval(interval: tuple[float, float], most: int = 1, sign: str = "") -> list[str]:
     """Return the ends of an interval with the digits that are known."""
     return [_written(end, decimals(interval, most), sign) for end in interval]
+
+
+def with_interval(value: float | None, ends: Sequence[float | None] | None) -> tuple[str, str]:
+    """Return a value of any size, and its interval, with the digits that are known.
+
+    Args:
+        value: The value; None: unknown, written as a dash.
+        ends: Of its interval; None, or an end of None: not known, and not written.
+    """
+    if value is None:
+        return "–", ""
+    low, high = ends or (None, None)
+    interval = (value, value) if low is None or high is None else (low, high)
+    largest = max(abs(value), *map(abs, interval))
+    power = math.floor(math.log10(largest)) if largest else 0
+    # Up to five digits before or after the point are read at a glance.
+    if -3 <= power < 5:
+        numbers = [known(number, interval, 6) for number in (value, *interval)]
+    else:  # Pixel terms are as small as 1e-12 m / pixel^4.
+        digits = max(power + decimals(interval, 16), 1)
+        numbers = [f"{number:.{min(digits, 3)}e}" for number in (value, *interval)]
+    return numbers[0], "" if interval[0] == interval[1] else " to ".join(numbers[1:])
+
+
+def in_mm(millimetres: float | None) -> str:
+    """Return a length for a page, without its unit; None is a dash."""
+    if millimetres is None:
+        return "–"
+    return f"{millimetres:z.1f}" if round(abs(millimetres), 1) >= 1 else f"{millimetres:z.2f}"
 
 
 def _written(value: float, places: int, sign: str) -> str:

@@ -1,10 +1,7 @@
 """The report page in a browser: no error, nothing cut, a text beside every picture."""
 
 import html
-import json
 import re
-import shutil
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -15,6 +12,7 @@ from typing import Any, cast
 import pytest
 from matplotlib.text import Text
 from optional import present
+from shown_pages import WIDTHS, fetched, looked_at, needs_browser, silent
 
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Estimated, Stage
@@ -29,39 +27,6 @@ from tofcorr.diagnosis.report.words import (
     share_words,
 )
 from tofcorr.diagnosis.rerun.simulator import sensor_of
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-needs_browser = pytest.mark.skipif(
-    CHROMIUM is None, reason="needs a Chromium: Debian's package is `chromium`"
-)
-WIDTHS = (1200, 480)
-LOOK = (Path(__file__).parent / "look.js").read_text(encoding="utf-8")
-
-
-def looked_at(page: str, folder: Path) -> tuple[list[dict[str, Any]], str]:
-    """Open a page in frames of all widths; return what each shows, and what the console said."""
-    source = html.escape(page)
-    frames = [f'<iframe width={width} height=2000 srcdoc="{source}"></iframe>' for width in WIDTHS]
-    around = folder / "around.html"
-    style = "<style>iframe { border: 0; display: block; }</style>"
-    around.write_text(f"<!DOCTYPE html>{style}{''.join(frames)}<script>{LOOK}</script>")
-    done = subprocess.run(
-        [
-            present(CHROMIUM),
-            *("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
-            *("--enable-logging=stderr", "--v=0", f"--user-data-dir={folder / 'profile'}"),
-            *("--window-size=1300,4100", "--virtual-time-budget=20000", "--dump-dom"),
-            around.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    found = re.search(r"seen (\[.*\]) end", html.unescape(done.stdout), re.DOTALL)
-    assert found, f"the page did not load: {done.stdout[:300]}"
-    console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    return json.loads(found.group(1)), "\n".join(console)
 
 
 def with_simulator(result: DiagnosisResult) -> DiagnosisResult:
@@ -127,6 +92,7 @@ def test_every_picture_of_every_kind_of_report_has_words(
 ) -> None:
     kinds = [(kind(time_diagnosis), rendered(kind)) for kind in (with_simulator, without_effects)]
     for result, whole in (*kinds, (time_diagnosis, page)):
+        assert (fetched(whole), silent(whole)) == ([], 0)
         figures, shown = all_figures(result), html.unescape(whole)
         assert ("where_as_given" in figures) == (result.stages[0].gap is not None)
         for name in figures:

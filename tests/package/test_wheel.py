@@ -76,7 +76,8 @@ def test_the_wheel_holds_every_configuration_and_text_as_in_the_repository(wheel
     for path in (ROOT / "configs").glob("*/*.yaml"):
         assert packed[f"tofcorr/configs/{path.parent.name}/{path.name}"] == path.read_bytes()
     assert "tofcorr/py.typed" in packed
-    assert {"tofcorr/diagnosis/report/report.html.j2", "tofcorr/__init__.pyi"} <= packed.keys()
+    shown = {f"tofcorr/pages/{name}" for name in ("page.html.j2", "style.css", "cloud.js")}
+    assert shown | {"tofcorr/__init__.pyi"} <= packed.keys()
     assert any(name.endswith("/licenses/LICENSE") for name in packed)
     metadata = next(text for name, text in packed.items() if name.endswith("/METADATA")).decode()
     assert "\nLicense-Expression: Apache-2.0\n" in metadata

@@ -3,10 +3,9 @@
 import re
 
 import numpy as np
-import pytest
 from matplotlib import colors
 
-from tofcorr.pages.drawing import BLUE, GREY, LIGHT, PALE, RED, coloured, panels, svg_of
+from tofcorr.pages.drawing import BLUE, GREY, LIGHT, PALE, RED, panels, svg_of
 from tofcorr.pages.page import resource
 
 
@@ -38,12 +37,3 @@ def test_a_picture_has_no_colour_of_its_own_that_a_dark_page_could_not_change() 
     for name in set(re.findall(r"var\((--\w+)\)", drawn + style)):
         assert f"{name}: #" in light
         assert f"{name}: #" in dark
-
-
-def test_signed_colours_run_from_purple_to_orange_and_unused_pixels_are_grey() -> None:
-    near, zero, far, unused = coloured(np.array([[-9.0, 0.0, 9.0, np.nan]]), limit=2.0)[0]
-    assert near[2] > near[0] > near[1]
-    assert far[0] > far[1] > far[2]
-    assert zero.min() > 240
-    assert unused.tolist() == [187, 187, 187]
-    assert coloured(np.array([[0.5]]), 1.0) == pytest.approx(coloured(np.array([[5.0]]), 10.0))

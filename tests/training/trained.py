@@ -20,7 +20,7 @@ CONFIG: dict[str, Any] = {
 }
 FILES = {
     *("calibration.yaml", "config.yaml", "corrector.ts", "reference.json"),
-    *("report.json", "state.pt", "tb"),
+    *("report.html", "report.json", "state.pt", "tb"),
 }
 
 

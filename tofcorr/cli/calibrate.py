@@ -55,7 +55,7 @@ def inspect_command(recordings: tuple[Path, ...], out: Path | None, planes: Any)
 @out_option("Folder of the run, made anew.")
 @option("--resume", "An interrupted run; the fit goes on where it stood.", type=FOLDER)
 @force_option
-@option("--no-figures", "Draw no figures for TensorBoard.", is_flag=True)
+@option("--no-figures", "Write no page, and draw no figures for TensorBoard.", is_flag=True)
 def train_command(
     options: "TrainingOptions",
     recordings: tuple[Path, ...],

@@ -11,7 +11,7 @@ from tofcorr.estimation.robust import without_strays
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.measure import LEAST_VARIANCE, DropoutMeasurement, NoiseMeasurement
 from tofcorr.observables.pairs import Interval, Pair
-from tofcorr.observables.read import log_of, quotient
+from tofcorr.observables.read import log_of
 from tofcorr.pages.drawing import (
     BLUE,
     FAINT,
@@ -25,7 +25,7 @@ from tofcorr.pages.drawing import (
     plain_look,
     plain_numbers,
 )
-from tofcorr.training.figures import profile
+from tofcorr.training.figures import profile, tile_means
 
 
 def drawings(observables: Observables) -> dict[str, Callable[[], Figure]]:
@@ -165,22 +165,11 @@ def amplitude_figure(observables: Observables) -> Figure:
     for axis in (upper.xaxis, upper.yaxis):
         plain_numbers(axis)
     shape = observables.real_dropouts.map.shape
-    tiles = 100 * np.expm1(_tile_means(both.real.pixel[lit], np.log(real / sim / ratio), shape))
+    tiles = 100 * np.expm1(tile_means(both.real.pixel[lit], np.log(real / sim / ratio), shape))
     limit = max(float(np.nanmax(np.abs(tiles))), 1.0)
     image_map(lower, tiles, "recording brighter, %", (-limit, limit), SIGNED)
     lower.set_title("ratio over the image, less its mean", fontsize=10)
     return figure
-
-
-def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the mean of values in tiles of the image."""
-    # Single pixels would show noise alone: sixteen tiles along the longer side.
-    side = max(1, max(shape) // 16)
-    rows, columns = (-(-length // side) for length in shape)
-    place = pixel // shape[1] // side * columns + pixel % shape[1] // side
-    count = np.bincount(place, minlength=rows * columns)
-    total = np.bincount(place, values, minlength=rows * columns)
-    return quotient(total, count).reshape(rows, columns)
 
 
 def _log_ends(values: np.ndarray) -> Interval:

@@ -36,7 +36,8 @@ class TrainingOptions(FitOptions, MaskOptions):
         name: The model's name in reports.
         split: The frames held out.
         advice: For how many further poses the report gives advice; 0: for none.
-        figures: Whether TensorBoard is given figures; the numbers of the fit it gets anyway.
+        figures: Whether a page is written, and TensorBoard is given figures; the numbers of the fit
+            it gets anyway.
     """
 
     config_folder: ClassVar[str] = "train"

@@ -1,11 +1,16 @@
-"""Figures of a calibration: profiles of errors and frames, as numbers, as colours, and drawn."""
+"""Figures of a calibration: errors of frames and over covariates, the poses, the hand-eye."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
 
-from tofcorr.estimation.robust import without_strays
+from tofcorr.estimation.robust import LEVEL, without_strays
 from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
+from tofcorr.training.advice import along_axis
 from tofcorr.training.calibration import Calibration
 
 if TYPE_CHECKING:  # Matplotlib takes longer to import than a short fit.
@@ -42,36 +47,21 @@ def profile(
     return (edges[1:] + edges[:-1]) / 2, mean, spread
 
 
-def error_picture(calibration: Calibration) -> tuple[np.ndarray, str]:
-    """Return errors of some frames before, after, and after once more on a finer scale, in colours.
+def tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the mean of values in tiles of the image; NaN in a tile without any.
 
-    Returns:
-        One row a frame, from the best corrected to the worst, shape (H, W, 3), uint8; and what it
-        shows, in Markdown. Pictures narrower than 600 pixels are enlarged by a whole factor.
+    Args:
+        pixel: Numbers of the pixels, counted row by row, shape (M,).
+        values: Shape (M,).
+        shape: Of the image.
     """
-    from tofcorr.pages.drawing import coloured
-
-    data, stages, titles = calibration.data, calibration.stages, []
-    gap, columns = max(data.first.camera.height // 25, 1), {"before": [], "after": []}
-    for frame in frames_to_show(calibration):
-        (batch,) = data.batches(np.array([frame]))
-        for stage, column in columns.items():
-            error = errors_along_ray(data, stages[stage], batch)[0][0].numpy()
-            column.append(np.pad(error, ((0, gap), (0, gap)), constant_values=np.nan))
-        half = "held out" if frame in calibration.test else "fitted"
-        titles.append(f"{len(titles) + 1}. frame {frame}, {data.targets[frame]}, {half}")
-    before, after = (np.concatenate(column) for column in columns.values())
-    # All but one pixel in fifty are within the limits of the colours.
-    sizes = (np.abs(one[np.isfinite(one)]) for one in (before, after))
-    common, own = (float(np.quantile(one, 1 - 1 / 50)) or 1.0 if len(one) else 1.0 for one in sizes)
-    shown = (before, common), (after, common), (after, own)
-    picture = np.concatenate([coloured(*one) for one in shown], axis=1)
-    factor = -(-600 // picture.shape[1])
-    words = (
-        "Errors along the ray: purple too near, orange too far, grey not used. Left: before, up to "
-        f"{common:.1f} mm; middle: after; right: after, up to {own:.2f} mm. From top to bottom:\n\n"
-    )
-    return picture.repeat(factor, axis=0).repeat(factor, axis=1), words + "\n".join(titles)
+    # Single pixels would show noise alone: sixteen tiles along the longer side.
+    side = max(1, max(shape) // 16)
+    rows, columns = (-(-length // side) for length in shape)
+    place = pixel // shape[1] // side * columns + pixel % shape[1] // side
+    count = np.bincount(place, minlength=rows * columns)
+    total = np.bincount(place, values, minlength=rows * columns)
+    return np.divide(total, np.where(count, count, np.nan)).reshape(rows, columns)
 
 
 def frames_to_show(calibration: Calibration) -> np.ndarray:
@@ -82,35 +72,60 @@ def frames_to_show(calibration: Calibration) -> np.ndarray:
     return thinned(errors.frames[used][order], 5)
 
 
-def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) -> "Figure":
-    """Draw mean and standard deviation of the error against one covariate.
+def stage_words(stage: str) -> str:
+    """Return what a stage of `error_mm` is called in a picture."""
+    return stage.replace("hand_eye", "hand-eye").replace("_", " ")
 
-    Above: all stages. Below: after correction, fitted and held-out frames separately.
+
+def stage_colour(stage: str) -> str:
+    """Return the colour of a stage of `error_mm` in every picture."""
+    from tofcorr.pages.drawing import BLUE, GREY, RED
+
+    return {"before": RED, "hand_eye_only": GREY}.get(stage, BLUE)
+
+
+def profile_figure(
+    sample: PixelSample, covariates: Sequence[str], held_out: np.ndarray
+) -> "Figure":
+    """Draw mean and standard deviation of the error against covariates, a column each.
+
+    Above: all stages. In the middle: after correction, fitted and held-out frames separately.
+    Below: how many pixels there are.
 
     Args:
         sample: The pixels.
-        covariate: One of its covariates.
+        covariates: Some of its covariates.
         held_out: Global numbers of the frames held out; may be empty.
     """
-    from tofcorr.pages.drawing import BLUE, GREY, PALE, RED, line_across, panels
+    from tofcorr.pages.drawing import BLUE, GREY, PALE, line_across, panels
 
-    figure, found = panels(5, 2)
-    x, last = sample.covariates[covariate], list(sample.errors_mm.values())[-1]
-    ends, tested = without_strays(x), np.isin(sample.frame, held_out)
-    colours = {"before": RED, "hand_eye_only": GREY}
-    for stage, error in sample.errors_mm.items():
-        label = stage.replace("hand_eye", "hand-eye").replace("_", " ")
-        draw_profile(found[0], x, error, ends, colours.get(stage, BLUE), label)
-    for chosen, colour, label in ((~tested, PALE, "fitted"), (tested, BLUE, "held out")):
-        if chosen.any():
-            draw_profile(found[1], x[chosen], last[chosen], ends, colour, label)
-    titles = "All stages: mean, and one standard deviation", "After correction"
-    for axes, title in zip(found, titles, strict=True):
-        line_across(axes)
-        axes.set(xlabel=covariate, ylabel="error along the ray [mm]")
-        axes.set_title(title, fontsize=10)
-        # The best place would be found by looking at every point.
-        axes.legend(loc="upper right", fontsize=9, frameon=False)
+    count, last = len(covariates), list(sample.errors_mm.values())[-1]
+    figure, found = panels(5, 3, count, same_rows=True, shares=(3, 3, 1))
+    tested = np.isin(sample.frame, held_out)
+    halves = (~tested, PALE, "after: fitted"), (tested, BLUE, "after: held out")
+    for covariate, above, middle, below in zip(
+        covariates, found, found[count:], found[2 * count :], strict=False
+    ):
+        x = sample.covariates[covariate]
+        ends = without_strays(x)
+        for stage, error in sample.errors_mm.items():
+            draw_profile(above, x, error, ends, stage_colour(stage), stage_words(stage))
+        for chosen, colour, label in halves:
+            if chosen.any():
+                draw_profile(middle, x[chosen], last[chosen], ends, colour, label)
+        below.hist(x, bins=30, range=ends, color=GREY)
+        below.set(xlabel=covariate, yticks=[])
+        for axes in (above, middle, below):
+            axes.set_xlim(*ends)
+            axes.locator_params(axis="x", nbins=5)
+        for axes in (above, middle):
+            line_across(axes)
+            axes.set_xticklabels([])
+    lines = [*found[0].get_lines()[: len(sample.errors_mm)], *found[count].get_lines()[:-1]]
+    figure.legend(handles=lines, fontsize=8, frameon=False, ncols=5, loc="outside upper left")
+    found[0].set_ylabel("error along the ray, mm")
+    found[count].set_ylabel("after correction, mm")
+    found[2 * count].set_ylabel("pixels")
     return figure
 
 
@@ -131,18 +146,187 @@ def draw_profile(
 
     middle, mean, spread = profile(x, error, ends)
     axes.plot(middle, mean, color=colour, label=label)
-    axes.fill_between(middle, mean - spread, mean + spread, color=(colour, FAINT), linewidth=0)
+    axes.fill_between(middle, mean - spread, mean + spread, color=colour, alpha=FAINT, linewidth=0)
 
 
-def residual_figure(calibration: Calibration) -> "Figure":
-    """Draw what `error_picture` returns, with its words."""
-    from matplotlib.figure import Figure
+def image_figure(sample: PixelSample, shape: tuple[int, int]) -> "Figure":
+    """Draw the mean error over the image (H, W) at each stage, each on a scale of its own."""
+    from tofcorr.pages.drawing import SIGNED, image_map, panels
 
-    picture, words = error_picture(calibration)
-    height = 10 * picture.shape[0] / picture.shape[1] + 2
-    figure = Figure(figsize=(10, height), layout="constrained")
-    axes = figure.subplots()
-    axes.imshow(picture)
-    axes.set_axis_off()
-    axes.set_title(words, fontsize="small", loc="left")
+    figure, found = panels(2, 1, len(sample.errors_mm))
+    row, column = (sample.covariates[f"{name} [pixel]"] for name in ("row", "column"))
+    pixel = (row * shape[1] + column).astype(int)
+    for axes, (stage, error) in zip(found, sample.errors_mm.items(), strict=True):
+        tiles = tile_means(pixel, error, shape)
+        limit = float(np.nanmax(np.abs(tiles), initial=0.0)) or 1.0
+        image_map(axes, tiles, "mean error, mm", (-limit, limit), SIGNED)
+        axes.set_title(stage_words(stage), fontsize=9, color=stage_colour(stage))
+    return figure
+
+
+def residual_figure(calibration: Calibration, frames: np.ndarray) -> "Figure":
+    """Draw errors of some frames before, after, and after once more on a finer scale.
+
+    All but one pixel in fifty are within the limits of the colours.
+
+    Args:
+        calibration: The fitted model and its errors.
+        frames: Global numbers of the frames, from top to bottom.
+    """
+    from tofcorr.pages.drawing import SIGNED, image_map, panels
+
+    data, camera = calibration.data, calibration.data.first.camera
+    gap, columns = max(camera.height // 25, 1), {"before": [], "after": []}
+    for frame in frames:
+        (batch,) = data.batches(np.array([frame]))
+        for stage, column in columns.items():
+            error = errors_along_ray(data, calibration.stages[stage], batch)[0][0].numpy()
+            column.append(np.pad(error, ((0, gap), (0, 0)), constant_values=np.nan))
+    before, after = (np.concatenate(column) for column in columns.values())
+    sizes = (np.abs(one[np.isfinite(one)]) for one in (before, after))
+    common, own = (float(np.quantile(one, 1 - 1 / 50)) or 1.0 if len(one) else 1.0 for one in sizes)
+    figure, found = panels(1 + 2 * len(before) / camera.width, 1, 3)
+    shown = ("before", before, common), ("after", after, common), ("after, finer", after, own)
+    for axes, (title, image, limit) in zip(found, shown, strict=True):
+        image_map(axes, image, "error, mm", (-limit, limit), SIGNED)
+        axes.set_title(title, fontsize=9)
+    halves = np.where(np.isin(frames, calibration.test), "held out", "fitted")
+    names = [
+        f"frame {k}\n{data.targets[k]}\n{half}" for k, half in zip(frames, halves, strict=True)
+    ]
+    rows = (np.arange(len(frames)) + 1 / 2) * (len(before) / len(frames))
+    found[0].set_yticks(rows, names, fontsize=7)
+    found[0].tick_params(length=0)
+    return figure
+
+
+def before_walls(cameras: Tensor, plane: tuple[Tensor, Tensor]) -> tuple[np.ndarray, np.ndarray]:
+    """Return where cameras stand before their walls, and the direction in which they look.
+
+    The axes are to the right along the wall, up along it, and away from it; the origin is the
+    middle of what the cameras look at. "Up" is the world's z axis, or y where the wall is level.
+
+    Args:
+        cameras: world_from_camera, shape (N, 4, 4).
+        plane: Of the wall that each looks at: normals towards the camera, shape (N, 3), and
+            offsets, shape (N,).
+
+    Returns:
+        Places, metres, and unit vectors, shape (N, 3) each.
+    """
+    (normal, offset), centre, forward = plane, cameras[:, :3, 3], cameras[:, :3, 2]
+    level = int(normal.mean(dim=0).abs().argmax()) == 2
+    up = torch.eye(3, dtype=normal.dtype)[1 if level else 2].expand_as(normal)
+    right = normalize(torch.linalg.cross(up, normal), dim=1)
+    axes = torch.stack([right, torch.linalg.cross(normal, right), normal], dim=1)
+    seen = centre + along_axis(cameras, plane)[:, None] * forward
+    middle = seen.nan_to_num().median(dim=0).values
+    place = torch.einsum("nij,nj->ni", axes, centre - middle)
+    place[:, 2] = (normal * centre).sum(dim=1) + offset
+    return place.numpy(), torch.einsum("nij,nj->ni", axes, forward).numpy()
+
+
+def poses_figure(
+    calibration: Calibration, advised: Tensor, known: Sequence[Mapping[str, float]]
+) -> "Figure":
+    """Draw the wall and where the camera stood and looked, from above and from the side, to scale.
+
+    Args:
+        calibration: The fitted model and its errors.
+        advised: world_from_tool of poses to add, each before the wall of a fitted frame, shape
+            (K, 4, 4); drawn with their numbers.
+        known: `correction_curves` over the distance: the redder a strip, the less well is the
+            error known at that distance.
+    """
+    from tofcorr.pages.drawing import BLUE, RED, panels
+
+    data, hand_eye = calibration.data, calibration.fit.solution.parameters.tool_from_camera
+    columns = [data.column(name) for name in ("world_from_tool", "normal_world", "offset")]
+    first = int(calibration.train[0])
+    walls = [torch.cat([one, one[first].expand(len(advised), *one.shape[1:])]) for one in columns]
+    cameras = torch.cat([columns[0], advised]) @ hand_eye
+    place, way = before_walls(cameras, (walls[1], walls[2]))
+    fitted, tested = (
+        np.isin(np.arange(data.num_frames), k) for k in (calibration.train, calibration.test)
+    )
+    groups = (
+        (fitted, "o", BLUE, BLUE, "fitted"),
+        (tested, "o", BLUE, "white", "held out"),
+        (~(fitted | tested), "X", RED, RED, "left out"),
+    )
+    figure, found = panels(3, 1, 2)
+    length = float(np.ptp(place, axis=0).max()) / 12
+    distance, error = (
+        np.array([one[k] for one in known]) for k in ("radial_distance_m", "standard_error_mm")
+    )
+    for axes, across, label in zip(found, (0, 1), ("to the right, m", "up, m"), strict=True):
+        for low, high, size in zip(distance, distance[1:], error, strict=False):
+            axes.axvspan(low, high, color=RED, alpha=size / error.max() / 2, linewidth=0)
+        axes.axvline(0, color="black", linewidth=4)
+        at = place[:, [2, across]]
+        ends = at + length * way[:, [2, across]]
+        for chosen, mark, colour, inside, name in groups:
+            own = np.flatnonzero(chosen)
+            if len(own):
+                axes.plot(
+                    *np.stack([at[own], ends[own]]).transpose(2, 0, 1), color=colour, linewidth=1
+                )
+                look = {"color": colour, "markerfacecolor": inside, "markersize": 4, "label": name}
+                axes.plot(*at[own].T, mark, **look)
+        for number, (x, y) in enumerate(at[data.num_frames :], start=1):
+            axes.plot(
+                *np.stack([at, ends])[:, data.num_frames + number - 1].T, color="black", linewidth=1
+            )
+            axes.plot(x, y, "D", color="black", markersize=4)
+            axes.annotate(f" {number}", (x, y), fontsize=9, weight="bold")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(xlabel="distance from the wall, m", ylabel=label)
+        axes.set_title(("from above", "from the side")[across], fontsize=9)
+    figure.legend(
+        *found[0].get_legend_handles_labels(),
+        fontsize=8,
+        ncols=3,
+        loc="outside upper right",
+        frameon=False,
+    )
+    return figure
+
+
+def ellipse(covariance: np.ndarray, degrees_of_freedom: int) -> np.ndarray:
+    """Return points of the ellipse that holds two unknowns with 95 %, shape (2, P), around zero.
+
+    Its radius, in standard deviations, is that of Hotelling's T^2 of two unknowns, whose F
+    distribution of two and n degrees of freedom has a closed form.
+
+    Args:
+        covariance: Of the two, shape (2, 2).
+        degrees_of_freedom: n, of the covariance.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    radius = (degrees_of_freedom * (LEVEL ** (-2 / degrees_of_freedom) - 1)) ** 0.5
+    angle = np.linspace(0, 2 * np.pi, 100)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    return radius * vectors @ (np.sqrt(values.clip(min=0))[:, None] * circle)
+
+
+def hand_eye_figure(hand_eye: Mapping[str, Any], degrees_of_freedom: int) -> "Figure":
+    """Draw 95 % ellipses of translation and rotation around the estimate, x-y and x-z.
+
+    Args:
+        hand_eye: That of the report, with its covariance.
+        degrees_of_freedom: Of the covariance.
+    """
+    from tofcorr.pages.drawing import BLUE, FAINT, line_across, panels
+
+    figure, found = panels(5, 2, 2)
+    covariance = np.array(hand_eye["covariance_mm_deg"])
+    for axes, (start, other) in zip(found, ((0, 1), (0, 2), (3, 4), (3, 5)), strict=True):
+        points = ellipse(covariance[np.ix_([start, other], [start, other])], degrees_of_freedom)
+        axes.fill(*points, color=BLUE, alpha=FAINT)
+        axes.plot(*points, color=BLUE)
+        line_across(axes)
+        line_across(axes, vertical=True)
+        kind, unit = ("turn about", "deg") if start else ("shift along", "mm")
+        axes.set(xlabel=f"{kind} x, {unit}", ylabel=f"{kind} {'xyz'[other - start]}, {unit}")
+        axes.set_aspect("equal", adjustable="datalim")
     return figure

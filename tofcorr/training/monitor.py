@@ -18,10 +18,11 @@ from tofcorr.geometry import se3
 from tofcorr.pixels.sample import PixelSample
 from tofcorr.progress import event_writer
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.figures import error_picture, profile
+from tofcorr.training.figures import profile
 from tofcorr.training.judgement import report_text
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from torch.utils.tensorboard import SummaryWriter
 
 
@@ -36,7 +37,7 @@ class RunMonitor:
     Example:
         monitor = RunMonitor()
         calibration = Calibration(data, options, watcher=monitor.iteration)
-        monitor.write(run / "tb", calibration, report, figures=True)
+        monitor.write(run / "tb", calibration, report, sample, figures)
     """
 
     def __init__(self) -> None:
@@ -49,7 +50,12 @@ class RunMonitor:
         self._times.append(time.time())
 
     def write(
-        self, folder: Path, calibration: Calibration, report: Mapping[str, Any], *, figures: bool
+        self,
+        folder: Path,
+        calibration: Calibration,
+        report: Mapping[str, Any],
+        sample: PixelSample | None,
+        figures: Mapping[str, "Figure"],
     ) -> None:
         """Write TensorBoard's files.
 
@@ -57,16 +63,27 @@ class RunMonitor:
             folder: Where the event files go, usually RUN/tb; made if it is missing.
             calibration: The fitted model and its errors.
             report: The content of report.json, to be shown as text.
-            figures: Whether to draw figures, which take longer than the rest.
+            sample: Pixels whose errors are shown as curves and distributions; None: neither.
+            figures: Pictures of the run by name.
         """
         with event_writer(folder) as writer:
+            # TensorBoard shows groups in the order of their names: the result comes first.
+            stages = "_".join(f"{step}_{stage}" for step, stage in enumerate(report["error_mm"]))
+            for step, halves in enumerate(report["error_mm"].values()):
+                for half, error in zip(("fitted", "held_out"), halves.values(), strict=True):
+                    if error["rms"] is not None:
+                        writer.add_scalar(f"1_result/rms_mm_{half}_{stages}", error["rms"], step)
             for values in self._scalars(calibration):
                 writer.add_scalar(*values)
             # Four spaces keep the lines of a table as they are.
             lines = [report["message"], *report_text(report).splitlines()]
             writer.add_text("report", "\n".join(f"    {line}" for line in lines))
-            if figures:
-                _write_figures(writer, calibration)
+            if sample is not None:
+                _write_errors(writer, calibration, sample)
+            for name, figure in figures.items():
+                from tofcorr.pages.drawing import raster  # With it comes matplotlib.
+
+                writer.add_image(f"1_result/picture_{name}", raster(figure), dataformats="HWC")
 
     def _scalars(self, calibration: Calibration) -> Iterator[tuple[str, float, int, float]]:
         """Yield tag, value, iteration and time of every number.
@@ -99,13 +116,8 @@ class RunMonitor:
             yield tag, value, self.iterations[-1].iterations + 1, self._times[-1]
 
 
-def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
-    """Write curves over each covariate, distributions, and error images of some frames.
-
-    None of it is drawn by Matplotlib, which takes longer than a short fit. `plot_profile` of a
-    `TrainingResult`, and its neighbours, draw the same with labelled axes.
-    """
-    sample = PixelSample(calibration.data, calibration.stages, calibration.frames)
+def _write_errors(writer: "SummaryWriter", calibration: Calibration, sample: PixelSample) -> None:
+    """Write curves of the error over each covariate, and distributions."""
     tested = np.isin(sample.frame, calibration.test)
     for covariate, x in sample.covariates.items():
         low, high = ends = without_strays(x)
@@ -128,6 +140,3 @@ def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
             known = errors[chosen & np.isfinite(errors)]
             if len(known):
                 writer.add_histogram(f"error_mm/{stage}_{half}", known)
-    image, words = error_picture(calibration)
-    writer.add_image("frames/error_before_and_after", image, dataformats="HWC")
-    writer.add_text("frames/error_before_and_after", words)

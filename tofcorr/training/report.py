@@ -25,15 +25,19 @@ from tofcorr.training.support import Support
 from tofcorr.version import __version__
 
 
-def hand_eye_errors(fit: Fit) -> Tensor:
-    """Return the standard errors of translation and rotation, shape (2, 3), metres and radians.
+def hand_eye_covariance(fit: Fit) -> Tensor:
+    """Return the covariance of translation and rotation, shape (6, 6), metres and radians.
 
-    They are along the tool's axes: by leaving out one pose at a time, with what is left of the
-    noise's shift, and the shift by an error that the model lacks.
+    It is along the tool's axes: by leaving out one pose at a time, with what is left of the noise's
+    shift, and the shift by an error that the model lacks.
     """
     turn = torch.block_diag(*[fit.solution.parameters.tool_from_camera[:3, :3]] * 2)
-    matrix = turn @ fit.hand_eye_covariance @ turn.T
-    return matrix.diagonal().clamp(min=0).sqrt().view(2, 3)
+    return turn @ fit.hand_eye_covariance @ turn.T
+
+
+def hand_eye_errors(fit: Fit) -> Tensor:
+    """Return the standard errors of translation and rotation, shape (2, 3), metres and radians."""
+    return hand_eye_covariance(fit).diagonal().clamp(min=0).sqrt().view(2, 3)
 
 
 def _in_units(values: Tensor, kind: str) -> dict[str, Any]:
@@ -56,6 +60,8 @@ def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
 def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
     """Return the hand-eye transform with standard errors and 95 % intervals along the tool's axes.
 
+    `covariance_mm_deg` (6, 6) is that of the translation, then of the rotation.
+
     Args:
         fit: The fitted model.
         frames: What the recording calls the frames; `tool` carries the camera.
@@ -66,13 +72,20 @@ def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
     # Student's t, with the poses less one as degrees of freedom: a fortieth lies beyond each end.
     half_width = student_quantile(39 / 40, fit.covariance.degrees_of_freedom)
     exact = HandEyeAccuracy.model_validate(_in_units(torch.zeros(2, 3), "se"))
+    uncertain: dict[str, Any] = {}
+    if known is not None:
+        units = torch.tensor([1e3] * 3 + [math.degrees(1)] * 3, dtype=torch.float64)
+        uncertain = _in_units(half_width * hand_eye_errors(fit), "ci95")
+        uncertain["covariance_mm_deg"] = (
+            units[:, None] * hand_eye_covariance(fit) * units
+        ).tolist()
     return {
         "tool_from_camera": transform.tolist(),
         "estimated": known is not None,
         **(known or exact).model_dump(mode="json"),
         "noise_shift": shift,
         "frames": frames.to_mapping(),
-        **({} if known is None else _in_units(half_width * hand_eye_errors(fit), "ci95")),
+        **uncertain,
     }
 
 

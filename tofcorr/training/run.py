@@ -22,7 +22,7 @@ from tofcorr.correction.state import (
 from tofcorr.errors import ConfigError, ExportError
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Solution
-from tofcorr.files import refuse_existing, staged_folder, write_json
+from tofcorr.files import refuse_existing, staged_folder, write_json, write_text
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import REFERENCE_FILE, estimate_reference, save_reference
 from tofcorr.options import dump_yaml, resolve_options
@@ -33,7 +33,7 @@ from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import stages
 from tofcorr.training.calibration import Calibration, TrainingOptions
-from tofcorr.training.figures import profile_figure, residual_figure
+from tofcorr.training.figures import frames_to_show, profile_figure, residual_figure
 from tofcorr.training.judgement import DO_NOT_USE, against_garbage, frames_left_out, report_text
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report
@@ -125,7 +125,7 @@ class TrainingResult:
         self.show_in(Path(folder))
 
     def write_into(self, folder: Path) -> None:
-        """Write all files but TensorBoard's into an existing folder."""
+        """Write all files but TensorBoard's and the page into an existing folder."""
         fit, options = self.fit, self.options
         state = calibration_state(self.data, options, fit)
         save_calibration(folder / STATE_FILE, state)
@@ -137,7 +137,7 @@ class TrainingResult:
         self.write_report(folder)
         text = dump_yaml(options.to_mapping(), last="model")
         (folder / "config.yaml").write_text(text, encoding="utf-8")
-        text = dump_yaml(calibration_mapping(self.data, options, fit, self.report))
+        text = dump_yaml(self._found)
         (folder / "calibration.yaml").write_text(text, encoding="utf-8")
 
     def write_report(self, folder: Path) -> None:
@@ -145,9 +145,16 @@ class TrainingResult:
         write_json(folder / "report.json", self.report, ExportError)
 
     def show_in(self, folder: Path) -> None:
-        """Write TensorBoard's files of a run folder."""
-        figures = self.options.figures
-        self.monitor.write(folder / "tb", self.calibration, self.report, figures=figures)
+        """Write the page of a run folder, unless figures are off, and TensorBoard's files."""
+        figures, sample = {}, None
+        if self.options.figures:
+            from tofcorr.training.page import draw_figures, render
+
+            sample = self._sample
+            content = self.report, self.calibration, sample, self._found
+            figures = draw_figures(*content)
+            write_text(folder / "report.html", render(*content, figures))
+        self.monitor.write(folder / "tb", self.calibration, self.report, sample, figures)
 
     def plot_profile(self, covariate: str = "distance") -> "Figure":
         """Draw mean and standard deviation of the error against a covariate.
@@ -159,18 +166,23 @@ class TrainingResult:
             CalibrationDataError: The recording has no such covariate.
         """
         name = self._sample.covariate_named(covariate)
-        return profile_figure(self._sample, name, self.calibration.test)
+        return profile_figure(self._sample, [name], self.calibration.test)
 
     def plot_residuals(self) -> "Figure":
         """Draw the error images of some frames before and after correction.
 
         The frames range from the best corrected to the worst.
         """
-        return residual_figure(self.calibration)
+        return residual_figure(self.calibration, frames_to_show(self.calibration))
 
     def __repr__(self) -> str:
         """Return errors, hand-eye translation, advice and warnings, as the command prints them."""
         return report_text(self.report)
+
+    @cached_property
+    def _found(self) -> dict[str, Any]:
+        """The content of calibration.yaml."""
+        return calibration_mapping(self.data, self.options, self.fit, self.report)
 
     @cached_property
     def _sample(self) -> PixelSample:
@@ -243,9 +255,9 @@ def train(
     Args:
         recordings: A folder, a `Recording`, or several of either.
         config: A shipped configuration by name, a YAML file, its keys and values, or the options.
-        out: Folder of the run, written whole or not at all; nothing may be there yet. Files for
-            TensorBoard follow once it is there. None writes nothing; `TrainingResult.save` does
-            later.
+        out: Folder of the run, written whole or not at all; nothing may be there yet. The page
+            and files for TensorBoard follow once it is there. None writes nothing;
+            `TrainingResult.save` does later.
         resume: Folder of an interrupted run of the same model; the fit goes on where it stood.
         force: Fit whatever the recordings look like, and write a corrector whatever the verdict.
 
@@ -311,5 +323,7 @@ def train(
                     result.show_in(place)
                 result.write_report(place)
             except (OSError, ExportError) as error:
-                _LOG.warning("%s is whole; its files for TensorBoard are not: %s", out, error)
+                _LOG.warning(
+                    "%s is whole; its page or files for TensorBoard are not: %s", out, error
+                )
         return result

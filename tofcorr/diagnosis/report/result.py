@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -37,7 +36,7 @@ from tofcorr.diagnosis.report.words import (
 from tofcorr.diagnosis.rerun.checks import Closure, DegradedStage, Transfer
 from tofcorr.diagnosis.rerun.simulator import Evidence, FittedValue, sensor_of
 from tofcorr.diagnosis.sums.study import Study, absorbed_share
-from tofcorr.digits import decimals, known, known_interval
+from tofcorr.digits import in_mm, known, known_interval, with_interval
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.pairs import LEAST_P
 from tofcorr.options import dump_yaml
@@ -307,7 +306,7 @@ def render(result: DiagnosisResult) -> str:
 
     study, named = result.evidence.study, result.evidence.named
     filters = {
-        "mm": _mm_shown,
+        "mm": in_mm,
         "metres": mm,
         "known": known,
         "known_interval": known_interval,
@@ -321,7 +320,7 @@ def render(result: DiagnosisResult) -> str:
         "cause": partial(cause_words, study),
         "along": along,
         "p_of_draws": lambda p: p_words(p, LEAST_P),
-        "with_digits": _with_digits,
+        "with_digits": lambda one: with_interval(one["value"], one["ci"]),
     }
     return page_text(
         "tofcorr.diagnosis.report",
@@ -338,29 +337,6 @@ def render(result: DiagnosisResult) -> str:
         stage_words=STAGE_WORDS,
         libraries=f"torch {torch.__version__}, NumPy {np.__version__}",
     )
-
-
-def _mm_shown(value: float | None) -> str:
-    if value is None:
-        return "–"
-    return f"{value:z.1f}" if round(abs(value), 1) >= 1 else f"{value:z.2f}"
-
-
-def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:
-    """Return a fitted value and its interval with the digits that are known."""
-    value, ends = entry["value"], entry["ci"]
-    if value is None:
-        return "–", ""
-    interval = (value, value) if ends is None or None in ends else (ends[0], ends[1])
-    largest = max(abs(value), *map(abs, interval))
-    power = math.floor(math.log10(largest)) if largest else 0
-    # Up to five digits before or after the point are read at a glance.
-    if -3 <= power < 5:
-        numbers = [known(number, interval, 6) for number in (value, *interval)]
-    else:  # Pixel terms are as small as 1e-12 m / pixel^4.
-        digits = max(power + decimals(interval, 16), 1)
-        numbers = [f"{number:.{min(digits, 3)}e}" for number in (value, *interval)]
-    return numbers[0], "" if interval[0] == interval[1] else " to ".join(numbers[1:])
 
 
 def write_events(result: DiagnosisResult, folder: Path | str) -> None:
