@@ -5,9 +5,13 @@ ideal: where each ray meets the board.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import numpy as np
+
+if TYPE_CHECKING:  # torch loads on first use
+    from tofcorr.data.recording import Recording
 
 SIZE = 5.7, 3.1
 """Of both pictures, inches: the same, as they stand side by side."""
@@ -59,7 +63,7 @@ def _draw_correction(config: str, recording: Path, out: Path) -> None:
     save_figure(figure, out)
 
 
-def _ideal(recording: "tofcorr.Recording") -> np.ndarray:  # noqa: F821 - torch loads on first use
+def _ideal(recording: "Recording") -> np.ndarray:
     """Return the depth at which each ray meets its board, shape (N, H, W), metres, of its kind."""
     from tofcorr.geometry.rays import ray_directions
 
@@ -68,7 +72,7 @@ def _ideal(recording: "tofcorr.Recording") -> np.ndarray:  # noqa: F821 - torch 
     planes = zip(poses, recording.frames.normal_world, recording.frames.offset, strict=True)
     depth = [-(n @ pose[:3, 3] + d) / (rays @ pose[:3, :3].T @ n) for pose, n, d in planes]
     along = rays[..., 2] if recording.depth_kind == "z" else 1.0
-    return np.array(depth * along, dtype=np.float32)
+    return np.array(np.stack(depth) * along, dtype=np.float32)
 
 
 if __name__ == "__main__":

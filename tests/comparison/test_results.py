@@ -1,12 +1,15 @@
 """`tofcorr.evaluate` and `tofcorr.select`: what the commands print, draw and write, as results."""
 
+import html
 import json
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from shown_pages import fetched, silent
 from simulated_walls import EA, simulated_wall
 
 import tofcorr
@@ -55,7 +58,8 @@ def test_evaluate_returns_what_the_command_prints_and_writes(
     written = json.loads((tmp_path / "out" / "evaluation.json").read_text(), parse_constant=fail)
     assert written == json.loads(json.dumps(evaluation.to_mapping()))
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"evaluation.json", "evaluation.md", "comparison.png", "config.yaml", "tb"}
+    files = {"evaluation.json", "evaluation.md", "comparison.png", "config.yaml", "tb"}
+    assert names == files | {"report.html"}
     assert "Table 2" in printed
     half, folds = (written["sets"][0]["held_out"][name] for name in ("half", "folds"))
     assert len(folds["error_mm"]["rms_mm"]["EA"]["splits"]) == 3
@@ -78,7 +82,24 @@ def test_select_returns_what_the_command_prints_and_writes(
 
 def test_results_are_drawn(evaluation: tofcorr.EvaluationResult) -> None:
     (comparison,) = evaluation.plot_comparison().axes
-    assert [text.get_text() for text in comparison.get_xticklabels()] == ["wall"]
+    assert comparison.get_title("left") == "wall"
+    assert [text.get_text() for text in comparison.get_yticklabels()] == evaluation.options.columns
+
+
+def test_pages_hold_the_verdict_and_every_cell_of_the_tables(
+    evaluation: tofcorr.EvaluationResult, selection: tofcorr.SelectionResult
+) -> None:
+    own, verdict = evaluation.to_mapping()["sets"][0]["held_out"]["folds"], selection.verdict
+    best = own["error_mm"]["mean_abs_mm"]["EA"]["mean"]
+    first = f"wall: EA has the smallest held-out error, {best:.2f} mm"
+    for result, said in ((evaluation, first), (selection, verdict)):
+        page = result.page()
+        assert (fetched(page), silent(page)) == ([], 0)
+        shown = html.unescape(page)
+        assert said in shown[: shown.index("<h2>")]
+        for table in result.tables():
+            for cell in chain((table.title, table.note), table.header, *table.rows):
+                assert f">{cell}<" in shown
 
 
 def test_every_set_is_a_row_and_recordings_of_one_selection_are_taken_together(

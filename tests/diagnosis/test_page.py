@@ -14,6 +14,7 @@ from matplotlib.text import Text
 from optional import present
 from shown_pages import WIDTHS, fetched, looked_at, needs_browser, silent
 
+import tofcorr
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Estimated, Stage
 from tofcorr.diagnosis.report.figures import all_figures, stage_bars
@@ -93,6 +94,8 @@ def test_every_picture_of_every_kind_of_report_has_words(
     kinds = [(kind(time_diagnosis), rendered(kind)) for kind in (with_simulator, without_effects)]
     for result, whole in (*kinds, (time_diagnosis, page)):
         assert (fetched(whole), silent(whole)) == ([], 0)
+        # The version of the file of numbers stood there.
+        assert f"<footer>tofcorr {tofcorr.__version__}</footer>" in whole
         figures, shown = all_figures(result), html.unescape(whole)
         assert ("where_as_given" in figures) == (result.stages[0].gap is not None)
         for name in figures:

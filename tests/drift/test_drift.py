@@ -1,5 +1,6 @@
 """A camera that reads as it did is not accused, one that does not is found out."""
 
+import html
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +13,7 @@ import torch
 from drift.few_walls import FEW, Walls, sensor
 from optional import present
 from running import Program
+from shown_pages import fetched, silent
 from simulated_walls import CAMERA, simulated_wall
 
 import tofcorr
@@ -86,7 +88,7 @@ def test_a_wall_that_bends_is_not_flat_any_more(state: CalibrationState, walls: 
     assert found.flatness > found.threshold
 
 
-def test_the_command_says_so_and_writes_json(
+def test_the_command_says_so_and_writes_json_and_a_page(
     state: CalibrationState, walls: Walls, tmp_path: Path, program: Program
 ) -> None:
     few = walls(11, 20.0)
@@ -103,6 +105,16 @@ def test_the_command_says_so_and_writes_json(
     assert written["offset_mm"] == pytest.approx(20.0, abs=1.0)
     # A run of an older version has no reference.
     assert "takes the form" in repr(found)
+    page = tmp_path / "check.html"
+    said = program("check", *given, "--page", page)
+    assert said == (0, f"{found!r}\nPage written to {page}\n", "")
+    text = html.unescape(page.read_text(encoding="utf-8"))
+    assert (fetched(text), silent(text)) == ([], 0)
+    for sentence in repr(found).splitlines():
+        assert sentence in text
+    assert f"<b>{1e3 * found.offset:.1f} mm</b>" in text
+    assert "exists already" in program("check", *given, "--page", page).err
+    assert "ends in .html" in program("check", *given, "--page", tmp_path / "check.md").err
 
 
 @pytest.mark.parametrize(

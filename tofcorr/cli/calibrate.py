@@ -93,7 +93,8 @@ def evaluate_command(
     Every RECORDING is evaluated on its own, as one set: a random half held out, k-fold
     cross-validation by image with paired t-tests, and repeated random splits if asked for. The
     columns "before" (no calibration) and "hand-eye only" (no depth correction) are there to compare
-    with. Writes evaluation.json, evaluation.md, comparison.png and TensorBoard files to OUT.
+    with. Writes report.html, evaluation.json, evaluation.md, comparison.png and TensorBoard files
+    to OUT.
     Ctrl-C ends it early: the report then holds the models that were finished.
     """
     from tofcorr.comparison.evaluate import evaluate
@@ -111,8 +112,8 @@ def select_command(options: "SelectionOptions", recordings: tuple[Path, ...], **
     """Compare models on images, distances and targets that they were not fitted to.
 
     Names the simplest model within one standard error of the best, and those that do not differ
-    significantly from it. Writes selection.json and selection.md to OUT. Ctrl-C ends it early:
-    the report then holds the models that were finished.
+    significantly from it. Writes report.html, selection.json and selection.md to OUT. Ctrl-C ends
+    it early: the report then holds the models that were finished.
     """
     from tofcorr.comparison.select import select
 
@@ -126,6 +127,7 @@ def select_command(options: "SelectionOptions", recordings: tuple[Path, ...], **
 @option("--wall", _WALL, default="per_image", type=click.Choice(["per_image", "one", "recorded"]))
 @option("--threshold-mm", _DRIFTED, default=5.0)
 @option("--out", "JSON file to write.", type=REPLACED_FILE)
+@option("--page", "HTML page to write.", type=NewPath())
 @force_option
 def check_command(run: Path, recordings: tuple[Path, ...], **given: Any) -> None:  # noqa: ANN401
     """Measure a calibration again on a few frames and say how far the camera has drifted.
@@ -135,3 +137,5 @@ def check_command(run: Path, recordings: tuple[Path, ...], **given: Any) -> None
     from tofcorr.drift.check import check
 
     click.echo(repr(check(run, recordings, **given)))
+    if given["page"] is not None:
+        click.echo(f"Page written to {given['page']}")

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, pairwise, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter, ScalarFormatter
 
 from tofcorr.comparison.experiment import METRICS, VIEWS, Experiment, compare
 from tofcorr.comparison.options import (
@@ -19,6 +19,7 @@ from tofcorr.comparison.options import (
     comparability_notes,
     masks_of,
 )
+from tofcorr.comparison.page import held_out_figure, render
 from tofcorr.comparison.statistics import Estimate, Table
 from tofcorr.files import staged_folder, write_json
 from tofcorr.options import dump_yaml, resolve_options
@@ -124,38 +125,46 @@ class EvaluationResult:
 
     def plot_comparison(self) -> Figure:
         """Draw the held-out mean absolute error of each model and set, with 95 % intervals."""
-        options, columns, sets = self.options, self.options.columns, self.sets
-        width = max(6, len(columns) * (1 + len(sets)) / 2)
-        figure = Figure(figsize=(width, 5), layout="constrained")
-        axes, protocol = figure.subplots(), "folds" if options.folds else "half"
-        for k, column in enumerate(columns):
-            found = [one.estimate(protocol, "mean_abs_mm", column) for one in sets]
-            # Beside one another, on four fifths of the room of a set.
-            place = np.arange(len(sets)) + ((k + 1 / 2) / len(columns) - 1 / 2) * 4 / 5
-            means = np.array([one.mean for one in found])
-            spread = np.nan_to_num([one.half_width for one in found])
-            # On a logarithmic axis an interval that reaches zero ends near it.
-            down = np.minimum(spread, means * (1 - 1 / 50))
-            colour = {0: "0.6", 1: "0.35"}.get(k, f"C{k - 2}")
-            style = {"fmt": "o", "color": colour, "capsize": 3, "label": column}
-            axes.errorbar(place, means, (down, spread), **style)
-            for x, mean in zip(place, means, strict=True):
-                axes.annotate(f" {mean:.1f}", (x, mean), fontsize=8, color=colour, va="bottom")
-        axes.set(yscale="log", ylabel="held-out mean absolute error [mm]")
-        axes.yaxis.set_major_formatter(ScalarFormatter())
-        axes.yaxis.set_minor_formatter(LogFormatter())
-        axes.set_xticks(np.arange(len(sets)), [one.name for one in sets])
-        folds = f"{options.folds}-fold cross-validation, 95 % intervals"
-        how = folds if options.folds else "one split"
-        axes.set_title(f"Models on images they were not fitted to ({how})", fontsize=10)
-        figure.legend(loc="outside lower center", fontsize=8, ncols=len(columns))
-        axes.grid(axis="y", color="0.9")
-        return figure
+        label = "held-out mean absolute error, mm"
+        return held_out_figure(self._errors, label, [self._best(one) for one in self._errors])
+
+    @cached_property
+    def _errors(self) -> dict[str, dict[str, Estimate]]:
+        """Held-out mean absolute errors by set and column."""
+        protocol, columns = "folds" if self.options.folds else "half", self.options.columns
+        return {
+            one.name: {k: one.estimate(protocol, "mean_abs_mm", k) for k in columns}
+            for one in self.sets
+        }
+
+    def _best(self, name: str) -> str:
+        """Return the model of the smallest error on a set."""
+        found = {k: v for k, v in self._errors[name].items() if k not in (BEFORE, HAND_EYE_ONLY)}
+        return min(found, key=lambda k: found[k].mean)
+
+    def _verdict(self, name: str) -> str:
+        own, best = self._errors[name], self._best(name)
+        bare = (
+            f"{own[BEFORE].mean:.2f} before, {own[HAND_EYE_ONLY].mean:.2f} with the hand-eye alone"
+        )
+        return f"{name}: {best} has the smallest held-out error, {own[best].mean:.2f} mm ({bare})."
+
+    def page(self) -> str:
+        """Return the same as one HTML page with a picture."""
+        return render(
+            "Models on frames that they were not fitted to",
+            [*self.headlines, *map(self._verdict, self._errors)],
+            self.plot_comparison(),
+            self.tables(),
+            comparability_notes(self.options),
+            self.warnings,
+        )
 
     def write(self, folder: Path) -> None:
-        """Write `evaluation.json`, `evaluation.md`, `comparison.png`, `config.yaml` and `tb/`."""
+        """Write numbers, tables, page, picture, options, and TensorBoard's files into a folder."""
         write_json(folder / "evaluation.json", self.to_mapping())
         (folder / "evaluation.md").write_text(self.markdown(), encoding="utf-8")
+        (folder / "report.html").write_text(self.page(), encoding="utf-8")
         options = dump_yaml(self.options.to_mapping())
         (folder / "config.yaml").write_text(options, encoding="utf-8")
         image = save_figure(self.plot_comparison(), folder / "comparison.png")
@@ -275,8 +284,8 @@ def evaluate(
             each.
         config: Models and protocols: the name of a shipped configuration (`paper`, `robust`), a
             file, a mapping or `EvaluationOptions`.
-        out: Folder for `evaluation.json`, `evaluation.md`, `comparison.png`, `config.yaml` and
-            TensorBoard files; nothing may be there yet. None writes nothing.
+        out: Folder for `evaluation.json`, `evaluation.md`, `report.html`, `comparison.png`,
+            `config.yaml` and TensorBoard files; nothing may be there yet. None writes nothing.
         force: Compare whatever the recordings look like.
         tell: Called with what the work will cost, and with a line as each model ends.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from tofcorr.comparison.experiment import Experiment, compare
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
+from tofcorr.comparison.page import held_out_figure, render
 from tofcorr.comparison.statistics import Ranking, Table
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
@@ -22,6 +23,8 @@ from tofcorr.plausibility.examine import vet
 from tofcorr.progress import LOG
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import number_or_none
+
+_METRICS = {"mean_abs": "mean absolute", "rms": "RMS"}
 
 
 @dataclass(frozen=True, repr=False)
@@ -83,9 +86,26 @@ class SelectionResult:
         page = self._page([table.markdown() for table in self.tables()])
         return f"# Choice of a model\n\n{page}\n"
 
+    def page(self) -> str:
+        """Return the same as one HTML page with a picture."""
+        metric = _METRICS[self.options.metric]
+        ordered = {
+            f"{by}s held out": dict(sorted(ranking.errors.items(), key=lambda item: item[1].mean))
+            for by, ranking in self.rankings.items()
+        }
+        best = [ranking.best for ranking in self.rankings.values()]
+        return render(
+            "Choice of a model",
+            [*filter(None, [self.headline]), self.verdict],
+            held_out_figure(ordered, f"held-out {metric} error, mm", best),
+            self.tables(),
+            self._notes,
+            self.experiment.warnings,
+        )
+
     def tables(self) -> list[Table]:
         """Return a table for each grouping, the model with the smallest error first."""
-        metric = {"mean_abs": "mean absolute", "rms": "RMS"}[self.options.metric]
+        metric = _METRICS[self.options.metric]
         found, header = [], ["model", "unknowns", "error", "behind the best", ""]
         for by, ranking in self.rankings.items():
             ordered = sorted(ranking.errors.items(), key=lambda item: item[1].mean)
@@ -107,17 +127,20 @@ class SelectionResult:
         ]
 
     def _page(self, tables: list[str]) -> str:
-        parts = [
-            *([self.headline] if self.headline else []),
-            self.verdict,
-            *tables,
+        doubtful = filter(None, [self.headline])
+        warnings = (f"Warning: {warning}" for warning in self.experiment.warnings)
+        return "\n\n".join([*doubtful, self.verdict, *tables, *warnings, *self._notes])
+
+    @property
+    def _notes(self) -> list[str]:
+        """How the numbers were found, and what could not be held out."""
+        skipped = self.experiment.skipped.items()
+        return [
             *comparability_notes(self.options),
-            *(f"Not held out by {by}: {why}" for by, why in self.experiment.skipped.items()),
-            *(f"Warning: {warning}" for warning in self.experiment.warnings),
+            *(f"Not held out by {by}: {why}" for by, why in skipped),
             "Errors are distances to the plane, mean over the held-out poses ± one standard error. "
             "Behind the best: paired difference, pose by pose, with its 95 % interval.",
         ]
-        return "\n\n".join(parts)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return every number as plain values, as in `selection.json`."""
@@ -177,8 +200,8 @@ def select(
             are taken together.
         config: Models and what is held out: the name of a shipped configuration (`paper`,
             `all_models`), a file, a mapping or `SelectionOptions`.
-        out: Folder for `selection.json` and `selection.md`; nothing may be there yet. None writes
-            nothing.
+        out: Folder for `selection.json`, `selection.md` and `report.html`; nothing may be there
+            yet. None writes nothing.
         force: Compare whatever the recordings look like.
         tell: Called with what the work will cost, and with a line as each model ends.
 
@@ -205,6 +228,7 @@ def select(
         result = SelectionResult(rankings, found, options, inspection.headline)
         if folder is not None:
             (folder / "selection.md").write_text(result.markdown(), encoding="utf-8")
+            (folder / "report.html").write_text(result.page(), encoding="utf-8")
             write_json(folder / "selection.json", result.to_mapping())
     return result
 

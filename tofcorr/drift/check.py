@@ -11,7 +11,7 @@ from tofcorr.drift.offset import OffsetSums, Wall
 from tofcorr.drift.result import DriftResult, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import solvable
-from tofcorr.files import file_to_replace, write_json
+from tofcorr.files import file_to_replace, write_json, write_text
 from tofcorr.fit.reference import (
     REFERENCE_FILE,
     Reference,
@@ -19,6 +19,7 @@ from tofcorr.fit.reference import (
     share_unlike,
     unknown_reference,
 )
+from tofcorr.pages.page import refuse_page
 from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import CAMERA, FEWEST_PIXELS, LARGEST_GAP
@@ -35,6 +36,7 @@ def check(
     wall: Wall = "per_image",
     threshold_mm: float = 5.0,
     out: str | Path | None = None,
+    page: str | Path | None = None,
     force: bool = False,
 ) -> DriftResult:
     """Measure a calibration again on a few frames of a wall.
@@ -48,6 +50,7 @@ def check(
         threshold_mm: Offset, or departure of a corrected wall from a plane, above which the camera
             counts as drifted, millimetres.
         out: JSON file for the numbers; None writes nothing.
+        page: HTML page with pictures to write, a new name; None writes none.
         force: Measure whatever the frames look like.
 
     Raises:
@@ -55,13 +58,15 @@ def check(
         CalibrationDataError: `run` is not a run; the camera is another one; no image has enough
             usable pixels; the frames cannot be what they say (see `tofcorr.inspect`); `one` is
             asked for and no robot moves or there are several estimated walls; `recorded` is asked
-            for and the planes are estimated; the offset is one that no camera has; or `out` cannot
-            be written.
+            for and the planes are estimated; the offset is one that no camera has; or `out` or
+            `page` cannot be written.
     """
     if threshold_mm <= 0:
         raise ConfigError(f"threshold_mm: expected a positive number, got {threshold_mm:g}.")
     if out is not None:
         file_to_replace(Path(out), CalibrationDataError)
+    if page is not None:
+        refuse_page(Path(page))
     state, dataset = load_calibration(Path(run) / STATE_FILE), Dataset(opened(recordings))
     _refuse_unfit(state, dataset, "per_image")
     planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
@@ -78,6 +83,9 @@ def check(
     result = replace(result, headline=headline or result.headline)
     if out is not None:
         write_json(Path(out), result.to_mapping())
+    if page is not None:
+        names = [recording.path.name for recording in dataset.recordings]
+        write_text(page, result.page(Path(run).name, names), CalibrationDataError)
     return result
 
 

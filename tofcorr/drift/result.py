@@ -1,11 +1,14 @@
 """What a drift check found, in words and as plain values."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from tofcorr.digits import known, known_interval
+from tofcorr.digits import in_mm, known, known_interval
 from tofcorr.drift.offset import ImageDrift, Wall
 from tofcorr.plausibility.finding import in_words
+
+if TYPE_CHECKING:  # Matplotlib takes longer to import than a check.
+    from matplotlib.figure import Figure
 
 Verdict = Literal["holds", "drifted", "undecided"]
 
@@ -53,6 +56,9 @@ class DriftResult:
 
     def __repr__(self) -> str:
         """Return the verdict and its numbers in a few sentences."""
+        return "\n".join(self._sentences())
+
+    def _sentences(self) -> list[str]:
         interval = 1e3 * self.interval[0], 1e3 * self.interval[1]
         offset = known(1e3 * self.offset, interval, most=2, sign="+")
         low, high = known_interval(interval, most=2, sign="+")
@@ -78,7 +84,44 @@ class DriftResult:
             and "The run has no reference.json: the interval takes the form of its model as right.",
             self.verdict == "undecided" and how,
         ]
-        return "\n".join(line for line in lines if line)
+        return [line for line in lines if line]
+
+    def plot(self) -> "Figure":
+        """Draw the offset and how flat each image's wall is, against the threshold."""
+        from tofcorr.pages.drawing import BLUE, FAINT, GREY, RED, line_across, panels
+
+        limit, colour = 1e3 * self.threshold, RED if self.verdict == "drifted" else BLUE
+        figure, (upper, lower) = panels(4, 2, shares=(1, 3))
+        low, high = (1e3 * end for end in self.interval)
+        upper.axvspan(-limit, limit, color=GREY, alpha=FAINT, linewidth=0)
+        upper.plot([low, high], [0, 0], color=colour, linewidth=2)
+        upper.plot(1e3 * self.offset, 0, "o", color=colour)
+        line_across(upper, vertical=True)
+        upper.set(yticks=[], xlabel="offset since the calibration, mm (positive: too far)")
+        frames = [one.frame for one in self.images]
+        lower.axhspan(0, limit, color=GREY, alpha=FAINT, linewidth=0)
+        lower.plot(
+            frames, [1e3 * one.flatness for one in self.images], "o", color=BLUE, markersize=4
+        )
+        lower.set(xlabel="frame", ylabel="departure from a plane, mm", ylim=(0, None))
+        return figure
+
+    def page(self, run: str, recordings: list[str]) -> str:
+        """Return the same as one HTML page with a picture.
+
+        Args:
+            run: Name of the calibration.
+            recordings: Names of the recordings.
+        """
+        from tofcorr.pages.page import page_text
+
+        headline, *others = self._sentences()
+        if self.headline:
+            headline, others = others[0], [headline, *others[1:]]
+        values = {"run": run, "recordings": recordings, "headline_said": headline}
+        values |= {"others": others, **self.to_mapping()}
+        figures, filters = {"drift": self.plot()}, {"mm": in_mm}
+        return page_text("tofcorr.drift", "report.html.j2", figures, filters, **values)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the finding as plain values, as in the command's JSON file."""

@@ -47,12 +47,12 @@ def page_text(
         lstrip_blocks=True,
     )
     environment.filters |= filters
-    environment.globals |= {
-        "figures": {key: Markup(svg_of(figure)) for key, figure in figures.items()},
-        "style": Markup(resource("tofcorr.pages", "style.css")),
-        "version": __version__,
-    }
-    return environment.get_template(name).render(values)
+    return environment.get_template(name).render(
+        values,
+        figures={key: Markup(svg_of(figure)) for key, figure in figures.items()},
+        style=Markup(resource("tofcorr.pages", "style.css")),
+        version=__version__,
+    )
 
 
 def resource(folder: str, name: str) -> str:
