@@ -21,7 +21,7 @@ _ELSEWHERE = frozenset({"_mm", "_us", "_deg", "_optical", "camera_link"})
 @cache
 def _words() -> frozenset[str]:
     """Return every word of the sources, and of the fenced examples in the documents."""
-    files = [ROOT / "pyproject.toml", ROOT / "mkdocs.yml"]
+    files = [ROOT / "pyproject.toml", ROOT / "docs" / "conf.py"]
     for folder in _SOURCES:
         files += [path for path in (ROOT / folder).rglob("*") if path.suffix in _SUFFIXES]
     texts = [path.read_text(encoding="utf-8") for path in files]
