@@ -1,17 +1,37 @@
-"""Draw the README's picture: held-out error of a real recording before and after correction."""
+"""Draw the README's two pictures of a real recording: its error corrected, and its gap closed.
+
+The recording is that of `tofcorr import checkerboard` in docs/how-to/record.md. The simulator is
+ideal: where each ray meets the board.
+"""
 
 from pathlib import Path
 
 import click
 import numpy as np
 
+SIZE = 5.7, 3.1
+"""Of both pictures, inches: the same, as they stand side by side."""
+
 
 @click.command()
-@click.option("--config", required=True, type=click.Path(path_type=Path))
+@click.option("--config", required=True, help="Of the training.")
 @click.option("--recording", required=True, type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path))
-def command(config: Path, recording: Path, out: Path) -> None:
-    """Train on half of the poses of RECORDING, and draw the errors of the other half to OUT."""
+@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False))
+def command(config: str, recording: Path, out: Path) -> None:
+    """Write to OUT how training on half of RECORDING corrects the rest, and how its gap closes."""
+    import tofcorr
+    from tofcorr.pages.drawing import save_figure
+
+    _draw_correction(config, recording, out / "correction.png")
+    found = tofcorr.diagnose(recording, _ideal, {"page": False, "simulate_anew": False})
+    click.echo(found.verdict)
+    figure = found.plot("stages")
+    figure.set_size_inches(*SIZE)
+    save_figure(figure, out / "gap.png")
+
+
+def _draw_correction(config: str, recording: Path, out: Path) -> None:
+    """Train on half of the poses, and draw the errors of the other half."""
     from matplotlib.figure import Figure
 
     import tofcorr
@@ -22,9 +42,9 @@ def command(config: Path, recording: Path, out: Path) -> None:
     found = tofcorr.train(recording, config).calibration
     stages = {name: found.stages[name] for name in ("before", "after")}
     sample = PixelSample(found.data, stages, found.test)
-    figure = Figure(figsize=(12, 3.4), layout="constrained")
-    panels = figure.subplots(1, 3, sharey=True)
-    for axes, name in zip(panels, ("distance", "column", "amplitude"), strict=True):
+    figure = Figure(figsize=SIZE, layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, name in zip(panels, ("distance", "amplitude"), strict=True):
         covariate = sample.covariate_named(name)
         x = sample.covariates[covariate]
         ends = float(np.nanmin(x)), float(np.nanmax(x))
@@ -35,8 +55,20 @@ def command(config: Path, recording: Path, out: Path) -> None:
         axes.grid(alpha=0.25)
     panels[0].set_ylabel("error along the ray, mm")
     panels[0].legend()
-    figure.suptitle(f"{len(found.test)} held-out views: mean error and one standard deviation")
+    figure.suptitle(f"{len(found.test)} held-out views: mean error, one standard deviation")
     save_figure(figure, out)
+
+
+def _ideal(recording: "tofcorr.Recording") -> np.ndarray:  # noqa: F821 - torch loads on first use
+    """Return the depth at which each ray meets its board, shape (N, H, W), metres, of its kind."""
+    from tofcorr.geometry.rays import ray_directions
+
+    rays = ray_directions(recording.camera).numpy()
+    poses = recording.frames.world_from_tool @ recording.tool_from_camera
+    planes = zip(poses, recording.frames.normal_world, recording.frames.offset, strict=True)
+    depth = [-(n @ pose[:3, 3] + d) / (rays @ pose[:3, :3].T @ n) for pose, n, d in planes]
+    along = rays[..., 2] if recording.depth_kind == "z" else 1.0
+    return np.array(depth * along, dtype=np.float32)
 
 
 if __name__ == "__main__":
