@@ -68,7 +68,7 @@ def _ideal(recording: "tofcorr.Recording") -> np.ndarray:  # noqa: F821 - torch 
     planes = zip(poses, recording.frames.normal_world, recording.frames.offset, strict=True)
     depth = [-(n @ pose[:3, 3] + d) / (rays @ pose[:3, :3].T @ n) for pose, n, d in planes]
     along = rays[..., 2] if recording.depth_kind == "z" else 1.0
-    return np.array(depth * along, dtype=np.float32)
+    return (np.array(depth) * along).astype(np.float32)
 
 
 if __name__ == "__main__":
