@@ -5,9 +5,13 @@ ideal: where each ray meets the board.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import numpy as np
+
+if TYPE_CHECKING:
+    from tofcorr import Recording
 
 SIZE = 5.7, 3.1
 """Of both pictures, inches: the same, as they stand side by side."""
@@ -59,7 +63,7 @@ def _draw_correction(config: str, recording: Path, out: Path) -> None:
     save_figure(figure, out)
 
 
-def _ideal(recording: "tofcorr.Recording") -> np.ndarray:  # noqa: F821 - torch loads on first use
+def _ideal(recording: "Recording") -> np.ndarray:
     """Return the depth at which each ray meets its board, shape (N, H, W), metres, of its kind."""
     from tofcorr.geometry.rays import ray_directions
 
