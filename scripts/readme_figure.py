@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-if TYPE_CHECKING:  # torch loads on first use
-    from tofcorr.data.recording import Recording
+if TYPE_CHECKING:
+    from tofcorr import Recording
 
 SIZE = 5.7, 3.1
 """Of both pictures, inches: the same, as they stand side by side."""
@@ -72,7 +72,7 @@ def _ideal(recording: "Recording") -> np.ndarray:
     planes = zip(poses, recording.frames.normal_world, recording.frames.offset, strict=True)
     depth = [-(n @ pose[:3, 3] + d) / (rays @ pose[:3, :3].T @ n) for pose, n, d in planes]
     along = rays[..., 2] if recording.depth_kind == "z" else 1.0
-    return np.array(np.stack(depth) * along, dtype=np.float32)
+    return (np.array(depth) * along).astype(np.float32)
 
 
 if __name__ == "__main__":
