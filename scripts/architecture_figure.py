@@ -15,6 +15,7 @@ ASSETS = ROOT / "docs" / "assets"
 PURPOSES = {
     "__main__": "python -m tofcorr",
     "cli": "commands: parse, call one function, print",
+    "examples": "small input to start from, in the formats of other programs",
     "module": "DepthCorrection, an nn.Module to fit, differentiate and save",
     "diagnosis": "where simulator and recording differ, and which effect is missing",
     "sensor": "a camera as it was found, and what it measures of any scene",
@@ -51,7 +52,7 @@ COLOURS = {
     "ground": ("#eceff1", "#546e7a"),
 }
 GROUPS = {
-    "front": ("__main__", "cli", "module"),
+    "front": ("__main__", "cli", "examples", "module"),
     "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
     "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),

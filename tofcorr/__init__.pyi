@@ -16,6 +16,7 @@ from tofcorr.errors import ExportError as ExportError
 from tofcorr.errors import FrameError as FrameError
 from tofcorr.errors import StateError as StateError
 from tofcorr.errors import TofcorrError as TofcorrError
+from tofcorr.examples.example import example as example
 from tofcorr.geometry.camera import CameraIntrinsics as CameraIntrinsics
 from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
 from tofcorr.plausibility.examine import inspect as inspect

@@ -11,6 +11,8 @@ import numpy as np
 from cameras import rigid
 from scipy.spatial.transform import Rotation, Slerp
 
+from tofcorr.examples import files
+
 # Planes n . x + d = 0 around the robot, normals inwards, z up.
 Plane = tuple[tuple[float, float, float], float]
 FLOOR: Plane = ((0.0, 0.0, 1.0), 0.0)
@@ -28,37 +30,18 @@ DISTORTION = (-0.06, 0.02, 0.0008, -0.0005, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recorded:
-    """What the robot and the camera recorded.
+class Recorded(files.Recorded):
+    """What the robot and the camera recorded, and what only this file knows of it.
 
     Attributes:
-        depth_mm: z-depth, shape (I, H, W), uint16, millimetres; 0: no return.
-        amplitude: Counts, shape (I, H, W), uint16.
-        image_times: Stamps of the images, shape (I,), seconds.
         stop: The stop that each image was taken at, shape (I,); -1: in motion.
-        pose_times: Stamps of the poses, shape (P,), seconds.
-        world_from_tool: The poses, shape (P, 4, 4).
         exact: The pose at which each image was taken, shape (I, 4, 4).
-        matrix: The pinhole matrix, shape (3, 3).
-        distortion: Of the lens, OpenCV's order.
         tool_from_camera: The hand-eye transform, shape (4, 4).
     """
 
-    depth_mm: np.ndarray
-    amplitude: np.ndarray
-    image_times: np.ndarray
     stop: np.ndarray
-    pose_times: np.ndarray
-    world_from_tool: np.ndarray
     exact: np.ndarray
-    matrix: np.ndarray
-    distortion: tuple[float, ...]
     tool_from_camera: np.ndarray
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the images."""
-        return self.depth_mm.shape[2], self.depth_mm.shape[1]
 
     def take(self, chosen: np.ndarray) -> "Recorded":
         """Return some of the images, with all poses."""

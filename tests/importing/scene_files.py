@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,24 +11,15 @@ import yaml
 from importing.posed_scene import Recorded
 from scipy.spatial.transform import Rotation
 
-
-def write_intrinsics(recorded: Recorded, path: Path) -> Path:
-    """Write K, distortion and image size as YAML."""
-    width, height = recorded.size
-    values = {"width": width, "height": height}
-    values |= {"K": recorded.matrix.tolist(), "distortion": list(recorded.distortion)}
-    path.write_text(yaml.safe_dump(values), encoding="utf-8")
-    return path
+from tofcorr.examples import files
 
 
 def write_png(recorded: Recorded, folder: Path, *, swap_bytes: bool = False, turn: int = 0) -> None:
     """Write `depth/STAMP.png` in millimetres and `ir/STAMP.png`."""
-    for kind, images in (("depth", recorded.depth_mm), ("ir", recorded.amplitude)):
-        (folder / kind).mkdir(parents=True)
-        for stamp, image in zip(recorded.image_times, images, strict=True):
-            written = image.byteswap() if swap_bytes and kind == "depth" else image
-            path = folder / kind / f"{stamp:.6f}.png"
-            cv2.imwrite(str(path), np.ascontiguousarray(np.rot90(written, turn)))
+    depth = recorded.depth_mm.byteswap() if swap_bytes else recorded.depth_mm
+    turned = [np.rot90(images, turn, axes=(1, 2)) for images in (depth, recorded.amplitude)]
+    images = replace(recorded, depth_mm=turned[0], amplitude=turned[1])
+    files.write_png(images, folder, [f"{stamp:.6f}" for stamp in recorded.image_times])
 
 
 def write_numbered(recorded: Recorded, folder: Path, ending: str) -> None:
@@ -48,17 +40,6 @@ def write_images(recorded: Recorded, folder: Path, ending: str) -> None:
         write_numbered(recorded, folder, ending)
 
 
-def write_tum(times: np.ndarray, poses: np.ndarray, path: Path) -> Path:
-    """Write `timestamp tx ty tz qx qy qz qw` lines."""
-    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for time, pose, turn in zip(times, poses, turns, strict=True):
-        numbers = [f"{number:.9f}" for number in (*pose[:3, 3], *turn)]
-        lines.append(" ".join([f"{time:.6f}", *numbers]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
-
-
 def write_csv(poses: np.ndarray, path: Path) -> Path:
     """Write a table of image names, millimetres and rotation vectors."""
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
@@ -67,12 +48,6 @@ def write_csv(poses: np.ndarray, path: Path) -> Path:
         writer.writerow(["image", "tx_mm", "ty_mm", "tz_mm", "rx", "ry", "rz"])
         for number, (pose, turn) in enumerate(zip(poses, turns, strict=True)):
             writer.writerow([f"{number}.npy", *(1e3 * pose[:3, 3]), *turn])
-    return path
-
-
-def write_matrices(poses: np.ndarray, path: Path) -> Path:
-    """Write 16 numbers a line."""
-    np.savetxt(path, poses.reshape(len(poses), 16))
     return path
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from fuzzed import MANY, read_or_refused
 from importing.posed_scene import Drive
-from importing.rosbag import written_bags as bags
+from importing.rosbag import written_bags
 
 from benchmarks import fuzz
+from tofcorr.examples import bags
 from tofcorr.importing.images import DepthCoding
 from tofcorr.importing.robot_images import ImagesOfPlanes, PosedOptions
 from tofcorr.importing.rosbag.source import open_bag
@@ -26,10 +27,10 @@ def read_bag(path: Path) -> None:
         ImagesOfPlanes(images, PosedOptions()).look(Sieve("bag"))
 
 
-@pytest.fixture(scope="module", params=bags.KINDS)
+@pytest.fixture(scope="module", params=written_bags.KINDS)
 def bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> fuzz.Target:
     few = Drive(stops=3, width=8, height=6, rate=3).record().take(np.arange(4))
-    path = bags.write_drive(few, tmp_path_factory.mktemp("bag"), request.param)
+    path = written_bags.write_drive(few, tmp_path_factory.mktemp("bag"), request.param)
     if path.is_dir():
         path = next(one for one in path.iterdir() if one.suffix != ".yaml")
     return fuzz.Target(path.name, path.read_bytes(), read_bag)

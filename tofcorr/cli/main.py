@@ -18,6 +18,7 @@ from tofcorr.files import remove_begun
 from tofcorr.version import __version__
 
 COMMANDS = {
+    "example": ("record", "Write small real-looking input to try the other commands with."),
     "poses": ("record", "Propose robot poses to record, before any recording exists."),
     "simulate": ("simulate", "Draw a recording from the sensor simulator."),
     "import": ("record", "Turn recorded images into a recording."),

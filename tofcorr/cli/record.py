@@ -1,4 +1,4 @@
-"""The commands before there is a recording: propose poses, import what a robot recorded."""
+"""The commands before there is a recording: an example, poses to drive to, imports."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,28 @@ _PAIR = {"nargs": 2, "type": float}
 _DISTANCES = "Distances to the wall at which the camera will be used, metres."
 _START = "The tool's pose where the camera looks squarely at the wall; else poses are relative."
 _GUESS = "A guess of the camera's pose on the tool; else the tool's axes are the camera's."
+
+
+@click.command()
+@click.argument("name", required=False)
+@out_option("Folder of the example, made anew; left out: NAME in this folder.", required=False)
+@option("--seed", "Of all random draws.", default=1, type=click.IntRange(min=0))
+def example_command(name: str | None, out: Path | None, seed: int) -> None:
+    """Write the example called NAME, or list all of them.
+
+    Each is small input of one kind, a few MB made by the sensor simulator, and the command that
+    goes on from it. What only a simulator knows, such as the true hand-eye transform, goes to
+    truth.yaml.
+    """
+    from tofcorr.examples.example import EXAMPLES, example
+
+    if name is None:
+        width = max(map(len, EXAMPLES))
+        click.echo("\n".join(f"{one:<{width}}  {EXAMPLES[one].summary}" for one in EXAMPLES))
+        click.echo("\nNext: tofcorr example bag")
+        return
+    folder = example(name, out, seed)
+    click.echo(f"Example written to {folder}\nNext: {EXAMPLES[name].command_for(folder)}")
 
 
 @click.command()

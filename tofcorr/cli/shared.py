@@ -89,9 +89,11 @@ run_option = option("--run", "Folder that tofcorr train made.", required=True, t
 """The option of every command that uses a calibration; the command receives a path."""
 
 
-def out_option(text: str, kind: click.ParamType | None = None) -> Callable[[Command], Command]:
+def out_option(
+    text: str, kind: click.ParamType | None = None, *, required: bool = True
+) -> Callable[[Command], Command]:
     """Add `--out`, a name that is new unless another kind is given; the command receives a path."""
-    return option("--out", text, required=True, type=kind or NewPath())
+    return option("--out", text, required=required, type=kind or NewPath())
 
 
 def recording_option(text: str, *, many: bool = False) -> Callable[[Command], Command]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry.se3 import UNIT_LENGTH_TOLERANCE
-from tofcorr.options import Number, Options, PositiveNumber, Share, Vector3
+from tofcorr.options import Count, Number, Options, PositiveNumber, Share, Vector3
 
 
 class UniformTarget(Options):
@@ -21,10 +21,16 @@ class UniformTarget(Options):
 
 
 class CheckerboardTarget(Options):
-    """A wall of alternating dark and bright squares that is unlimited in both directions."""
+    """A wall of alternating dark and bright squares.
+
+    Attributes:
+        squares: Columns and rows of a board in the middle of a bright wall; null: squares without
+            an end.
+    """
 
     pattern: Literal["checkerboard"] = "checkerboard"
     square_mm: PositiveNumber = 80.0
+    squares: tuple[Count, Count] | None = None
     reflectivity_dark: Share = 0.1
     reflectivity_bright: Share = 0.8
 
@@ -97,7 +103,11 @@ def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Ten
     if isinstance(target, UniformTarget):
         return torch.full_like(target_xy[..., 0], target.reflectivity)
     in_squares = target_xy / (target.square_mm / 1000)
-    share_bright = _bright(in_squares)
+    board = None
+    if target.squares is not None:
+        board = in_squares.new_tensor(target.squares)
+        in_squares = in_squares + board / 2
+    share_bright = _bright(in_squares, board)
     # How the coordinates change from row to row, and from column to column.
     steps = [
         torch.gradient(in_squares, dim=axis)[0] if count > 1 else torch.zeros_like(in_squares)
@@ -109,12 +119,18 @@ def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Ten
     at, down, right = (each[crossed].T.contiguous() for each in (in_squares, *steps))
     inside = (torch.arange(subsamples, dtype=at.dtype) + 0.5) / subsamples - 0.5
     places = (at + a * down + b * right for a, b in product(inside, inside))
-    share_bright[crossed] = sum(_bright(place.T) for place in places) / subsamples**2
+    share_bright[crossed] = sum(_bright(place.T, board) for place in places) / subsamples**2
     contrast = target.reflectivity_bright - target.reflectivity_dark
     return target.reflectivity_dark + contrast * share_bright
 
 
-def _bright(in_squares: Tensor) -> Tensor:
-    """Return 1.0 in bright squares and 0.0 in dark ones; coordinates (..., 2) in squares."""
-    column, row = in_squares.unbind(-1)
-    return torch.remainder(torch.floor(column) + torch.floor(row), 2.0)
+def _bright(in_squares: Tensor, board: Tensor | None) -> Tensor:
+    """Return 1.0 in bright squares and 0.0 in dark ones; coordinates (..., 2) in squares.
+
+    Beyond a board of so many squares, (2,), all is bright.
+    """
+    square = torch.floor(in_squares)
+    bright = torch.remainder(square.sum(-1), 2.0)
+    if board is None:
+        return bright
+    return bright.masked_fill(((square < 0) | (square >= board)).any(-1), 1.0)

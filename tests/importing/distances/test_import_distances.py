@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from importing.frames.imported import Imported, run_import
 from importing.posed_scene import FRONT, Drive, Recorded
-from importing.scene_files import write_matrices
 from importing.walls.wall_trials import MOUNTS, WALLS, read_trial
 from scipy.spatial.transform import Rotation
 
 import tofcorr
+from tofcorr.examples.files import write_matrices
 
 
 def import_trials(real_data: Path, mount: str, out: Path) -> Imported:

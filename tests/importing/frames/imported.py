@@ -12,6 +12,7 @@ from importing.posed_scene import Recorded
 from tofcorr.cli.main import group
 from tofcorr.data.recording import Recording
 from tofcorr.errors import TofcorrError
+from tofcorr.examples import files
 
 
 class Imported(NamedTuple):
@@ -65,7 +66,7 @@ def import_png(recorded: Recorded, folder: Path, *arguments: object) -> Imported
     """Write PNG and TUM, and import them."""
     scene_files.write_png(recorded, folder)
     track = recorded.pose_times, recorded.world_from_tool
-    poses = scene_files.write_tum(*track, folder / "poses.txt")
+    poses = files.write_tum(*track, folder / "poses.txt")
     return import_written(recorded, folder, "png", poses, *arguments)
 
 
@@ -73,7 +74,7 @@ def import_written(
     recorded: Recorded, folder: Path, ending: str, poses: Path, *arguments: object
 ) -> Imported:
     """Import what was written into a folder."""
-    intrinsics = scene_files.write_intrinsics(recorded, folder / "camera.yaml")
+    intrinsics = files.write_intrinsics(recorded, folder / "camera.yaml")
     patterns = ("--depth", f"depth/*.{ending}", "--amplitude", f"ir/*.{ending}")
     given = ("--poses", poses, "--intrinsics", intrinsics)
     return run_import("frames", folder, *patterns, *given, *arguments, out=folder / "out")

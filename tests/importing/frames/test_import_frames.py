@@ -11,6 +11,8 @@ from importing.frames.imported import Imported, assert_equal_recordings, import_
 from importing.posed_scene import Recorded
 from optional import present
 
+from tofcorr.examples import files
+
 # How near the start of the fit is: the camera's error of 10 mm is not calibrated yet.
 NEAR_MM, NEAR_DEG = 15.0, 0.5
 
@@ -101,9 +103,9 @@ def test_a_camera_that_stands_still_has_its_poses_inverted_and_its_frames_named(
 def test_all_formats_of_files_give_one_recording(at_stops: Recorded, tmp_path: Path) -> None:
     imported = {}
     for name, ending, write_poses in (
-        ("png", "png", partial(scene_files.write_tum, at_stops.image_times)),
+        ("png", "png", partial(files.write_tum, at_stops.image_times)),
         ("npy", "npy", scene_files.write_csv),
-        ("tiff", "tiff", scene_files.write_matrices),
+        ("tiff", "tiff", files.write_matrices),
         ("moveit", "npy", scene_files.write_moveit),
     ):
         folder = tmp_path / name
@@ -128,7 +130,7 @@ def test_turned_images_and_swapped_bytes_are_undone_when_named_and_refused_when_
         folder = tmp_path / name
         scene_files.write_png(at_stops, folder, swap_bytes=swap_bytes, turn=turn)
         track = at_stops.pose_times, at_stops.world_from_tool
-        poses = scene_files.write_tum(*track, folder / "poses.txt")
+        poses = files.write_tum(*track, folder / "poses.txt")
         refused = import_written(at_stops, folder, "png", poses)
         assert f"Add {' '.join(arguments)}" in refused.refusal
         undone = import_written(at_stops, folder, "png", poses, *arguments)

@@ -12,13 +12,15 @@ from importing.frames.imported import Imported, import_png, import_written, run_
 from importing.posed_scene import Recorded
 from scipy.spatial.transform import Rotation
 
+from tofcorr.examples import files
+
 SLOW = pytest.mark.slow
 
 
 def in_order(recorded: Recorded, folder: Path, poses: np.ndarray, *arguments: object) -> Imported:
     """Import images without time stamps, and poses in their order."""
     scene_files.write_numbered(recorded, folder, "npy")
-    file = scene_files.write_matrices(poses, folder / "poses.txt")
+    file = files.write_matrices(poses, folder / "poses.txt")
     return import_written(recorded, folder, "npy", file, *arguments)
 
 
@@ -120,7 +122,7 @@ def test_numbers_of_another_kind_are_refused(
     scene_files.write_numbered(at_stops, tmp_path, "npy")
     for path in (tmp_path / kind).iterdir():
         np.save(path, spoilt(np.load(path)))
-    poses = scene_files.write_matrices(at_stops.exact, tmp_path / "poses.txt")
+    poses = files.write_matrices(at_stops.exact, tmp_path / "poses.txt")
     assert re.search(said, import_written(at_stops, tmp_path, "npy", poses).text)
     if "distances" in said:
         assert import_written(at_stops, tmp_path, "npy", poses, "--depth-unit-mm", 1).done
@@ -128,7 +130,7 @@ def test_numbers_of_another_kind_are_refused(
 
 def test_missing_or_other_intrinsics_are_refused(at_stops: Recorded, tmp_path: Path) -> None:
     scene_files.write_png(at_stops, tmp_path)
-    poses = scene_files.write_tum(at_stops.image_times, at_stops.exact, tmp_path / "poses.txt")
+    poses = files.write_tum(at_stops.image_times, at_stops.exact, tmp_path / "poses.txt")
     given = ("--depth", "depth/*.png", "--poses", poses)
     without = run_import("frames", tmp_path, *given, out=tmp_path / "out")
     assert "say where the intrinsics come from" in without.text

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from importing.posed_scene import Drive, Recorded
-from importing.rosbag import written_bags as bags
+from importing.rosbag import written_bags
 from running import printed
+
+from tofcorr.examples import bags
 
 IMAGES = 2000
 ENLARGED = 8
@@ -26,6 +28,7 @@ RETURN_AT_ONCE = {"MALLOC_MMAP_THRESHOLD_": "65536"}
 MEASURED = """
 import sys
 from pathlib import Path
+from tofcorr.examples import bags
 from tofcorr.cli.main import main
 sys.argv = ["tofcorr", *sys.argv[1:]]
 try:
@@ -50,10 +53,10 @@ def test_two_thousand_vga_frames_are_imported_in_bounded_memory(tmp_path: Path) 
     drive = Drive(width=80, height=60, rate=IMAGES / 59.0, distortion=())
     recorded = drive.record()
     recorded = enlarged(recorded.take(np.arange(min(IMAGES, len(recorded.stop)))))
-    path = bags.bag_path(tmp_path, "mcap")
+    path = written_bags.bag_path(tmp_path, "mcap")
     with bags.writing(path, "mcap") as bag:
         bag.camera_info(bags.INFO, recorded, size=(80 * ENLARGED, 60 * ENLARGED))
-        bags.write_robot(bag, recorded)
+        written_bags.write_robot(bag, recorded)
         for time, depth in zip(recorded.image_times, recorded.depth_mm, strict=True):
             bag.image(bags.DEPTH, time, np.kron(depth, np.ones((8, 8), np.uint16)), "16UC1")
     arguments = [

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from cameras import apart, rigid
 from importing.posed_scene import Drive, Recorded
-from importing.rosbag import written_bags as bags
+from importing.rosbag import written_bags
 from importing.rosbag.test_import_rosbag import WITH_INFRARED, import_bag
 from optional import present
 from running import Program
@@ -41,7 +41,7 @@ def test_the_hand_eye_is_found_wherever_the_camera_is_and_whatever_its_clock(
     """Import, train and export; nothing is known but the bag."""
     late, still = 0.08 if how == "late" else 0.0, how == "standing still"
     drive = recorded.with_camera_fixed() if still else recorded.stamped_late(late)
-    path = bags.write_drive(drive, tmp_path, kind)
+    path = written_bags.write_drive(drive, tmp_path, kind)
     recording, out, urdf = (tmp_path / name for name in ("recording", "run", "camera.urdf.xacro"))
     options = ("--eye-to-hand",) if still else ()
     imported = import_bag(path, recording, *WITH_INFRARED, *options)

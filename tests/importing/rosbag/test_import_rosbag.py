@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from importing.frames.imported import Imported, assert_equal_recordings, run_import
 from importing.posed_scene import Recorded
-from importing.rosbag import written_bags as bags
+from importing.rosbag import written_bags
+
+from tofcorr.examples import bags
 
 
 def import_bag(path: Path, out: Path, *arguments: object, depth: str = bags.DEPTH) -> Imported:
@@ -25,20 +27,20 @@ def written(
     recorded: Recorded, folder: Path, write: Callable[[bags.Bag, float, np.ndarray], None]
 ) -> Path:
     """Write a bag whose depth images are written in a way of their own."""
-    path = bags.bag_path(folder, "mcap")
+    path = written_bags.bag_path(folder, "mcap")
     with bags.writing(path, "mcap") as bag:
         bag.camera_info(bags.INFO, recorded)
-        bags.write_robot(bag, recorded)
+        written_bags.write_robot(bag, recorded)
         for time, depth in zip(recorded.image_times, recorded.depth_mm, strict=True):
             write(bag, time, depth)
     return path
 
 
-@pytest.mark.parametrize("kind", bags.KINDS)
+@pytest.mark.parametrize("kind", written_bags.KINDS)
 def test_a_bag_of_any_kind_gives_the_recording_of_the_same_drive_in_files(
     kind: str, at_stops: Recorded, from_files: Imported, tmp_path: Path
 ) -> None:
-    path = bags.write_drive(at_stops, tmp_path, kind)
+    path = written_bags.write_drive(at_stops, tmp_path, kind)
     imported = import_bag(path, tmp_path / "out", *WITH_INFRARED)
     assert_equal_recordings(from_files.done, imported.done, 0.0)
     assert imported.done.frame_names.camera == bags.CAMERA
@@ -57,8 +59,8 @@ def test_depth_is_the_same_however_its_messages_are_coded(
         elif coding == "metres":
             bag.image(bags.DEPTH, time, (depth / 1e3).astype(np.float32), "32FC1")
         else:
-            content = bags.compressed_depth(depth, floats=coding == "32FC1")
-            bag.compressed(bags.DEPTH, time, content, f"{coding}; compressedDepth png")
+            content = written_bags.compressed_depth(depth, floats=coding == "32FC1")
+            written_bags.write_compressed(bag, time, content, f"{coding}; compressedDepth png")
 
     path = written(at_stops, tmp_path, write)
     imported = import_bag(path, tmp_path / "out")
@@ -87,7 +89,7 @@ def test_stamps_of_headers_count_and_receipt_is_named_where_there_are_none(
 
 
 def test_a_missing_topic_is_named_with_those_there_are(at_stops: Recorded, tmp_path: Path) -> None:
-    path = bags.write_drive(at_stops.take(np.arange(3)), tmp_path, "mcap")
+    path = written_bags.write_drive(at_stops.take(np.arange(3)), tmp_path, "mcap")
     out = tmp_path / "out"
     missing = import_bag(path, out, depth="/nope").refusal
     assert "there is no such topic" in missing
@@ -99,7 +101,7 @@ def test_a_missing_topic_is_named_with_those_there_are(at_stops: Recorded, tmp_p
 
 
 def test_a_missing_frame_or_transform_is_named(at_stops: Recorded, tmp_path: Path) -> None:
-    path = bags.write_drive(at_stops.take(np.arange(3)), tmp_path, "mcap")
+    path = written_bags.write_drive(at_stops.take(np.arange(3)), tmp_path, "mcap")
 
     def between(base: str, tool: str) -> str:
         frames = ("--base-frame", base, "--tool-frame", tool)
@@ -109,7 +111,7 @@ def test_a_missing_frame_or_transform_is_named(at_stops: Recorded, tmp_path: Pat
     assert "no frame 'hand'" in unknown
     assert "base_link, shoulder, tool0, world, wrist" in unknown
     assert "static" in between(bags.TOOL, "wrist")
-    bare = bags.bag_path(tmp_path / "bare", "mcap")
+    bare = written_bags.bag_path(tmp_path / "bare", "mcap")
     with bags.writing(bare, "mcap") as bag:
         bag.camera_info(bags.INFO, at_stops)
         bag.image(bags.DEPTH, at_stops.image_times[0], at_stops.depth_mm[0], "16UC1")
@@ -139,7 +141,7 @@ def test_previews_are_refused(at_stops: Recorded, tmp_path: Path, encoding: str,
 def test_a_fisheye_lens_and_a_camera_that_is_missing_or_unknown_are_refused(
     model: str | None, known: float, said: str, at_stops: Recorded, tmp_path: Path
 ) -> None:
-    path = bags.bag_path(tmp_path, "mcap")
+    path = written_bags.bag_path(tmp_path, "mcap")
     with bags.writing(path, "mcap") as bag:
         bag.image(bags.DEPTH, at_stops.image_times[0], at_stops.depth_mm[0], "16UC1")
         if model:

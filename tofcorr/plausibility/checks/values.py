@@ -92,8 +92,11 @@ def repeats(look: Look) -> Iterator[Finding]:
 
     Ten times what they differ by elsewhere, and more than errors of a camera, is no noise.
     """
-    middle, group = np.nanmedian(look.scene.distance, axis=1), look.group[look.usable]
-    apart = np.array([np.ptp(middle[group == own]) for own in group])
+    distance, group = look.scene.distance, look.group[look.usable]
+    # Pixel by pixel: on a steep wall the middle of all pixels moves with one that is missing.
+    pairs = zip(distance, group, strict=True)
+    moved = (np.nanmedian(distance[group == own] - one, axis=1) for one, own in pairs)
+    apart = np.array([np.abs(each).max() for each in moved])
     typical = float(np.median(apart[apart > 0])) if apart.any() else 0.0
     if frames := tuple(look.frames[apart > max(CAMERA, 10 * typical)].tolist()):
         said = f"{in_words(frames).capitalize()} differ by {1e3 * apart.max():.0f} mm within a pose"
