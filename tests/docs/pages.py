@@ -10,7 +10,10 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 # Their examples run in a package that has them, in `tests/extending`.
 ADDING = [page for page in PAGES if page.name.startswith("add-")]
 
-_FENCE = re.compile(r"^([ \t]*)```(\w+)[^\n]*\n(.*?)^\1```[ \t]*$", re.DOTALL | re.MULTILINE)
+_FENCE = re.compile(
+    r"(?:<!-- not run: ([^>]+) -->\s*?\n\s*?)?^([ \t]*)```(\w+)[^\n]*\n(.*?)^\2```[ \t]*$",
+    re.DOTALL | re.MULTILINE,
+)
 
 
 class Block(NamedTuple):
@@ -20,11 +23,13 @@ class Block(NamedTuple):
         language: The word after the opening fence.
         text: What stands between the fences, indentation of the fence removed.
         line: Line of its first character in the page, counted from 1.
+        not_run: Why no test runs it, from a comment before it; empty: it is run.
     """
 
     language: str
     text: str
     line: int
+    not_run: str = ""
 
 
 def blocks(page: Path) -> list[Block]:
@@ -32,10 +37,10 @@ def blocks(page: Path) -> list[Block]:
     text = page.read_text(encoding="utf-8")
     found = []
     for match in _FENCE.finditer(text):
-        indent, language, body = match.groups()
+        reason, indent, language, body = match.groups()
         lines = [line.removeprefix(indent) for line in body.splitlines(keepends=True)]
-        line = text.count("\n", 0, match.start(3)) + 1
-        found.append(Block(language=language, text="".join(lines), line=line))
+        line = text.count("\n", 0, match.start(4)) + 1
+        found.append(Block(language, "".join(lines), line, (reason or "").strip()))
     return found
 
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from docs.pages import ADDING, PAGES, ROOT, blocks, title
-from docs.shell import run_command, tofcorr_commands
+from docs.pages import ADDING, PAGES, blocks, title
 
 from tofcorr.options import configs_folder
 
@@ -25,17 +24,6 @@ def quick_diagnosis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = yaml.safe_load(many.read_text(encoding="utf-8")) | QUICK
     many.write_text(yaml.safe_dump(options), encoding="utf-8")
     monkeypatch.setattr("tofcorr.options.configs_folder", lambda: folder)
-
-
-@pytest.fixture(scope="session")
-def first_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which the commands of the first page were run, as a visitor would."""
-    folder = tmp_path_factory.mktemp("first_page")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        for command in tofcorr_commands(ROOT / "docs" / "index.md"):
-            run_command(command)
-    return folder
 
 
 @pytest.mark.usefixtures("quick_diagnosis")

@@ -111,9 +111,9 @@ def board(folder: Path, seed: int) -> None:
 def distances(folder: Path, seed: int) -> None:
     """Write a folder of each wall for a sensor of one ray, and of each for one of 8 x 8 zones."""
     for kind, sensor in _SENSORS.items():
-        for wall, plane in _WALLS.items():
+        for number, (wall, plane) in enumerate(_WALLS.items()):
             changes = (*_ROBOT, plane, *sensor, *_REPEATED)
-            options, plan, generator = _planned("demo", changes, seed)
+            options, plan, generator = _planned("demo", changes, seed + number)
             read = _taken(options, plan, _times(plan), generator)
             own = folder / f"{wall}{kind}"
             own.mkdir()
