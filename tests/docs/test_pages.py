@@ -1,5 +1,7 @@
 """Every block of README, the first page and the how-tos runs as it stands, in an empty folder.
 
+So do the Python blocks of all other pages, in a folder that has what the first page makes.
+
 Shell blocks run in bash, Python blocks in one Python for the page, with the program as a user has
 it. A `text` block is what the block before it prints, numbers apart. `<!-- not run: REASON -->`
 before a block says why a test cannot run it. `TOFCORR_WRITE_OUTPUTS=1` writes the numbers that were
@@ -19,11 +21,15 @@ from typing import Any, NamedTuple
 
 import pytest
 from docs.pages import ADDING, ROOT, Block, blocks, title
+from docs.pages import PAGES as EVERY
 from running import printed
 
 HERE = Path(__file__).parent
 PAGES = [ROOT / "README.md", ROOT / "docs" / "index.md"]
 PAGES += [one for one in sorted((ROOT / "docs" / "how-to").glob("*.md")) if one not in ADDING]
+OTHERS = [
+    one for one in EVERY if one not in (*PAGES, *ADDING) and "```python" in one.read_text("utf-8")
+]
 SLOW = ("README.md", "check.md", "choose.md", "deploy.md", "diagnose.md", "distance-sensor.md")
 SLOW += ("install.md", "your-simulator.md")
 """Pages that take half a minute or more, and those that only repeat what others run."""
@@ -99,12 +105,14 @@ def from_wheel(python_with_wheel: Path) -> Installed:
     return Installed([str(python_with_wheel)], python_with_wheel.parent)
 
 
-def outcomes_of(page: Path, installed: Installed, folder: Path) -> list[dict[str, Any]]:
+def outcomes_of(
+    page: Path, installed: Installed, folder: Path, languages: Sequence[str]
+) -> list[dict[str, Any]]:
     """Run the blocks of a page in a folder; return what became of each, up to one that failed."""
     run = [
         {"language": one.language, "text": one.text, "line": one.line, "page": str(page)}
         for one in blocks(page)
-        if one.language not in FILES and not why_not_run(one)
+        if one.language in languages and not why_not_run(one)
     ]
     listed = folder.with_name(f"{folder.name}.json")
     listed.write_text(json.dumps(run), encoding="utf-8")
@@ -117,15 +125,17 @@ def outcomes_of(page: Path, installed: Installed, folder: Path) -> list[dict[str
     return outcomes
 
 
-def assert_runs(page: Path, installed: Installed, folder: Path) -> None:
+def assert_runs(
+    page: Path, installed: Installed, folder: Path, languages: Sequence[str] = ("bash", "python")
+) -> None:
     """Every block of a page ends well, and prints what the page says."""
-    outcomes = {one["line"]: one for one in outcomes_of(page, installed, folder)}
+    outcomes = {one["line"]: one for one in outcomes_of(page, installed, folder, languages)}
     for one in outcomes.values():
         assert one["ok"], f"{title(page)}, line {one['line']}:\n{one['printed']}"
     said, missing, text = "", [], page.read_text(encoding="utf-8")
     for block in blocks(page):
         said = outcomes[block.line]["printed"] if block.line in outcomes else said
-        if block.language == "text" and not block.not_run:
+        if block.language == "text" and page in PAGES and not block.not_run:
             missing += unprinted(block.text, said)
             text = text.replace(block.text, with_numbers_of(block.text, said))
     if os.environ.get("TOFCORR_WRITE_OUTPUTS"):
@@ -135,10 +145,10 @@ def assert_runs(page: Path, installed: Installed, folder: Path) -> None:
 
 @pytest.fixture
 def folder(page: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """An empty folder; for README the repository's own job has been run in it."""
+    """An empty folder; for README and pages that are no how-to, one with runs of the first page."""
     folder = tmp_path / "empty"
     folder.mkdir()
-    if page.parent == ROOT:
+    if page.parent == ROOT or page not in PAGES:
         shutil.copytree(request.getfixturevalue("first_page") / "runs", folder / "runs")
     return folder
 
@@ -152,6 +162,11 @@ def test_page_runs(page: Path, warm: Installed, folder: Path) -> None:
     assert_runs(page, warm, folder)
 
 
+@pytest.mark.parametrize("page", [PAGES[0], *OTHERS], ids=title)
+def test_python_of_page_runs(page: Path, warm: Installed, folder: Path) -> None:
+    assert_runs(page, warm, folder, ["python"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=title)
 def test_page_runs_with_the_wheel(page: Path, from_wheel: Installed, folder: Path) -> None:
@@ -159,15 +174,20 @@ def test_page_runs_with_the_wheel(page: Path, from_wheel: Installed, folder: Pat
 
 
 def test_every_block_runs_or_says_why_not() -> None:
-    """`pytest -s` shows the list."""
-    programs = [(p, one) for p in PAGES for one in blocks(p) if one.language not in FILES]
-    left_out = [(p, one) for p, one in programs if why_not_run(one)]
+    """`pytest -s` shows the list; the pages that add to the package run in `tests/extending`."""
+    programs = [
+        (page, one)
+        for page in (*PAGES, *ADDING)
+        for one in blocks(page)
+        if one.language not in FILES
+    ]
+    left_out = [(page, one) for page, one in programs if why_not_run(one)]
     print(f"\n{len(programs) - len(left_out)} of {len(programs)} blocks run; not run:")  # noqa: T201
-    for page, block in left_out:
-        print(f"{title(page)}, line {block.line}: {why_not_run(block)}")  # noqa: T201
-    unknown = {one.language for p, one in programs if not why_not_run(one)}
-    assert unknown <= {"bash", "python"}
-    assert len(left_out) * 5 < len(programs)
+    for page, one in left_out:
+        print(f"{title(page)}, line {one.line}: {why_not_run(one)}")  # noqa: T201
+    assert {one.language for _, one in programs if not why_not_run(one)} == {"bash", "python"}
+    assert {one.language for page, one in programs if page in ADDING} == {"python"}
+    assert 5 * len(left_out) < len(programs)
 
 
 def test_what_a_page_promises_and_a_program_does_not_print_would_be_noticed() -> None:

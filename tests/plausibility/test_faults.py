@@ -129,7 +129,7 @@ def test_waves_of_the_error_over_metres_are_the_cameras_where_the_frequency_is_k
 def test_a_camera_knocked_by_little_is_told_and_poses_that_scatter_as_much_are_not(
     parts: Parts, tmp_path: Path
 ) -> None:
-    # The sizes that docs/how-to/record.md names.
+    # The sizes that docs/concepts/inspection.md names.
     knocked = scattered = 0
     for draw in range(8):
         generator = np.random.default_rng([11, draw])
