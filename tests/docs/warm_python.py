@@ -6,12 +6,14 @@
 Starting Python and torch takes two seconds; the commands of the documents are many.
 """
 
+import gc
 import json
 import os
 import runpy
 import signal
 import socket
 import sys
+import traceback
 from pathlib import Path
 
 STANDARD = (0, 1, 2)
@@ -37,6 +39,7 @@ def wait_for_calls(place: str) -> None:
     import tofcorr.cli.main
     import tofcorr.importing.posed
 
+    gc.freeze()  # The forks share what is loaded.
     # Nobody waits for the forks of this process.
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     with socket.socket(socket.AF_UNIX) as of:
@@ -65,7 +68,18 @@ def _serve(caller: socket.socket) -> None:
     os.environ.clear()
     os.environ.update(asked["environment"])
     sys.argv = asked["words"]
-    runpy.run_path(sys.argv[0], run_name="__main__")
+    code: object = 0
+    try:
+        runpy.run_path(sys.argv[0], run_name="__main__")
+    except SystemExit as done:
+        code = done.code or 0
+    except BaseException:  # noqa: BLE001 - as Python ends on it
+        traceback.print_exc()
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Nothing is tidied up: taking torch apart takes a second, and every page of its memory.
+    os._exit(code if isinstance(code, int) else 1)
 
 
 if __name__ == "__main__":
