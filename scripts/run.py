@@ -52,7 +52,8 @@ def main() -> None:
         sys.exit(2)
     for number, line in enumerate(findings(out), 1):
         click.echo(f"{number}. {line}")
-    click.echo(f"Pages: {out / 'run' / 'report.html'} and {out / 'diagnosis' / 'report.html'}")
+    pages = [out / of / "report.html" for of in ("run", "diagnosis")]
+    click.echo(f"Pages: {' and '.join(str(page) for page in pages if page.exists())}")
 
 
 def _run(commands: str, out: Path) -> None:
