@@ -1,6 +1,8 @@
 """The errors that a user can cause and can correct."""
 
 import unicodedata
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class TofcorrError(Exception):
@@ -17,6 +19,12 @@ class TofcorrError(Exception):
 
 Kind = type[TofcorrError]
 """Which error a function is to raise: a configuration's, a recording's, an export's."""
+
+
+def did_you_mean(given: str, known: Iterable[str]) -> str:
+    """Return a sentence that asks whether what resembles a text was meant; empty: nothing does."""
+    close = get_close_matches(given, known, n=1)
+    return f" Did you mean '{close[0]}'?" if close else ""
 
 
 def printable(text: str) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from tofcorr.comparison.experiment import Experiment, compare
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
 from tofcorr.comparison.statistics import Ranking, Table
+from tofcorr.digits import aligned, at_most
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.files import staged_folder, write_json
@@ -75,8 +76,30 @@ class SelectionResult:
         return text
 
     def __repr__(self) -> str:
-        """Return what is doubtful, the choice, a table for each grouping, and warnings."""
+        """Return the choice, the best models' held-out errors, and a warning: 11 lines at most."""
+        rankings, decisive = self.rankings.values(), self.decisive
+        ordered = sorted(decisive.errors, key=lambda name: decisive.errors[name].mean)
+        rows = [
+            [name, str(decisive.complexity[name])]
+            + [
+                f"{one.errors[name].mean:.2f} ± {one.errors[name].standard_error:.2f}"
+                for one in rankings
+            ]
+            for name in ordered
+        ]
+        heads = [f"{by}s held out, mm" for by in self.rankings]
+        table = at_most(6, aligned([["model", "unknowns", *heads], *rows]))
+        doubtful = [self.headline] if self.headline else []
+        return "\n".join([self.verdict, *doubtful, *table, *at_most(2, self._warnings)])
+
+    @property
+    def details(self) -> str:
+        """The choice, a table for each grouping, and all warnings."""
         return self._page([table.text() for table in self.tables()])
+
+    @property
+    def _warnings(self) -> list[str]:
+        return [f"Warning: {warning}" for warning in self.experiment.warnings]
 
     def markdown(self) -> str:
         """Return the same as a page of Markdown."""
@@ -108,12 +131,12 @@ class SelectionResult:
 
     def _page(self, tables: list[str]) -> str:
         parts = [
-            *([self.headline] if self.headline else []),
             self.verdict,
+            *([self.headline] if self.headline else []),
             *tables,
             *comparability_notes(self.options),
             *(f"Not held out by {by}: {why}" for by, why in self.experiment.skipped.items()),
-            *(f"Warning: {warning}" for warning in self.experiment.warnings),
+            *self._warnings,
             "Errors are distances to the plane, mean over the held-out poses ± one standard error. "
             "Behind the best: paired difference, pose by pose, with its 95 % interval.",
         ]

@@ -7,7 +7,7 @@ A new format is a file in this folder and one line here. The file is called as t
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-from tofcorr.errors import ConfigError
+from tofcorr.errors import ConfigError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class Format:
         packages: Packages that writing or reading it needs besides the required ones.
         extra: The extra of tofcorr that installs them.
         for_device: Whether the file is compiled for one device, `cpu` or `cuda`.
+        aliases: Other names that people try for it.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Format:
     packages: tuple[str, ...] = ()
     extra: str = ""
     for_device: bool = False
+    aliases: tuple[str, ...] = ()
 
     def require_packages(self) -> None:
         """Refuse to go on without the packages that the format needs.
@@ -45,19 +47,48 @@ class Format:
 _ONNX = ("onnx", "onnxscript", "onnxruntime")
 
 _FORMATS = (
-    Format("torchscript", ".ts", "any machine with torch"),
-    Format("pt2", ".pt2", "the fastest; compiled for this kind of processor", for_device=True),
+    Format("torchscript", ".ts", "any machine with torch", aliases=("ts", "pt", "jit")),
+    Format(
+        "pt2",
+        ".pt2",
+        "the fastest; compiled for this kind of processor",
+        for_device=True,
+        aliases=("aoti",),
+    ),
     Format("onnx", ".onnx", "without torch", packages=_ONNX, extra="onnx"),
-    Format("c", ".c", "without any library: C99 for robots and controllers, compiled there"),
-    Format("lut", ".npz", "table for NumPy, to 0.1 mm"),
-    Format("urdf", ".xacro", "the camera's pose as a fixed joint of a robot description"),
+    Format(
+        "c",
+        ".c",
+        "without any library: C99 for robots and controllers, compiled there",
+        aliases=("c99",),
+    ),
+    Format("lut", ".npz", "table for NumPy, to 0.1 mm", aliases=("npz", "numpy", "table")),
+    Format(
+        "urdf",
+        ".xacro",
+        "the camera's pose as a fixed joint of a robot description",
+        aliases=("xacro",),
+    ),
     Format("tf", ".yaml", "the camera's pose for ROS, with the commands that publish it"),
-    Format("easy_handeye", ".yaml, or .calib for easy_handeye2", "the camera's pose for ROS"),
-    Format("opencv", ".yml", "intrinsics, camera's pose and coefficients for cv::FileStorage"),
+    Format(
+        "easy_handeye",
+        ".yaml, or .calib for easy_handeye2",
+        "the camera's pose for ROS",
+        aliases=("calib",),
+    ),
+    Format(
+        "opencv",
+        ".yml",
+        "intrinsics, camera's pose and coefficients for cv::FileStorage",
+        aliases=("cv", "yml"),
+    ),
 )
 
 FORMATS = {one.name: one for one in _FORMATS}
 """Every format by its name."""
+
+BY_ANY_NAME = FORMATS | {alias: one for one in _FORMATS for alias in one.aliases}
+"""Every format by its name and by its aliases."""
 
 
 def format_named(name: str) -> Format:
@@ -66,6 +97,7 @@ def format_named(name: str) -> Format:
     Raises:
         ConfigError: There is no format of this name.
     """
-    if name not in FORMATS:
-        raise ConfigError(f"'{name}' is no format of export. Known: {', '.join(FORMATS)}.")
-    return FORMATS[name]
+    if (plain := name.lower().lstrip(".")) not in BY_ANY_NAME:
+        hint = did_you_mean(plain, [*BY_ANY_NAME])
+        raise ConfigError(f"'{name}' is no format of export.{hint} Known: {', '.join(FORMATS)}.")
+    return BY_ANY_NAME[plain]
