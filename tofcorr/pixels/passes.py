@@ -192,7 +192,7 @@ def frame_errors(
     device: str = "cpu",
     variance: float = 0.0,
 ) -> dict[str, ErrorsByKind]:
-    """Return the errors by kind that models leave on all frames; `variance` is that of `FittedModel`."""
+    """Return the errors by kind that models leave on all frames; `variance`: of `FittedModel`."""
     every = np.arange(dataset.num_frames)
     fitted = [FittedModel(one, every, variance=variance) for one in models.values()]
     return dict(zip(models, held_out_errors(dataset, fitted, device), strict=True))

@@ -429,12 +429,12 @@ class PosePlan:
         return self._text({*range(1, len(self.expected) + 1)})
 
     def _text(self, counts: set[int]) -> str:
-        rows = [("poses", "translation", "rotation")]
+        rows: list[tuple[str, ...]] = [("poses", "translation", "rotation")]
         for k in sorted(counts):
             shift, turn = self.expected[k - 1].tolist()
             known = f"{shift:.2f} mm", f"{turn:.3f} deg"
-            shown = ("unknown", "unknown") if math.isinf(shift + turn) else known
-            rows.append((str(k), *shown))
+            sizes = ("unknown", "unknown") if math.isinf(shift + turn) else known
+            rows.append((str(k), *sizes))
         *_, (count, shift, turn) = rows
         verdict = f"{count} poses determine the hand-eye transform to {shift} and {turn}."
         if shift == "unknown":
