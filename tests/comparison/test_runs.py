@@ -75,7 +75,7 @@ def test_runs_of_other_recordings_are_named_and_of_other_cameras_refused(
     wide = simulated_wall(
         tmp_path / "wide", camera=CAMERA | {"distortion": [0.01, 0.0, 0.0, 0.0, 0.0]}
     ).first.path
-    tofcorr.train(wide, {"model": {}, "figures": False}, out=tmp_path / "run")
+    tofcorr.train(wide, {"name": "bent", "model": {}, "figures": False}, out=tmp_path / "run")
     with pytest.raises(tofcorr.CalibrationDataError, match="the cameras or their lenses differ"):
         tofcorr.compare([runs[0], tmp_path / "run"])
     with pytest.raises(tofcorr.CalibrationDataError, match="give two runs at least"):

@@ -19,10 +19,7 @@ if TYPE_CHECKING:
     from tofcorr.data.recording import Recording
 
 _CLOUDS = "Folder of point clouds, made anew: frame_000_before.ply, frame_000_after.ply, ..."
-_FORMATS = " ".join(
-    f"{' = '.join((one.name, *one.aliases))} ({one.ending}): {one.summary}."
-    for one in FORMATS.values()
-)
+_FORMATS = " ".join(f"{one.name} ({one.ending}): {one.summary}." for one in FORMATS.values())
 
 
 class _FormatName(click.Choice[str]):

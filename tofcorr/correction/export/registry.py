@@ -21,7 +21,6 @@ class Format:
         packages: Packages that writing or reading it needs besides the required ones.
         extra: The extra of tofcorr that installs them.
         for_device: Whether the file is compiled for one device, `cpu` or `cuda`.
-        aliases: Other names that people try for it.
     """
 
     name: str
@@ -30,7 +29,6 @@ class Format:
     packages: tuple[str, ...] = ()
     extra: str = ""
     for_device: bool = False
-    aliases: tuple[str, ...] = ()
 
     def require_packages(self) -> None:
         """Refuse to go on without the packages that the format needs.
@@ -47,48 +45,30 @@ class Format:
 _ONNX = ("onnx", "onnxscript", "onnxruntime")
 
 _FORMATS = (
-    Format("torchscript", ".ts", "any machine with torch", aliases=("ts", "pt", "jit")),
-    Format(
-        "pt2",
-        ".pt2",
-        "the fastest; compiled for this kind of processor",
-        for_device=True,
-        aliases=("aoti",),
-    ),
+    Format("torchscript", ".ts", "any machine with torch"),
+    Format("pt2", ".pt2", "the fastest; compiled for this kind of processor", for_device=True),
     Format("onnx", ".onnx", "without torch", packages=_ONNX, extra="onnx"),
-    Format(
-        "c",
-        ".c",
-        "without any library: C99 for robots and controllers, compiled there",
-        aliases=("c99",),
-    ),
-    Format("lut", ".npz", "table for NumPy, to 0.1 mm", aliases=("npz", "numpy", "table")),
-    Format(
-        "urdf",
-        ".xacro",
-        "the camera's pose as a fixed joint of a robot description",
-        aliases=("xacro",),
-    ),
+    Format("c", ".c", "without any library: C99 for robots and controllers, compiled there"),
+    Format("lut", ".npz", "table for NumPy, to 0.1 mm"),
+    Format("urdf", ".xacro", "the camera's pose as a fixed joint of a robot description"),
     Format("tf", ".yaml", "the camera's pose for ROS, with the commands that publish it"),
-    Format(
-        "easy_handeye",
-        ".yaml, or .calib for easy_handeye2",
-        "the camera's pose for ROS",
-        aliases=("calib",),
-    ),
-    Format(
-        "opencv",
-        ".yml",
-        "intrinsics, camera's pose and coefficients for cv::FileStorage",
-        aliases=("cv", "yml"),
-    ),
+    Format("easy_handeye", ".yaml, or .calib for easy_handeye2", "the camera's pose for ROS"),
+    Format("opencv", ".yml", "intrinsics, camera's pose and coefficients for cv::FileStorage"),
 )
 
 FORMATS = {one.name: one for one in _FORMATS}
 """Every format by its name."""
 
-BY_ANY_NAME = FORMATS | {alias: one for one in _FORMATS for alias in one.aliases}
-"""Every format by its name and by its aliases."""
+ALIASES = {
+    **dict.fromkeys(("ts", "pt", "jit"), "torchscript"),
+    **dict.fromkeys(("npz", "numpy", "table"), "lut"),
+    "aoti": "pt2",
+    "c99": "c",
+    "xacro": "urdf",
+    "calib": "easy_handeye",
+    "yml": "opencv",
+}
+"""Formats by the other names that people try."""
 
 
 def format_named(name: str) -> Format:
@@ -97,7 +77,8 @@ def format_named(name: str) -> Format:
     Raises:
         ConfigError: There is no format of this name.
     """
-    if (plain := name.lower().lstrip(".")) not in BY_ANY_NAME:
-        hint = did_you_mean(plain, [*BY_ANY_NAME])
+    plain = name.lower().lstrip(".")
+    if (own := ALIASES.get(plain, plain)) not in FORMATS:
+        hint = did_you_mean(plain, [*FORMATS, *ALIASES])
         raise ConfigError(f"'{name}' is no format of export.{hint} Known: {', '.join(FORMATS)}.")
-    return BY_ANY_NAME[plain]
+    return FORMATS[own]
