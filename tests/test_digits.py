@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tofcorr.digits import decimals, known, known_interval
+from tofcorr.digits import aligned, at_most, decimals, known, known_interval
 
 
 @pytest.mark.parametrize(
@@ -41,3 +41,9 @@ def test_rounding_loses_at_most_a_seventh_of_the_half_width(value: float, half: 
     places = decimals(interval, most=9)
     assert 10.0**-places <= half / 3.5
     assert abs(round(value, places) - value) <= half / 7
+
+
+def test_columns_are_as_wide_as_their_widest_cell_and_long_lists_say_how_long() -> None:
+    assert aligned([("a", "10"), ("bcd", "2")]) == ["a    10", "bcd   2"]
+    assert at_most(2, ["a", "b"]) == ["a", "b"]
+    assert at_most(2, ["a", "b", "c"], "the page") == ["a", "... and 2 more: the page"]

@@ -2,6 +2,8 @@
 
 from tofcorr.comparison.evaluate import EvaluationResult as EvaluationResult
 from tofcorr.comparison.evaluate import evaluate as evaluate
+from tofcorr.comparison.runs import RunComparison as RunComparison
+from tofcorr.comparison.runs import compare as compare
 from tofcorr.comparison.select import SelectionResult as SelectionResult
 from tofcorr.comparison.select import select as select
 from tofcorr.data.recording import Recording as Recording

@@ -1,7 +1,7 @@
-"""Numbers with no more digits than their intervals leave known."""
+"""Numbers and tables as text: no more digits than are known, no more lines than are read."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 # An interval's half-width is at least so many of the units it is written in: 0.8 is written in
 # tenths, 2.1 too, 12 in ones, 40 in tens. The rounding rule of the Particle Data Group: two digits
@@ -77,3 +77,24 @@ def _written(value: float, places: int, sign: str) -> str:
         return "unknown"
     text = f"{round(value, places):{sign}.{max(places, 0)}f}"
     return text.removeprefix("-") if float(text) == 0 else text
+
+
+def aligned(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return rows of cells as lines, the first column aligned left and the others right."""
+    table = list(rows)
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    cells = ([a.ljust(widths[0]), *map(str.rjust, others, widths[1:])] for a, *others in table)
+    return ["  ".join(line).rstrip() for line in cells]
+
+
+def at_most(number: int, lines: Sequence[str], where: str = "--verbose") -> list[str]:
+    """Return lines that a user can read at once; the last one says how many more there are.
+
+    Args:
+        number: How many lines are returned at most.
+        lines: The most important first.
+        where: What shows the others.
+    """
+    if len(lines) <= number:
+        return [*lines]
+    return [*lines[: number - 1], f"... and {len(lines) - number + 1} more: {where}"]

@@ -1,6 +1,11 @@
 """The errors that a user can cause and can correct."""
 
 import unicodedata
+from difflib import get_close_matches
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 
 class TofcorrError(Exception):
@@ -17,6 +22,12 @@ class TofcorrError(Exception):
 
 Kind = type[TofcorrError]
 """Which error a function is to raise: a configuration's, a recording's, an export's."""
+
+
+def did_you_mean(given: str, known: "Iterable[str]") -> str:
+    """Return a sentence that asks whether what resembles a text was meant; empty: nothing does."""
+    close = get_close_matches(given, known, n=1)
+    return f" Did you mean '{close[0]}'?" if close else ""
 
 
 def printable(text: str) -> str:

@@ -119,8 +119,7 @@ def staged_folder(path: Path | str) -> Iterator[Path]:
     folder = target.parent / temporary_name()
     with ExitStack() as made:
         with writing_to(path):
-            for parent in reversed([one for one in target.parents if not one.exists()]):
-                made.enter_context(_begun(parent, parent.mkdir, Path.rmdir))
+            made.enter_context(new_folders(target.parent))
             remove_leftovers(target.parent)
             # The file system refuses a name that it cannot hold before any work is done.
             with suppress(FileNotFoundError):
@@ -131,6 +130,16 @@ def staged_folder(path: Path | str) -> Iterator[Path]:
             if os.path.lexists(target):
                 raise FileExistsError(0, "something appeared there in the meantime")
             folder.rename(target)
+
+
+@contextmanager
+def new_folders(path: Path) -> Iterator[None]:
+    """Make a folder and those above it; what is still empty after the block is removed."""
+    with ExitStack() as made:
+        missing = [one for one in (path, *path.parents) if not one.exists()]
+        for folder in reversed(missing):
+            made.enter_context(_begun(folder, folder.mkdir, Path.rmdir))
+        yield
 
 
 @contextmanager
@@ -227,6 +236,12 @@ def file_to_replace(path: Path, kind: Kind) -> Path:
         if target.exists() and not target.is_file():
             raise kind(f"{path}: is a device or a pipe, not a file; give the name of a file.")
     return target
+
+
+def file_in_new_folder(path: Path) -> None:
+    """Refuse the name of a file as `file_to_replace`, unless it is to stand in a new folder."""
+    if path.parent.exists():
+        file_to_replace(path, ExportError)
 
 
 def _refuse_name(path: Path, kind: Kind) -> None:

@@ -6,9 +6,8 @@ configuration: a shipped name, a file, a mapping or options that exist already.
 
 import os
 import reprlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
@@ -23,7 +22,7 @@ from pydantic import (
     ValidationError,
 )
 
-from tofcorr.errors import ConfigError, Kind
+from tofcorr.errors import ConfigError, Kind, did_you_mean
 from tofcorr.files import open_regular, reading
 
 LARGEST_NUMBER = 1e12
@@ -148,12 +147,6 @@ def refused_in_words(cls: type[BaseModel], where: str, kind: Kind = ConfigError)
         # More than five would hide the first, which often causes the others.
         faults = "; ".join(_one(detail, cls) for detail in error.errors()[:5])
         raise kind(f"{where}: {faults}") from None
-
-
-def did_you_mean(given: str, known: Iterable[str]) -> str:
-    """Return a sentence that asks whether what resembles a text was meant; empty: nothing does."""
-    close = get_close_matches(given, known, n=1)
-    return f" Did you mean '{close[0]}'?" if close else ""
 
 
 def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:

@@ -67,6 +67,8 @@ WRONG = {
     "simulate --config dmo --out o": "Did you mean 'demo'?",
     "simulate --out o": "Missing option '--config'",
     "diagnose --set sed=2 --recording r --out o": "Did you mean 'seed'?",
+    "trian": "No such command 'trian'. Did you mean 'train'?",
+    "export --run a --format npzz --out b": "Did you mean 'npz'?",
     "no-such-command": "No such command 'no-such-command'",
     "import polaroid": "No such command 'polaroid'",
     "correct --modle x": "No such option",

@@ -136,10 +136,10 @@ def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_pat
 def test_the_result_prints_stages_verdict_and_warnings(time_diagnosis: DiagnosisResult) -> None:
     warned = replace(time_diagnosis, warnings=("The lens was dirty.",))
     causes = [f"- {cause}" for cause in time_diagnosis.causes]
-    lines = [*table_of_stages(time_diagnosis), time_diagnosis.verdict, *causes]
-    lines += time_diagnosis.remarks
+    lines = [time_diagnosis.verdict, *table_of_stages(time_diagnosis), *causes]
     assert repr(time_diagnosis) == "\n".join(lines)
     assert repr(warned) == "\n".join([*lines, "Warning: The lens was dirty."])
+    assert time_diagnosis.details == "\n".join([*lines, *time_diagnosis.remarks])
 
 
 def test_every_figure_of_the_page_can_be_drawn_by_itself(time_diagnosis: DiagnosisResult) -> None:

@@ -98,7 +98,7 @@ def test_the_command_says_so_and_writes_json_and_a_page(
     given = ("--run", run, "--recording", few.first.path, "--wall", "recorded")
     said = program("check", *given, "--out", tmp_path / "check.json")
     found = tofcorr.check(run, few.first.path, wall="recorded")
-    assert said == (0, f"{found!r}\n", "")
+    assert said == (0, f"{found!r}\nWritten to {tmp_path / 'check.json'}\n", "")
     written = json.loads((tmp_path / "check.json").read_text())
     assert written == found.to_mapping()
     assert written["verdict"] == "drifted"

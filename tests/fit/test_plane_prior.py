@@ -64,7 +64,7 @@ def test_unknown_planes_leave_what_is_within_views_and_exact_ones_all(tmp_path: 
         known = None if size is None else np.tile(size * np.eye(4), (dataset.num_frames, 1, 1))
         frames = replace(recording.frames, plane_covariance=known)
         changed = Dataset((replace(recording, frames=frames),))
-        return views_mm(frame_errors(changed, {"before": model}, scale=1e-2)["before"])
+        return views_mm(frame_errors(changed, {"before": model}, variance=1e-2)["before"])
 
     unknown, exact, as_given = judged(1e6), judged(0.0), judged(None)
     assert unknown["within_prior"] == pytest.approx(unknown["within_views"], rel=1e-3)

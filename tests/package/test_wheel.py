@@ -47,7 +47,7 @@ def test_simulate_and_train_run_by_name_in_an_empty_folder(
     shipped = (ROOT / "configs" / "train" / "ea.yaml").read_text("utf-8")
     assert printed_alone(python_with_wheel, tmp_path, "-m", "tofcorr", "configs", "ea") == shipped
     printed = printed_alone(python_with_wheel, tmp_path, "-c", SIMULATE_AND_TRAIN)
-    assert "Run filed in run" in printed
+    assert "Written to run: " in printed
     report = json.loads((tmp_path / "run" / "report.json").read_text("utf-8"))
     assert report["model"] == "EA"
     assert report["iterations"] <= 30

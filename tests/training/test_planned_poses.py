@@ -109,7 +109,7 @@ def test_the_command_writes_poses_of_the_robot(tmp_path: Path, program: Program)
         # The start looks along the world's x axis; every pose looks at the same point of the wall.
         looked_at = np.array(pose[:3]) + float(row["distance_m"]) * forward
         np.testing.assert_allclose(looked_at, [1.4, 0.0, 0.5], atol=1e-3)
-    assert "6 poses written to" in told
+    assert "6 poses determine the hand-eye transform to" in told
 
 
 def test_a_start_that_is_no_pose_is_refused(tmp_path: Path, program: Program) -> None:

@@ -110,17 +110,32 @@ def test_nothing_is_written_until_asked(
 def test_the_command_prints_the_result(trained: Trained, tmp_path: Path, program: Program) -> None:
     given = ("--config", trained.folder / "config.yaml", "--recording", trained.recording)
     told = program("train", *given, "--out", tmp_path / "run")
-    filed = f"{trained.result.report['message']} Run filed in {tmp_path / 'run'}\n"
-    assert told == (0, f"{trained.result!r}\n{filed}", "")
+    code, printed, said = told
+    assert (code, said) == (0, "")
+    *found, last = printed.splitlines()
+    assert "\n".join(found) == repr(trained.result)
+    assert len(found) <= 11
+    assert last.startswith(f"Written to {tmp_path / 'run'}: ")
+    assert "report.json" in last
+
+
+def test_verbose_prints_all_that_the_training_says(
+    trained: Trained, tmp_path: Path, program: Program
+) -> None:
+    given = ("--config", trained.folder / "config.yaml", "--recording", trained.recording)
+    _, printed, logged = program("train", "--verbose", *given, "--out", tmp_path / "run")
+    assert printed.startswith(trained.result.details)
+    assert "training: fit" in logged
 
 
 def test_the_text_holds_the_errors_and_the_hand_eye(trained: Trained) -> None:
     lines = repr(trained.result).splitlines()
-    assert lines[0].split() == ["EA", "train", "held", "out"]
+    assert lines[0].startswith(f"Verdict: {trained.report()['verdict']}.")
     for line, (stage, halves) in zip(lines[2:], trained.report()["error_mm"].items(), strict=False):
-        numbers = [f"{halves[half][kind]:.2f}" for half in halves for kind in ("mean_abs", "rms")]
-        assert line[:16].strip().replace("-", "_").replace(" ", "_") == stage
-        assert line[16:].split() == numbers
+        *name, fitted, held_out = line.split()
+        assert "_".join(name).replace("-", "_") == stage
+        assert [fitted, held_out] == [f"{halves[half]['rms']:.2f}" for half in halves]
+        assert f"{halves['test']['mean_abs']:.2f}" in trained.result.details
     assert "hand-eye translation, mm" in lines[5]
 
 

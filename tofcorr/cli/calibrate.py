@@ -1,6 +1,5 @@
 """The commands that calibrate a camera: inspect, train, compare, check."""
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from tofcorr.cli.shared import (
     out_option,
     recording_option,
     run_option,
+    show,
 )
 from tofcorr.files import REPLACED_FILE, NewPath
 
@@ -44,9 +44,7 @@ def inspect_command(recordings: tuple[Path, ...], out: Path | None, planes: Any)
     """
     from tofcorr.plausibility.examine import inspect
 
-    click.echo(repr(inspect(recordings, planes=planes, out=out)))
-    if out is not None:
-        click.echo(f"Page written to {out}")
+    show(inspect(recordings, planes=planes, out=out), out)
 
 
 @click.command()
@@ -73,9 +71,7 @@ def train_command(
 
     if no_figures:
         options = options.model_copy(update={"figures": False})
-    result = train(recordings, options, **given)
-    click.echo(repr(result))
-    click.echo(f"{result.report['message']} Run filed in {given['out']}")
+    show(train(recordings, options, **given), given["out"])
 
 
 @click.command()
@@ -99,8 +95,7 @@ def evaluate_command(
     """
     from tofcorr.comparison.evaluate import evaluate
 
-    click.echo(repr(evaluate(recordings, options, tell=partial(click.echo, err=True), **given)))
-    click.echo(f"\nWritten to {given['out']}.")
+    show(evaluate(recordings, options, **given), given["out"])
 
 
 @click.command()
@@ -117,8 +112,21 @@ def select_command(options: "SelectionOptions", recordings: tuple[Path, ...], **
     """
     from tofcorr.comparison.select import select
 
-    click.echo(repr(select(recordings, options, tell=partial(click.echo, err=True), **given)))
-    click.echo(f"Written to {given['out']}.")
+    show(select(recordings, options, **given), given["out"])
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=FOLDER)
+@option("--out", "HTML page to write.", type=NewPath())
+def compare_command(runs: tuple[Path, ...], out: Path | None) -> None:
+    """Show runs of one camera side by side: errors, hand-eye transforms, options that differ.
+
+    Two hand-eye transforms differ significantly where chance, by their standard errors, makes as
+    large a difference in less than one case of twenty.
+    """
+    from tofcorr.comparison.runs import compare
+
+    show(compare(runs, out=out), out)
 
 
 @click.command()
@@ -136,6 +144,4 @@ def check_command(run: Path, recordings: tuple[Path, ...], **given: Any) -> None
     """
     from tofcorr.drift.check import check
 
-    click.echo(repr(check(run, recordings, **given)))
-    if given["page"] is not None:
-        click.echo(f"Page written to {given['page']}")
+    show(check(run, recordings, **given), given["out"], given["page"])

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import click
 
 from tofcorr.cli.shared import FOLDER, option, out_option, recording_option, run_option
-from tofcorr.correction.export.registry import FORMATS
+from tofcorr.correction.export.registry import FORMATS, format_named
 from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
-from tofcorr.files import REPLACED_FILE, NewPath
+from tofcorr.files import NewPath, file_in_new_folder, new_folders
 
 if TYPE_CHECKING:
     from tofcorr.correction.metadata import CorrectorMetadata
@@ -19,6 +19,14 @@ if TYPE_CHECKING:
 
 _CLOUDS = "Folder of point clouds, made anew: frame_000_before.ply, frame_000_after.ply, ..."
 _FORMATS = " ".join(f"{one.name} ({one.ending}): {one.summary}." for one in FORMATS.values())
+
+
+class _FormatName(click.Choice[str]):
+    """The name of an export format, or another name for it."""
+
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the name that the format is registered by."""
+        return format_named(value).name
 
 
 @click.command()
@@ -104,8 +112,8 @@ def _refuse_another_camera(
 
 @click.command()
 @run_option
-@option("--format", _FORMATS, "name", required=True, type=click.Choice(list(FORMATS)))
-@out_option("File to write; an older one is replaced.", REPLACED_FILE)
+@option("--format", _FORMATS, "name", required=True, type=_FormatName(list(FORMATS)))
+@out_option("File to write; an older one is replaced.", NewPath(file_in_new_folder, "file"))
 @option("--device", "What pt2 is compiled for: cpu or cuda.", default="cpu")
 def export_command(run: Path, name: str, out: Path, device: str) -> None:
     """Write the corrector of a run, once it agrees with the calibration, or the camera's pose.
@@ -125,5 +133,6 @@ def export_command(run: Path, name: str, out: Path, device: str) -> None:
         raise ConfigError(f"--device {device}: only for {compiled}, on a machine that has it.")
     verdict = verdict_of_run(run)
     state = load_calibration(run / STATE_FILE)
-    export(name, DepthCorrector.from_state(state).to(device), out, state)
+    with new_folders(out.parent):
+        export(name, DepthCorrector.from_state(state).to(device), out, state)
     click.echo(f"{out}: the calibration {state.name} of {run} as {name}. {verdict}".rstrip())

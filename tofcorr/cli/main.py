@@ -27,6 +27,7 @@ COMMANDS = {
     "train": ("calibrate", "Calibrate a recording: distance, pixel, intensity error, hand-eye."),
     "evaluate": ("calibrate", "Compare models on held-out images, in the paper's two tables."),
     "select": ("calibrate", "Choose the model that predicts best what it has not seen."),
+    "compare": ("calibrate", "Show several runs side by side: errors, hand-eye, options."),
     "check": ("calibrate", "Say whether a calibration still holds, from a few frames of any wall."),
     "export": ("correct", "Write the calibration of a run for robots: corrector, URDF, tf, ..."),
     "correct": ("correct", "Correct a recording with a trained corrector; also as point clouds."),
@@ -157,8 +158,8 @@ def configs_command(name: str | None) -> None:
     have one of the same name, write FOLDER/NAME, such as train/ea. To edit one, save it to a file:
     tofcorr configs ea > mine.yaml
     """
-    from tofcorr.errors import ConfigError
-    from tofcorr.options import configs_folder, did_you_mean
+    from tofcorr.errors import ConfigError, did_you_mean
+    from tofcorr.options import configs_folder
 
     files = sorted(configs_folder().glob("*/*.yaml"))
     every = {f"{file.parent.name}/{file.stem}": file for file in files}

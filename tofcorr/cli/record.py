@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tofcorr.cli.shared import LazyGroup, config_options, out_option
+from tofcorr.cli.shared import LazyGroup, config_options, out_option, show
 from tofcorr.files import REPLACED_FILE
 from tofcorr.importing.command_line import intrinsics_options, number_list, option, take_intrinsics
 from tofcorr.importing.registry import IMPORTERS
@@ -85,9 +85,9 @@ def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None: 
     space = Workspace(nearest=nearest, farthest=farthest, **given)
     plan = plan_poses(camera, options.model, space, tool_from_camera=hand_eye, **asked)
     write_text(out, _table(plan, np.eye(4) if start is None else start))
-    click.echo(repr(plan))
-    relative = " relative to the start pose" if start is None else ""
-    click.echo(f"{len(plan.expected)} poses{relative} written to {out}")
+    if start is None:
+        click.echo("The poses are relative to the start pose.", err=True)
+    show(plan, out)
 
 
 def _transform(values: tuple[float, ...] | None, key: str) -> "np.ndarray | None":

@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import click
 from click.shell_completion import CompletionItem
 
+from tofcorr.errors import did_you_mean
 from tofcorr.files import NewPath
 from tofcorr.importing.command_line import option
 
@@ -45,20 +46,57 @@ class LazyGroup(click.Group):
         # The commands of a group below have the option; the group itself has none.
         return command if known or isinstance(command, click.Group) else _VERBOSE(command)
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that was named; refuse an unknown one with the nearest."""
+        if args[0] not in self._lazy and not ctx.resilient_parsing:
+            ctx.fail(f"No such command '{args[0]}'.{did_you_mean(args[0], self._lazy)}")
+        return super().resolve_command(ctx, args)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List names and summaries."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, summary) for name, (_, summary) in self._lazy.items()])
 
 
+class Result(Protocol):
+    """What a command found: its `repr` is a few lines, its `details` all that it has to say."""
+
+    @property
+    def details(self) -> str:
+        """Verdict, every table and every warning."""
+        ...
+
+
+_ASKED_FOR_ALL = "tofcorr.verbose"
+
+
+def show(result: Result, *written: Path | None) -> None:
+    """Print the few lines of a result, or all with `--verbose`; then what was written.
+
+    Args:
+        result: What the command found.
+        written: Files and folders that it wrote; None: not asked for.
+    """
+    all_of_it = click.get_current_context().meta.get(_ASKED_FOR_ALL, False)
+    click.echo(result.details if all_of_it else repr(result))
+    for out in filter(None, written):
+        files = {one.name for one in out.iterdir()} if out.is_dir() else set[str]()
+        # What is for people stands first.
+        names = ", ".join(sorted(files, key=lambda name: (not name.endswith(".html"), name)))
+        click.echo(f"Written to {out}{names and f': {names}'}")
+
+
 def _log_every_step(context: click.Context, option: click.Parameter, asked: bool) -> None:
+    context.meta[_ASKED_FOR_ALL] = asked
     if asked:
         from tofcorr.progress import log_to_stderr
 
         log_to_stderr()
 
 
-_LOGGED = "Log every step to standard error, in place of progress bars."
+_LOGGED = "Print all results, and log every step to standard error in place of progress bars."
 _VERBOSE = option("--verbose", _LOGGED, is_flag=True, expose_value=False, callback=_log_every_step)
 
 

@@ -5,7 +5,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tofcorr.cli.shared import config_options, force_option, option, out_option, recording_option
+from tofcorr.cli.shared import (
+    config_options,
+    force_option,
+    option,
+    out_option,
+    recording_option,
+    show,
+)
 
 if TYPE_CHECKING:
     from tofcorr.diagnosis.options import DiagnosisOptions
@@ -90,5 +97,4 @@ def diagnose_command(
     """
     from tofcorr.diagnosis.diagnose import diagnose
 
-    click.echo(repr(diagnose(recording_path, simulator, options, **given)))
-    click.echo(f"Report filed in {given['out']}")
+    show(diagnose(recording_path, simulator, options, **given), given["out"])

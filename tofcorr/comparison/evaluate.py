@@ -21,6 +21,7 @@ from tofcorr.comparison.options import (
 )
 from tofcorr.comparison.page import held_out_figure, render
 from tofcorr.comparison.statistics import Estimate, Table
+from tofcorr.digits import aligned, at_most
 from tofcorr.files import staged_folder, write_json
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pages.drawing import save_figure
@@ -33,7 +34,7 @@ from tofcorr.version import __version__
 
 @dataclass(frozen=True, repr=False)
 class EvaluationResult:
-    """Held-out errors of several models; its `repr` is the tables that the command prints.
+    """Held-out errors of several models; its `repr` is the short text that the command prints.
 
     Attributes:
         sets: One a recording, in the order given.
@@ -46,7 +47,25 @@ class EvaluationResult:
     headlines: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """Return what is doubtful, tables, notes and warnings."""
+        """Return the best model, the held-out error of each, and a warning: 11 lines at most."""
+        columns, sets = self.options.columns, self.sets
+        protocol = "folds" if self.options.folds else "half"
+        found = {c: [one.estimate(protocol, "mean_abs_mm", c) for one in sets] for c in columns}
+        ordered = sorted(columns, key=lambda column: sum(one.mean for one in found[column]))
+        first = found[ordered[0]]
+        sizes = ", ".join(
+            f"{own.mean:.2f} mm on {one.name}" for own, one in zip(first, sets, strict=True)
+        )
+        verdict = f"{ordered[0]} predicts held-out images best: off by {sizes}."
+        rows = [[column, *map(_interval, found[column])] for column in ordered]
+        heads = ["mean absolute error, mm", *(one.name for one in sets)]
+        table = at_most(6, aligned([heads, *rows]))
+        said = [*self.headlines, *(f"Warning: {text}" for text in self.warnings)]
+        return "\n".join([verdict, *table, *at_most(3, said)])
+
+    @property
+    def details(self) -> str:
+        """What is doubtful, all tables, notes and warnings."""
         return "\n\n".join(self._page([table.text() for table in self.tables()]))
 
     def markdown(self) -> str:
@@ -326,4 +345,6 @@ def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
 
 
 def _interval(found: Estimate) -> str:
-    return f"{found.mean:.2f} ± {found.half_width:.2f}"
+    """Return a mean with its interval; of one split no interval is known."""
+    around = f" ± {found.half_width:.2f}" if np.isfinite(found.half_width) else ""
+    return f"{found.mean:.2f}{around}"

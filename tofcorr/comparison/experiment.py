@@ -193,7 +193,7 @@ def compare(sets: Sequence[Experiment], tell: Callable[[str], object] = LOG.info
     tell(f"{len(options.models)} models, {fits} fits each; how long follows with the first.")
     sizes = {one.name: sets[0].fitter.size(one) for one in options.models}
     try:
-        for column in options.columns:
+        for column in through(options.columns, "models", "model"):
             start = perf_counter()
             errors = ", ".join(f"{one.measure(column):.2f}" for one in sets)
             done.append(column)

@@ -12,6 +12,7 @@ from tofcorr.comparison.experiment import Experiment, compare
 from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
 from tofcorr.comparison.page import held_out_figure, render
 from tofcorr.comparison.statistics import Ranking, Table
+from tofcorr.digits import aligned, at_most
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.files import staged_folder, write_json
@@ -78,8 +79,30 @@ class SelectionResult:
         return text
 
     def __repr__(self) -> str:
-        """Return what is doubtful, the choice, a table for each grouping, and warnings."""
+        """Return the choice, the best models' held-out errors, and a warning: 11 lines at most."""
+        rankings, decisive = self.rankings.values(), self.decisive
+        ordered = sorted(decisive.errors, key=lambda name: decisive.errors[name].mean)
+        rows = [
+            [name, str(decisive.complexity[name])]
+            + [
+                f"{one.errors[name].mean:.2f} ± {one.errors[name].standard_error:.2f}"
+                for one in rankings
+            ]
+            for name in ordered
+        ]
+        heads = [f"{by}s held out, mm" for by in self.rankings]
+        table = at_most(6, aligned([["model", "unknowns", *heads], *rows]))
+        doubtful = [self.headline] if self.headline else []
+        return "\n".join([self.verdict, *doubtful, *table, *at_most(2, self._warnings)])
+
+    @property
+    def details(self) -> str:
+        """The choice, a table for each grouping, and all warnings."""
         return self._page([table.text() for table in self.tables()])
+
+    @property
+    def _warnings(self) -> list[str]:
+        return [f"Warning: {warning}" for warning in self.experiment.warnings]
 
     def markdown(self) -> str:
         """Return the same as a page of Markdown."""
@@ -127,9 +150,8 @@ class SelectionResult:
         ]
 
     def _page(self, tables: list[str]) -> str:
-        doubtful = filter(None, [self.headline])
-        warnings = (f"Warning: {warning}" for warning in self.experiment.warnings)
-        return "\n\n".join([*doubtful, self.verdict, *tables, *warnings, *self._notes])
+        parts = [self.verdict, *filter(None, [self.headline]), *tables, *self._notes]
+        return "\n\n".join([*parts, *self._warnings])
 
     @property
     def _notes(self) -> list[str]:

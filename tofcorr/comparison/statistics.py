@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tofcorr.digits import aligned
 from tofcorr.estimation.robust import LEVEL, student_quantile, student_tail
 from tofcorr.training.report import number_or_none
 
@@ -123,12 +124,9 @@ class Table(NamedTuple):
 
     def text(self) -> str:
         """Return the table as text, the first column aligned left and the others right."""
-        lines = [self.header, *self.rows]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        cells = ([a.ljust(widths[0]), *map(str.rjust, others, widths[1:])] for a, *others in lines)
-        aligned = ["  ".join(line).rstrip() for line in cells]
-        rule = "-" * (sum(widths) + 2 * len(widths) - 2)
-        return "\n".join([self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note])
+        header, *rows = aligned([self.header, *self.rows])
+        rule = "-" * max(map(len, [header, *rows]))
+        return "\n".join([self.title, rule, header, rule, *rows, rule, self.note])
 
     def markdown(self) -> str:
         """Return a Markdown table."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from tofcorr.digits import in_mm, known, known_interval
+from tofcorr.digits import aligned, in_mm, known, known_interval
 from tofcorr.drift.offset import ImageDrift, Wall
 from tofcorr.plausibility.finding import in_words
 
@@ -66,12 +66,19 @@ class DriftResult:
         if self.wall == "per_image":
             bow = f"tells an offset to within {(interval[1] - interval[0]) / 2:.2g} mm"
             how = f"A wall at an unknown place {bow}. Use a measured one, or one seen from poses."
+        limit = f"limit {1e3 * self.threshold:g} mm"
+        found = (
+            (
+                "distances too far since then by",
+                f"{offset} mm",
+                f"95 %: {low} to {high} mm; {limit}",
+            ),
+            ("walls depart from planes by", f"{1e3 * self.flatness:.2f} mm", limit),
+        )
         lines = [
-            self.headline,
             _VERDICTS[self.verdict],
-            f"Its distances are {offset} mm off, compared with the calibration (positive: too far; "
-            f"95 % interval {low} to {high} mm; threshold {1e3 * self.threshold:g} mm).",
-            f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",
+            self.headline,
+            *aligned(found),
             self.unused and f"Not used, with too few usable pixels: {in_words(self.unused)}.",
             # Some are expected: the ranges are the central 99.8 % of the training pixels.
             self.outside > 1 / 10
@@ -122,6 +129,14 @@ class DriftResult:
         values |= {"others": others, **self.to_mapping()}
         figures, filters = {"drift": self.plot()}, {"mm": in_mm}
         return page_text("tofcorr.drift", "report.html.j2", figures, filters, **values)
+
+    @property
+    def details(self) -> str:
+        """The same, and how flat the corrected wall of each image is."""
+        walls = (
+            f"  frame {k}: {1e3 * off:.2f} mm, {count} pixels" for k, off, count in self.images
+        )
+        return "\n".join([repr(self), "Departure of each corrected wall from a plane:", *walls])
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the finding as plain values, as in the command's JSON file."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from tofcorr.digits import at_most
 from tofcorr.errors import ConfigError
 from tofcorr.files import NewPath
 
@@ -181,10 +182,11 @@ def print_report(report: Mapping[str, Any], out: Path) -> None:
     reasons: dict[str, list[str]] = {}
     for refusal in report["refused"]:
         reasons.setdefault(refusal["reason"], []).append(refusal["view"])
-    for reason, left_out in list(reasons.items())[:10]:
+    refused = list[str]()
+    for reason, left_out in reasons.items():
         which = left_out[0] if len(left_out) == 1 else f"{len(left_out)} ({left_out[0]}, ...)"
-        click.echo(f"  refused {which}: {reason}")
-    if len(reasons) > 10:
-        click.echo(f"  and {len(reasons) - 10} more reasons: see import.json")
+        refused.append(f"  refused {which}: {reason}")
+    for line in at_most(10, refused, f"{out / 'import.json'}"):
+        click.echo(line)
     for warning in report["warnings"]:
         click.echo(f"Warning: {warning}", err=True)

@@ -190,11 +190,11 @@ def frame_errors(
     dataset: Dataset,
     models: Mapping[str, CalibrationModel],
     device: str = "cpu",
-    scale: float = 0.0,
+    variance: float = 0.0,
 ) -> dict[str, ErrorsByKind]:
-    """Return the errors by kind that models leave on all frames; scale: `FittedModel.variance`."""
+    """Return the errors by kind that models leave on all frames; `variance`: of `FittedModel`."""
     every = np.arange(dataset.num_frames)
-    fitted = [FittedModel(one, every, variance=scale) for one in models.values()]
+    fitted = [FittedModel(one, every, variance=variance) for one in models.values()]
     return dict(zip(models, held_out_errors(dataset, fitted, device), strict=True))
 
 

@@ -8,7 +8,7 @@ estimated with the hand-eye.
 
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -26,10 +26,8 @@ from tofcorr.estimation.robust import (
 from tofcorr.estimation.solvers import rotation_from_normals
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame, planes_through
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.finding import CAMERA, FAR_OFF, LARGE_CONSTANT
-
-if TYPE_CHECKING:
-    from tofcorr.plausibility.look import Look
 
 TINY = float(np.finfo(np.float64).tiny)
 """What a divisor is at the least."""
@@ -45,9 +43,10 @@ class Scene:
     The plane of a frame's own points is the largest one, fitted to the pixels near it.
 
     Args:
-        look: The recording.
-        stored: Depths, shape (F, P), metres; NaN: not usable.
-        pixel: Where, shape (F, P).
+        data: The recordings.
+        frames: Global numbers of the frames, shape (F,).
+        rays: Unit rays, shape (F, P, 3).
+        stored: Depths as stored, shape (F, P), metres; NaN: not usable.
 
     Attributes:
         poses: world_from_tool, shape (F, 4, 4), metres.
@@ -65,19 +64,18 @@ class Scene:
         flatness: Root mean square distance of the pixels on it to it, shape (F,), metres.
         moments: Mean of q q^T over these pixels with q = (point, 1, ray) in the camera frame, shape
             (F, 7, 7).
-        before: world_from_tool of the frame recorded before each, shape (F, 4, 4), metres.
-        after: The same of the frame after it.
         moves: Whether a robot moves the camera; without one the hand-eye is the identity.
         guess: The recorded tool_from_camera, shape (4, 4).
     """
 
-    def __init__(self, look: "Look", stored: np.ndarray, pixel: np.ndarray) -> None:
-        self.poses, self.moves = look.poses, look.data.moves
-        self.before, self.after = (look.column("world_from_tool", later=k) for k in (-1, 1))
-        self.normal, self.offset = (look.column(name) for name in ("normal_world", "offset"))
-        self.guess = np.asarray(look.recording.tool_from_camera, dtype=np.float64)
-        self.rays = rays = look.rays[pixel]
-        self.distance = stored / rays[..., 2] if look.recording.depth_kind == "z" else stored
+    def __init__(
+        self, data: Dataset, frames: np.ndarray, rays: np.ndarray, stored: np.ndarray
+    ) -> None:
+        names = "world_from_tool", "normal_world", "offset"
+        self.poses, self.normal, self.offset = (data.column(one).numpy()[frames] for one in names)
+        self.moves, self.rays = data.moves, rays
+        self.guess = np.asarray(data.first.tool_from_camera, dtype=np.float64)
+        self.distance = stored / rays[..., 2] if data.first.depth_kind == "z" else stored
         valid = np.isfinite(self.distance)
         # On a base as short, as seen from 1 m, errors of the camera turn the plane anywhere. And
         # three pixels determine a plane, six can judge it.

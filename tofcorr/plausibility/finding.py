@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
+from tofcorr.digits import aligned, at_most
+
 if TYPE_CHECKING:
     from tofcorr.plausibility.look import Look
 
@@ -145,8 +147,26 @@ class Inspection:
         }
 
     def __repr__(self) -> str:
-        """Return the findings, the worst first, and what was measured."""
-        lines = [f"{one.severity:<11}{one.sentence}" for one in self.findings]
-        numbers = [f"  {name:<44}{value:>10.4g}" for name, value in self.numbers.items()]
-        said = lines or ["Nothing odd was found."]
-        return "\n".join([", ".join(self.recordings), *said, *numbers])
+        """Return the worst findings, and what was measured first: 11 lines at most."""
+        found = at_most(5, self._found)
+        return "\n".join([*self._verdict, *found, *self._measured[: 10 - len(found)]])
+
+    @property
+    def details(self) -> str:
+        """All findings, the worst first, and all that was measured."""
+        return "\n".join([*self._verdict, *self._found, *self._measured])
+
+    @property
+    def _verdict(self) -> list[str]:
+        worst = self.findings[0].severity if self.findings else ""
+        said = {"": "Nothing odd was found.", "impossible": "No fit to this would mean anything."}
+        named = ", ".join(self.recordings)
+        return [f"{said.get(worst, f'{worst.capitalize()}: see below.')} Recording: {named}"]
+
+    @property
+    def _found(self) -> list[str]:
+        return [f"{one.severity:<11}{one.sentence}" for one in self.findings]
+
+    @property
+    def _measured(self) -> list[str]:
+        return aligned((f"  {name}", f"{value:.4g}") for name, value in self.numbers.items())

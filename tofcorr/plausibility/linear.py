@@ -379,11 +379,16 @@ Late = tuple[tuple[str, str], float, Estimate]
 moves points off their planes, metres."""
 
 
-def lateness(problem: LinearResiduals) -> Late | None:
+def lateness(problem: LinearResiduals, before: np.ndarray, after: np.ndarray) -> Late | None:
     """Estimate whether poses and images are of different moments, by a share of each move.
 
     A pose may hold a share of the move from the frame before, or to the next. A camera that filters
     over time shows a share of what it saw before.
+
+    Args:
+        problem: The residuals.
+        before: world_from_tool of the frame recorded before each, shape (F, 4, 4), metres.
+        after: The same of the frame after it.
 
     Returns:
         What explains most; None where nothing surely is late, or no robot moves.
@@ -392,11 +397,11 @@ def lateness(problem: LinearResiduals) -> Late | None:
     if not scene.moves or len(scene.poses) < problem.frames_for(1, times=2):
         return None
     columns: dict[tuple[str, str], np.ndarray] = {}
-    for move, other in (("before", scene.before), ("after", scene.after)):
+    for move, other in (("before", before), ("after", after)):
         turn = Rotation.from_matrix(other[:, :3, :3] @ scene.poses[:, :3, :3].mT).as_rotvec()
         step = other[:, None, :3, 3] - place + np.cross(turn[:, None], problem.world - place)
         columns["pose", f"the move {move} it"] = np.einsum("fpa,fa->fp", step, scene.normal)
-    camera, seen = scene.before @ problem.hand_eye, problem.distance[problem.used]
+    camera, seen = before @ problem.hand_eye, problem.distance[problem.used]
     height = (camera[:, :3, 3] * scene.normal).sum(-1) + scene.offset
     cosine = np.einsum("fpa,fba,fb->fp", problem.rays, camera[:, :3, :3].mT, scene.normal)
     # Where no wall was seen, something as far as the walls are is in the image.

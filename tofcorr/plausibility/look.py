@@ -131,11 +131,12 @@ class Look:
         self.rays = data.ray_directions().numpy().reshape(-1, 3)
         # Twenty minutes of poses, judged in about a second.
         self.sampled = np.unique(np.linspace(0, total - 1, min(total, 600)).astype(int))
-        self.poses, self.group = self.column("world_from_tool"), data.repeat_groups()[self.sampled]
+        self.poses = data.column("world_from_tool").numpy()[self.sampled]
+        self.group = data.repeat_groups()[self.sampled]
         # A plane is then known to a tenth of the noise of one pixel, and 60 frames are read and
         # judged in well below 0.3 s.
         self._read(int(np.clip(12_000 // len(self.sampled), 24, 200)))
-        whole = Scene(self, self.stored, self.pixel)
+        whole = Scene(data, self.sampled, self.rays[self.pixel], self.stored)
         self.usable = np.asarray(whole.on_plane.any(1))
         self.frames, self.scene = self.sampled[self.usable], whole.some(self.usable)
         flatness = self.scene.flatness[self.scene.known]
@@ -173,10 +174,17 @@ class Look:
         self.off_pixel = _padded(off_pixel, 0).astype(int)
         self.noise, self.noise_rms = _noise_of(np.concatenate(second))
 
-    def column(self, name: str, later: int = 0) -> np.ndarray:
-        """Return a column of every recording, (F, ...), so many frames after those looked at."""
-        frames = (self.sampled + later).clip(0, self.data.num_frames - 1)
-        return self.data.column(name).numpy()[frames]
+    @cached_property
+    def neighbours(self) -> list[np.ndarray]:
+        """world_from_tool of the frames before and after those of the linear residuals.
+
+        Two arrays of shape (F, 4, 4), metres. The first and the last frame of a recording stand for
+        those that it does not have.
+        """
+        ends = np.cumsum([0, *(one.num_frames for one in self.data.recordings)])
+        seen, poses = self.frames[self.scene.known], self.data.column("world_from_tool").numpy()
+        own = np.searchsorted(ends, seen, side="right")
+        return [poses[(seen + k).clip(ends[own - 1], ends[own] - 1)] for k in (-1, 1)]
 
     def condition(self, name: str) -> np.ndarray:
         """Return a condition of the frames looked at, shape (F,); NaN: unknown."""
@@ -184,7 +192,7 @@ class Look:
 
     def with_images(self, stored: np.ndarray, pixel: np.ndarray) -> Scene:
         """Return the scene if these depths (F, P) had been measured, at these pixels."""
-        return Scene(self, stored, pixel).some(self.usable)
+        return Scene(self.data, self.sampled, self.rays[pixel], stored).some(self.usable)
 
     @cached_property
     def as_given(self) -> Alignment | None:
@@ -248,7 +256,7 @@ class Look:
     @cached_property
     def late(self) -> Late | None:
         """Whether poses and images are of different moments; None where it cannot be told."""
-        return None if self.linear is None else lateness(self.of_camera)
+        return None if self.linear is None else lateness(self.of_camera, *self.neighbours)
 
     @cached_property
     def _left(self) -> np.ndarray | None:

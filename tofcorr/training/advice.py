@@ -17,14 +17,16 @@ from torch.nn.functional import normalize
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import FrameBatch
+from tofcorr.digits import aligned
 from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
-from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
+from tofcorr.estimation.moments import HAND_EYE_SYMBOLS, ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.uncertainty import (
     PRIOR_SIGMA,
+    Direction,
     posterior_covariance,
     worst_axes,
     worst_sigma,
@@ -355,8 +357,20 @@ def advise(
         for k, sigma in zip(order, worst[1:], strict=True)
     ]
     weakest = next(one for one in fit.directions if not fit.is_unseen(one))
-    now = {"direction": weakest.in_words(), "sigma_mm_or_mrad": 1e3 * weakest.sigma}
+    now = {
+        "direction": weakest.in_words(),
+        "of": _kinds(weakest, fit.model.error),
+        "sigma_mm_or_mrad": 1e3 * weakest.sigma,
+    }
     return order, {**now, "worst_sigma_mm_or_mrad": worst[0], "poses": poses}
+
+
+def _kinds(weakest: Direction, model: ErrorModel) -> list[str]:
+    """Return which kinds of unknowns a direction consists of, the largest component first."""
+    kinds = {symbol: f"{term.group} term" for term in model.terms() for symbol in term.symbols}
+    kinds |= dict.fromkeys(HAND_EYE_SYMBOLS, "hand-eye transform")
+    # c0, of no term, is the constant error of the distance.
+    return list(dict.fromkeys(kinds.get(symbol, "distance term") for symbol in weakest.shares))
 
 
 def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[list[int], Tensor]:
@@ -405,14 +419,28 @@ class PosePlan:
     expected: Tensor
 
     def __repr__(self) -> str:
-        """Return the expected standard errors after every few poses, as a table."""
-        lines = ["poses   hand-eye: worst axis of translation    rotation"]
+        """Return what to expect of all poses, and of the first half and quarter of them."""
         count = len(self.expected)
-        for k in sorted({*range(5, count, 5), count}):
+        return self._text({count // 4, count // 2, count} - {0})
+
+    @property
+    def details(self) -> str:
+        """What to expect of the first k poses, for every k."""
+        return self._text({*range(1, len(self.expected) + 1)})
+
+    def _text(self, counts: set[int]) -> str:
+        rows: list[tuple[str, ...]] = [("poses", "translation", "rotation")]
+        for k in sorted(counts):
             shift, turn = self.expected[k - 1].tolist()
-            known = f"{shift:24.2f} mm {turn:16.3f} deg"
-            lines.append(f"{k:5d}   {'not determined' if math.isinf(shift + turn) else known}")
-        return "\n".join(lines)
+            known = f"{shift:.2f} mm", f"{turn:.3f} deg"
+            sizes = ("unknown", "unknown") if math.isinf(shift + turn) else known
+            rows.append((str(k), *sizes))
+        *_, (count, shift, turn) = rows
+        verdict = f"{count} poses determine the hand-eye transform to {shift} and {turn}."
+        if shift == "unknown":
+            verdict = f"{count} poses do not determine the hand-eye transform: plan more of them."
+        expected = "Standard error to expect along the worst axis, by the number of poses:"
+        return "\n".join([verdict, expected, *aligned(rows)])
 
 
 def plan_poses(

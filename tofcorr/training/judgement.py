@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from tofcorr.digits import aligned, at_most
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.problem import Fit
@@ -252,49 +253,83 @@ def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) ->
     return f"{off}; `tofcorr diagnose` tells which."
 
 
-_POSE = "  {target:<14}{distance_m:6.2f} m, tilted {tilt_deg:.0f} deg, rolled by {roll_by_deg:+.0f}"
-_VIEWS = (
-    "{:<8} RMS along z {rms_z:.2f}: {between_views:.2f} between views (offset and tilts of whole "
-    "images), {within_views:.2f} within"
+_POSE = (
+    "  {target}: {distance_m:.2f} m away, tilted {tilt_deg:.0f} deg, rolled {roll_by_deg:+.0f} deg"
 )
+_VIEWS = "between views (offset and tilts of whole images)", "within views"
 
 
 def report_text(report: Mapping[str, Any]) -> str:
-    """Return errors, hand-eye translation, advice and warnings, a line each.
+    """Return verdict, errors, hand-eye, what is least known and one warning: 11 lines at most.
 
     Args:
         report: The content of report.json.
     """
-    lines = [report["headline"]] if report["headline"] else []
-    # The errors as aligned columns, millimetres.
-    lines.append(f"{report['model']:<16}{'train':>18}{'held out':>20}")
-    lines.append(f"{'mm':<16}{'mean abs':>9}{'RMS':>9}{'mean abs':>11}{'RMS':>9}")
-    for stage, halves in report["error_mm"].items():
-        name = stage.replace("hand_eye", "hand-eye").replace("_", " ")
-        errors = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
-        text = ["-" if one is None else f"{one:.2f}" for one in errors]
-        lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
-    if report["hand_eye"]["estimated"]:
-        lines += _hand_eye_lines(report)
+    return "\n".join(
+        [
+            verdict_text(report),
+            *_error_table(report, {"rms": "RMS"}),
+            *_hand_eye_lines(report)[:1],
+            *_advice_lines(report, 2),
+            *at_most(2, _warnings(report), "--verbose, or report.json"),
+        ]
+    )
+
+
+def full_text(report: Mapping[str, Any]) -> str:
+    """Return all that `report_text` says in short.
+
+    Args:
+        report: The content of report.json.
+    """
+    lines = [verdict_text(report), report["message"]]
+    lines += _error_table(report, {"mean_abs": "mean abs.", "rms": "RMS"})
     for half, own in report["views_mm"].items():
         if own["rms_z"] is not None:
-            lines.append(_VIEWS.format(half.replace("test", "held out"), **own))
+            lines.append(f"{half.replace('test', 'held out')}: RMS along z {own['rms_z']:.2f} mm")
+            parts = zip(_VIEWS, (own["between_views"], own["within_views"]), strict=True)
+            lines += [f"  {size:.2f} mm {part}" for part, size in parts]
             if own["within_prior"] != own["rms_z"]:  # Else no plane has a covariance.
-                lines[-1] += f"; {own['within_prior']:.2f} with planes within their covariance"
-    if advice := report["advice"]:
-        largest = f"{advice['sigma_mm_or_mrad']:.2f} mm (or mrad), of {advice['direction']}"
-        expects = advice["worst_sigma_mm_or_mrad"]
-        lines.append(f"The largest standard error is {largest}. To lower it, add:")
-        for pose in advice["poses"]:
-            lower = 100 - 100 * pose["worst_sigma_mm_or_mrad"] / expects
-            lines.append(f"{_POSE.format(**pose)}: lower by {lower:.0f} %")
-    lines += left_out_words([one["frame"] for one in report["left_out"]])
-    lines += outlying_words(report["outlying_images"])
-    found = [warning for warning in report["warnings"] if warning != report["reason"]]
-    lines += [f"Warning: {warning}" for warning in found[:5]]
-    if len(found) > 5:
-        lines.append(f"{len(found) - 5} more warnings are in report.json.")
-    return "\n".join([*lines, verdict_text(report)])
+                lines.append(f"  {own['within_prior']:.2f} mm with planes within their covariance")
+    lines += _hand_eye_lines(report)
+    if report["advice"]:
+        lines += _advice_lines(report, len(report["advice"]["poses"]))
+        lines.append(f"  In symbols it is {report['advice']['direction']}.")
+    return "\n".join([*lines, *_warnings(report)])
+
+
+def _error_table(report: Mapping[str, Any], kinds: Mapping[str, str]) -> list[str]:
+    """Return the errors of each stage on both halves, millimetres, as aligned columns."""
+    halves = ("train", "training"), ("test", "held out")
+    heads = [f"{half} {kind}, mm" for _, half in halves for kind in kinds.values()]
+    rows = [[report["model"], *heads]]
+    for stage, errors in report["error_mm"].items():
+        name = stage.replace("hand_eye", "hand-eye").replace("_", " ")
+        own = [errors[half][kind] for half, _ in halves for kind in kinds]
+        rows.append([name, *("-" if one is None else f"{one:.2f}" for one in own)])
+    return aligned(rows)
+
+
+def _advice_lines(report: Mapping[str, Any], number: int) -> list[str]:
+    """Return what is least well known, and the poses that would help most; empty without advice."""
+    if not (advice := report["advice"]):
+        return []
+    # Of more kinds than two a reader remembers the first two.
+    mixed = " against the ".join(advice["of"][:2])
+    helpful = "Poses that would help most, in this order:" if advice["poses"] else ""
+    size = f"{advice['sigma_mm_or_mrad']:.1f} mm at 1 m"
+    lines = [f"Least well known: the {mixed}, to {size}. {helpful}".rstrip()]
+    for pose in advice["poses"][:number]:
+        lower = 1 - pose["worst_sigma_mm_or_mrad"] / advice["worst_sigma_mm_or_mrad"]
+        lines.append(f"{_POSE.format(**pose)}: uncertainty falls by {100 * lower:.0f} %")
+    return lines
+
+
+def _warnings(report: Mapping[str, Any]) -> list[str]:
+    """Return what a user must know beside the verdict, a line each."""
+    said = [report["headline"] or "", *left_out_words([x["frame"] for x in report["left_out"]])]
+    said += [*outlying_words(report["outlying_images"]), *report["warnings"]]
+    return [f"Warning: {one}" for one in dict.fromkeys(said) if one not in ("", report["reason"])]
 
 
 def verdict_text(report: Mapping[str, Any]) -> str:
@@ -307,22 +342,24 @@ def verdict_text(report: Mapping[str, Any]) -> str:
     return said if expects in said else f"{said} {expects}"
 
 
-def _hand_eye_lines(report: Mapping[str, Any]) -> Iterator[str]:
-    """Yield where the camera sits, how far noise moved that, and what errors it leaves out."""
+def _hand_eye_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return where the camera sits, how far noise moved that, and what else would move it."""
     hand_eye, shift = report["hand_eye"], report["hand_eye"]["noise_shift"]
+    if not hand_eye["estimated"]:
+        return []
     frames = hand_eye["frames"]
     named = frames != FrameNames().to_mapping()
     where = f" of {frames['camera']} in {frames['tool']}" if named else ""
     translation = [1e3 * row[3] for row in hand_eye["tool_from_camera"][:3]]
-    pairs = zip(translation, hand_eye["translation_se_mm"], strict=True)
-    yield f"hand-eye translation{where}, mm: " + "  ".join(f"{t:.2f} ± {s:.2f}" for t, s in pairs)
+    pairs = zip("xyz", translation, hand_eye["translation_se_mm"], strict=True)
+    known = ", ".join(f"{axis} {t:.2f} ± {error:.2f}" for axis, t, error in pairs)
+    lines = [f"hand-eye translation{where}, mm: {known}"]
     if shift is not None:
         done = "taken off" if shift["removed"] else "not taken off; the standard errors contain it"
         millimetres = "  ".join(f"{t:+z.2f}" for t in shift["translation_mm"])
-        yield f"  moved by the noise of the distances, mm: {millimetres} ({done})"
-    moved = ((math.hypot(*one["translation_mm"]), one["error"]) for one in report["assumptions"])
-    if said := ", ".join(f"{size:.1f} mm for {error}" for size, error in moved):
-        yield f"  what ± leaves out: {said}"
+        lines.append(f"  moved by the noise of the distances, mm: {millimetres} ({done})")
+    moved = [(math.hypot(*one["translation_mm"]), one["error"]) for one in report["assumptions"]]
+    return lines + [f"  not in these ±: {size:.1f} mm for {error}" for size, error in moved]
 
 
 def verdict_of_run(run: Path) -> str:

@@ -19,7 +19,7 @@ from tofcorr.pixels.sample import PixelSample
 from tofcorr.progress import event_writer
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.figures import profile
-from tofcorr.training.judgement import report_text
+from tofcorr.training.judgement import full_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,7 +76,7 @@ class RunMonitor:
             for values in self._scalars(calibration):
                 writer.add_scalar(*values)
             # Four spaces keep the lines of a table as they are.
-            lines = [report["message"], *report_text(report).splitlines()]
+            lines = full_text(report).splitlines()
             writer.add_text("report", "\n".join(f"    {line}" for line in lines))
             if sample is not None:
                 _write_errors(writer, calibration, sample)

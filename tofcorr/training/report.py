@@ -162,6 +162,7 @@ def training_report(
             half: {k: number_or_none(own) for k, own in views_mm(calibration.kinds, frames).items()}
             for half, frames in (("train", calibration.train), ("test", calibration.test))
         },
+        "recordings": [str(one.path.resolve()) for one in data.recordings],
         "frames": {"train": calibration.train.tolist(), "test": calibration.test.tolist()},
         "assumptions": [
             {"name": one.cause, "error": one.words, **one.to_mapping(hand_eye[:3, :3])}

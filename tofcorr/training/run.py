@@ -34,7 +34,13 @@ from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import stages
 from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.figures import frames_to_show, profile_figure, residual_figure
-from tofcorr.training.judgement import DO_NOT_USE, against_garbage, frames_left_out, report_text
+from tofcorr.training.judgement import (
+    DO_NOT_USE,
+    against_garbage,
+    frames_left_out,
+    full_text,
+    report_text,
+)
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report
 
@@ -179,8 +185,13 @@ class TrainingResult:
         return residual_figure(self.calibration, frames_to_show(self.calibration))
 
     def __repr__(self) -> str:
-        """Return errors, hand-eye translation, advice and warnings, as the command prints them."""
+        """Return verdict, errors, hand-eye and what would help most, as the command prints them."""
         return report_text(self.report)
+
+    @property
+    def details(self) -> str:
+        """All that the training says of itself, with every warning."""
+        return full_text(self.report)
 
     @cached_property
     def _found(self) -> dict[str, Any]:

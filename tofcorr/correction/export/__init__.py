@@ -21,6 +21,7 @@ def export(
             cannot hold the model.
         ExportError: The export differs from the model, or cannot be written; there is no new file.
     """
-    format_named(name).require_packages()
-    module = import_module(f"tofcorr.correction.export.{name}")
-    getattr(module, f"export_{name}")(corrector, path, reference)
+    chosen = format_named(name)
+    chosen.require_packages()
+    module = import_module(f"tofcorr.correction.export.{chosen.name}")
+    getattr(module, f"export_{chosen.name}")(corrector, path, reference)

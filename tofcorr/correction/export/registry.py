@@ -7,7 +7,7 @@ A new format is a file in this folder and one line here. The file is called as t
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-from tofcorr.errors import ConfigError
+from tofcorr.errors import ConfigError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,17 @@ _FORMATS = (
 FORMATS = {one.name: one for one in _FORMATS}
 """Every format by its name."""
 
+ALIASES = {
+    **dict.fromkeys(("ts", "pt", "jit"), "torchscript"),
+    **dict.fromkeys(("npz", "numpy", "table"), "lut"),
+    "aoti": "pt2",
+    "c99": "c",
+    "xacro": "urdf",
+    "calib": "easy_handeye",
+    "yml": "opencv",
+}
+"""Formats by the other names that people try."""
+
 
 def format_named(name: str) -> Format:
     """Return a format.
@@ -78,6 +89,8 @@ def format_named(name: str) -> Format:
     Raises:
         ConfigError: There is no format of this name.
     """
-    if name not in FORMATS:
-        raise ConfigError(f"'{name}' is no format of export. Known: {', '.join(FORMATS)}.")
-    return FORMATS[name]
+    plain = name.lower().lstrip(".")
+    if (own := ALIASES.get(plain, plain)) not in FORMATS:
+        hint = did_you_mean(plain, [*FORMATS, *ALIASES])
+        raise ConfigError(f"'{name}' is no format of export.{hint} Known: {', '.join(FORMATS)}.")
+    return FORMATS[own]

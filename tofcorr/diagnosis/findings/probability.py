@@ -306,10 +306,6 @@ class Models:
         level = torch.where(torch.tensor(own), self.total - self._prices, -torch.inf)
         return self.sizes[int(level.argmax())]
 
-    def gain_of(self, name: str) -> float:
-        """Return the log predictive density of the model of one effect over the base model's."""
-        return float(self.total[self.models.index((name,))]) if (name,) in self.models else 0.0
-
     def posterior(self, weights: Tensor, generator: torch.Generator) -> Tensor:
         """Return the probability of each model for some weights of the poses, shape (N, D).
 

@@ -36,7 +36,7 @@ from tofcorr.diagnosis.report.words import (
 from tofcorr.diagnosis.rerun.checks import Closure, DegradedStage, Transfer
 from tofcorr.diagnosis.rerun.simulator import Evidence, FittedValue, sensor_of
 from tofcorr.diagnosis.sums.study import Study, absorbed_share
-from tofcorr.digits import in_mm, known, known_interval, with_interval
+from tofcorr.digits import at_most, in_mm, known, known_interval, with_interval
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.pairs import LEAST_P
 from tofcorr.options import dump_yaml
@@ -112,10 +112,23 @@ class DiagnosisResult:
     evidence: Evidence = field(repr=False)
 
     def __repr__(self) -> str:
-        """Return stages, verdict, causes, remarks and warnings, a line each."""
-        causes = (f"- {cause}" for cause in self.causes)
-        lines = [*table_of_stages(self), self.verdict, *causes, *self.remarks]
-        return "\n".join([*lines, *(f"Warning: {warning}" for warning in self.warnings)])
+        """Return verdict, stages, the largest causes and one warning: 11 lines at most."""
+        lines = [self.verdict, *table_of_stages(self), *at_most(3, self._causes)]
+        return "\n".join([*lines, *at_most(2, self._warnings)])
+
+    @property
+    def details(self) -> str:
+        """Verdict, stages, and every cause, remark and warning."""
+        lines = [self.verdict, *table_of_stages(self), *self._causes, *self.remarks]
+        return "\n".join([*lines, *self._warnings])
+
+    @property
+    def _causes(self) -> list[str]:
+        return [f"- {cause}" for cause in self.causes]
+
+    @property
+    def _warnings(self) -> list[str]:
+        return [f"Warning: {warning}" for warning in self.warnings]
 
     @property
     def unknown(self) -> bool:

@@ -14,7 +14,7 @@ from tofcorr.diagnosis.findings.where import Estimated, Interval, Region, Stage
 from tofcorr.diagnosis.rerun.simulator import Evidence
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study, absorbed_share
-from tofcorr.digits import known, known_interval
+from tofcorr.digits import aligned, known, known_interval
 from tofcorr.estimation.robust import LEVEL
 from tofcorr.simulation.effects import CATALOGUE
 
@@ -87,8 +87,7 @@ def table_of_stages(result: "DiagnosisResult") -> list[str]:
     rows = [(STAGE_WORDS[one.name], sized(one.gap)) for one in stages_shown(result) if one.gap]
     bound = "" if result.gap.floor_from_repeats else " (an upper bound)"
     rows.append(("noise of a pixel", f"{mm(result.gap.floor)} mm{bound}"))
-    width = max(len(words) for words, _ in rows)
-    return [f"{words:{width}}  {size}" for words, size in rows]
+    return aligned(rows)
 
 
 def pose_errors(result: "DiagnosisResult") -> tuple[np.ndarray, np.ndarray]:

@@ -139,7 +139,7 @@ def stillness(look: Look) -> Iterator[Finding]:
     if len(look.poses) < 2:
         yield impossible("The recording holds one frame; record more poses.")
     elif number == 1:
-        planes = (look.column(name) for name in ("normal_world", "offset"))
+        planes = (look.data.column(one).numpy()[look.sampled] for one in ("normal_world", "offset"))
         if len(distinct(np.column_stack([*planes]))) == 1:
             yield _still(look)
     elif number < 3:
