@@ -4,7 +4,7 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 wanted=$(cat scripts/requirements.txt scripts/requirements.in pyproject.toml | sha256sum | cut -d' ' -f1)
 if [ "$(cat .venv/.installed 2>/dev/null || true)" != "$wanted" ]; then
-  python=$(command -v python3.11 || command -v python3)
+  python=${PYTHON:-$(command -v python3.11 || command -v python3)}
   "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
     echo "tofcorr needs Python 3.11 or newer; found $("$python" --version)." >&2
     exit 2

@@ -142,8 +142,10 @@ def _is_free(fit: Fit) -> bool:
 
 
 def _known(fit: Fit) -> str:
-    shift, turn = fit.hand_eye_errors
-    return f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad"
+    # Beyond the wide prior a standard error says no more than that nothing is known.
+    wide = f"no better than {1e3 * PRIOR_SIGMA:.0f}"
+    sizes = [f"{1e3 * one:.1f}" if one < PRIOR_SIGMA else wide for one in fit.hand_eye_errors]
+    return "{} mm and {} mrad".format(*sizes)
 
 
 def _measured(fit: Fit, errors: Mapping[str, Any], look: Look) -> str:
