@@ -117,7 +117,7 @@ def test_what_is_printed_begins_with_the_gap_at_each_stage() -> None:
     gap = SimpleNamespace(floor=0.0025, floor_from_repeats=True)
     result: Any = SimpleNamespace(stages=stages, effects=(), gap=gap)
     assert table_of_stages(result) == [
-        "as given          12 mm [6, 25]",
-        "recalibrated      0.9 mm [0.5, 1.8]",
+        "as given           12 mm     [6, 25]",
+        "recalibrated      0.9 mm  [0.5, 1.8]",
         "noise of a pixel  2.5 mm",
     ]

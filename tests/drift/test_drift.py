@@ -107,7 +107,7 @@ def test_the_command_says_so_and_writes_json_and_a_page(
     assert "takes the form" in repr(found)
     page = tmp_path / "check.html"
     said = program("check", *given, "--page", page)
-    assert said == (0, f"{found!r}\nPage written to {page}\n", "")
+    assert said == (0, f"{found!r}\nWritten to {page}\n", "")
     text = html.unescape(page.read_text(encoding="utf-8"))
     assert (fetched(text), silent(text)) == ([], 0)
     for sentence in repr(found).splitlines():

@@ -122,10 +122,8 @@ class DriftResult:
         """
         from tofcorr.pages.page import page_text
 
-        headline, *others = self._sentences()
-        if self.headline:
-            headline, others = others[0], [headline, *others[1:]]
-        values = {"run": run, "recordings": recordings, "headline_said": headline}
+        verdict, *others = self._sentences()
+        values = {"run": run, "recordings": recordings, "headline_said": verdict}
         values |= {"others": others, **self.to_mapping()}
         figures, filters = {"drift": self.plot()}, {"mm": in_mm}
         return page_text("tofcorr.drift", "report.html.j2", figures, filters, **values)

@@ -84,10 +84,13 @@ def stages_shown(result: "DiagnosisResult", *, fitted: bool = False) -> list[Sta
 
 def table_of_stages(result: "DiagnosisResult") -> list[str]:
     """Return the gap at each stage with its interval, and the noise beside it, a line each."""
-    rows = [(STAGE_WORDS[one.name], sized(one.gap)) for one in stages_shown(result) if one.gap]
-    bound = "" if result.gap.floor_from_repeats else " (an upper bound)"
-    rows.append(("noise of a pixel", f"{mm(result.gap.floor)} mm{bound}"))
-    return aligned(rows)
+    rows = []
+    for one in stages_shown(result):
+        if one.gap is not None:
+            size, interval = sized(one.gap).split(" [")
+            rows.append((STAGE_WORDS[one.name], size, f"[{interval}"))
+    bound = "" if result.gap.floor_from_repeats else "(an upper bound)"
+    return aligned([*rows, ("noise of a pixel", f"{mm(result.gap.floor)} mm", bound)])
 
 
 def pose_errors(result: "DiagnosisResult") -> tuple[np.ndarray, np.ndarray]:
