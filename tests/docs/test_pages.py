@@ -66,8 +66,12 @@ def unprinted(expected: str, said: str) -> list[str]:
 
 def with_numbers_of(expected: str, said: str) -> str:
     """Return the lines of a page with the numbers that a program printed in lines like them."""
-    printed_as = {shape(line): line for line in reversed(said.splitlines())}
-    lines = [printed_as.get(shape(line), line) for line in expected.splitlines()]
+    printed, lines = said.splitlines(), list[str]()
+    for line in expected.splitlines():
+        shapes = [shape(one) for one in printed]
+        first = shapes.index(shape(line)) if shape(line) in shapes else None
+        lines.append(line if first is None else printed[first])
+        printed = printed if first is None else printed[first + 1 :]
     return "\n".join(lines) + "\n"
 
 
