@@ -30,7 +30,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_site_needs_nothing_from_elsewhere(site: str) -> None:
     """Links, anchors, pages that nothing points to and names of the API are checked by building."""
     assert "<math" in site
-    assert "mathjax" not in site.lower(), "an equation is still TeX"
+    # MyST marks every page as none of MathJax's.
+    assert "mathjax" not in site.lower().replace("mathjax_ignore", ""), "an equation is still TeX"
     assert "fonts.googleapis" not in site
     assert "cdn." not in site
 

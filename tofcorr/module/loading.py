@@ -17,11 +17,11 @@ _WHAT = "a file of tofcorr train or export that corrects (.ts, .pt2, .onnx, .npz
 def load_corrector(path: Path | str, *, trust: bool = False) -> LoadedCorrector:
     """Load what corrects frames, of any format: `corrected, valid = corrector(depth, amplitude)`.
 
-    | file | agrees with the calibration in float64 within |
-    |---|---|
-    | a run folder, its `state.pt`, a module's `.pt`, TorchScript (`.ts`) | 1 um, all bit for bit |
-    | a compiled package (`.pt2`), ONNX (`.onnx`) | 1 um |
-    | a look-up table (`.npz`) | 0.1 mm |
+    How closely each agrees with the calibration in float64:
+
+    - a run folder, its `state.pt`, a module's `.pt`, TorchScript (`.ts`): 1 um, all bit for bit;
+    - a compiled package (`.pt2`), ONNX (`.onnx`): 1 um;
+    - a look-up table (`.npz`): 0.1 mm.
 
     Beyond 1 m, by that share of the depth. Frames are those of the camera, float32, `(H, W)` or
     `(B, H, W)`, metres and the camera's amplitudes, as tensors or NumPy arrays; results have their

@@ -230,7 +230,7 @@ def _facts(conditions: Mapping[str, Tensor], count: int, like: Tensor) -> FrameF
 class Group(Enum):
     """Stages of the simulator in groups, in their order; and what delays whole frames."""
 
-    FRAME = ()
+    FRAME = ("",)  # At no stage. Python 3.11.2 loses an empty tuple.
     GEOMETRY = ("pose", "geometry")
     DELAY = ("delay",)
     SIGNAL = ("signal", "taps", "readout")
