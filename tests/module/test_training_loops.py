@@ -15,7 +15,7 @@ from kinds_of_terms import KINDS
 from module.modules import CAMERA, frames, module_of, with_missing
 from torch.func import functional_call, stack_module_state
 
-from tofcorr.errors import ConfigError, FrameError
+from tofcorr.errors import ConfigError, ExportError, FrameError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.module.depth_correction import DepthCorrection
@@ -130,3 +130,11 @@ def test_pixels_of_a_binned_camera_look_between_those_of_the_camera() -> None:
     torch.testing.assert_close(binned[..., :2] / binned[..., 2:], expected)
     again = camera.resize(8, 14).resize(4, 7).matrix_tensor()
     torch.testing.assert_close(again, camera.matrix_tensor())
+
+
+def test_a_script_of_the_module_is_refused_with_what_to_do() -> None:
+    module = module_of(*TERMS)
+    with pytest.raises(ExportError, match=r"write module\.export\('torchscript'"):
+        torch.jit.script(module)
+    with pytest.raises(FrameError, match="expected a torch tensor, got Proxy"):
+        torch.fx.symbolic_trace(module)

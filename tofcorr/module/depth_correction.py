@@ -6,7 +6,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NoReturn, Self
 
 import torch
 from pydantic import AfterValidator, BeforeValidator, InstanceOf, TypeAdapter
@@ -385,6 +385,11 @@ class DepthCorrection(FrameCorrection):
         """
         state = self.to_state()
         export(name, DepthCorrector.from_state(state), file, state)
+
+    def __prepare_scriptable__(self) -> NoReturn:
+        """Refuse `torch.jit.script`, which cannot compile terms that are chosen at run time."""
+        said = "torch.jit.script cannot compile a DepthCorrection"
+        raise ExportError(f"{said}: write module.export('torchscript', 'corrector.ts').")
 
     def to_state(self) -> CalibrationState:
         """Return the module as a calibration, which exporters read.
