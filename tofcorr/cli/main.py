@@ -1,6 +1,5 @@
 """The `tofcorr` command: lists its sub-commands and turns errors into one readable message."""
 
-import gc
 import os
 import signal
 import sys
@@ -84,9 +83,6 @@ def main() -> None:
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, _stop)
         set_up_threads(os.environ)
-        # What libraries make while they are loaded is never garbage: looking for it by default
-        # takes a tenth of a short training.
-        gc.set_threshold(100_000)
         _run()
     except (click.Abort, KeyboardInterrupt):
         _end_interrupted()
