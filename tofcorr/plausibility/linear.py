@@ -291,10 +291,9 @@ def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] 
     }
     blocks = {name: problem.by_moves(own, declared) for name, own in moves.items()}
     # Light by way of a room, of one brightness everywhere on the target: relative to the direct
-    # light it grows with the square of the distance and with the tilt, and bends walls as a focal
-    # length does.
-    lit = np.abs(problem.cosine).clip(_GRAZING)
-    room = (problem.cosine * problem.distance**2 / lit)[..., None]
+    # light it grows with the square of the distance over the cosine of incidence, so that points
+    # miss their plane with the former alone. It bends walls as a focal length does.
+    room = (np.sign(problem.cosine) * problem.distance**2)[..., None]
     with_room = problem.with_columns(room)
     found = {name: with_room.added(block)[0] for name, block in blocks.items()}
     found["room"] = problem.added(room)[0]
