@@ -48,17 +48,13 @@ class EvaluationResult:
 
     def __repr__(self) -> str:
         """Return the best model, the held-out error of each, and a warning: 11 lines at most."""
-        columns, sets = self.options.columns, self.sets
-        protocol = "folds" if self.options.folds else "half"
-        found = {c: [one.estimate(protocol, "mean_abs_mm", c) for one in sets] for c in columns}
-        ordered = sorted(columns, key=lambda column: sum(one.mean for one in found[column]))
-        first = found[ordered[0]]
-        sizes = ", ".join(
-            f"{own.mean:.2f} mm on {one.name}" for own, one in zip(first, sets, strict=True)
-        )
-        verdict = f"{ordered[0]} predicts held-out images best: off by {sizes}."
-        rows = [[column, *map(_interval, found[column])] for column in ordered]
-        heads = ["mean absolute error, mm", *(one.name for one in sets)]
+        columns = {k: [own[k] for own in self._errors.values()] for k in self.options.columns}
+        first, *_ = ordered = sorted(columns, key=lambda k: sum(one.mean for one in columns[k]))
+        both = zip(self._errors, columns[first], strict=True)
+        sizes = ", ".join(f"{own.mean:.2f} mm on {name}" for name, own in both)
+        verdict = f"{first} predicts held-out images best: off by {sizes}."
+        rows = [[column, *map(_interval, columns[column])] for column in ordered]
+        heads = ["mean absolute error, mm", *self._errors]
         table = at_most(6, aligned([heads, *rows]))
         said = [*self.headlines, *(f"Warning: {text}" for text in self.warnings)]
         return "\n".join([verdict, *table, *at_most(3, said)])

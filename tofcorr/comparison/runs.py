@@ -1,6 +1,5 @@
 """`tofcorr.compare`: runs of one camera side by side."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -15,9 +14,10 @@ from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibrat
 from tofcorr.digits import aligned, at_most
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.robust import LEVEL
-from tofcorr.files import reading, write_text
+from tofcorr.files import write_text
 from tofcorr.options import resolve_options
 from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.judgement import report_of_run, stage_words
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,6 @@ class HandEyeDifference:
         shift_mm: Length of the difference of the translations, millimetres.
         turn_deg: Angle between the rotations, degrees.
         p_value: How often chance makes as large a difference, by the standard errors of both.
-        significant: Whether that is less than one case of twenty.
     """
 
     first: str
@@ -41,7 +40,7 @@ class HandEyeDifference:
 
     @property
     def significant(self) -> bool:
-        """Whether the difference is more than chance."""
+        """Whether chance makes as large a difference in less than one case of twenty."""
         return self.p_value < LEVEL
 
     def __str__(self) -> str:
@@ -89,8 +88,7 @@ class RunComparison:
         rows += [[key, *(one[key] for one in self.reports)] for key in ("model", "verdict")]
         for stage, half in (("hand_eye_only", "test"), ("after", "train"), ("after", "test")):
             found = (one["error_mm"][stage][half]["rms"] for one in self.reports)
-            named = stage.replace("hand_eye", "hand-eye").replace("_", " ")
-            where = f"{half.replace('test', 'held out')}, {named}, mm RMS"
+            where = f"{half.replace('test', 'held out')}, {stage_words(stage)}, mm RMS"
             rows.append([where, *("-" if one is None else f"{one:.2f}" for one in found)])
         for axis, name in enumerate("xyz"):
             rows.append([f"hand-eye {name}, mm", *(_along(one, axis) for one in self.reports)])
@@ -145,7 +143,7 @@ def compare(runs: Sequence[str | Path], *, out: str | Path | None = None) -> Run
         _refuse_other(state, states[0], f"{run}: cannot be compared with {runs[0]}")
     short = [Path(run).resolve().name for run in runs]
     names = tuple(short if len({*short}) == len(short) else map(str, runs))
-    reports = tuple(_report(Path(run)) for run in runs)
+    reports = tuple(report_of_run(Path(run)) for run in runs)
     files = [str(Path(run) / "config.yaml") for run in runs]
     options = [resolve_options(TrainingOptions, file).to_mapping() for file in files]
     found = RunComparison(
@@ -178,15 +176,6 @@ def _refuse_other(state: CalibrationState, first: CalibrationState, start: str) 
     if state.frames != first.frames:
         frames = " and ".join(f"{one.frames.tool} to {one.frames.camera}" for one in (state, first))
         raise CalibrationDataError(f"{start}: the hand-eyes join other frames ({frames}).")
-
-
-def _report(run: Path) -> dict[str, Any]:
-    with reading(run / "report.json"):
-        text = (run / "report.json").read_text(encoding="utf-8")
-    try:
-        return json.loads(text)
-    except ValueError as error:
-        raise CalibrationDataError(f"{run / 'report.json'}: is no report ({error}).") from None
 
 
 def _flat(options: Mapping[Any, Any], above: str = "") -> dict[str, Any]:

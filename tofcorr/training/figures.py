@@ -12,6 +12,7 @@ from tofcorr.estimation.robust import LEVEL, without_strays
 from tofcorr.pixels.sample import PixelSample, errors_along_ray, thinned
 from tofcorr.training.advice import along_axis
 from tofcorr.training.calibration import Calibration
+from tofcorr.training.judgement import stage_words
 
 if TYPE_CHECKING:  # Matplotlib takes longer to import than a short fit.
     from matplotlib.axes import Axes
@@ -70,11 +71,6 @@ def frames_to_show(calibration: Calibration) -> np.ndarray:
     used = (errors.count > 0) & np.isin(errors.frames, calibration.frames)
     order = np.argsort(errors.squared[used] / errors.count[used])
     return thinned(errors.frames[used][order], 5)
-
-
-def stage_words(stage: str) -> str:
-    """Return what a stage of `error_mm` is called in a picture."""
-    return stage.replace("hand_eye", "hand-eye").replace("_", " ")
 
 
 def stage_colour(stage: str) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from tofcorr.digits import aligned, at_most
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
+from tofcorr.files import reading
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.sample import MaskOptions
@@ -256,7 +257,7 @@ def beyond_noise(held_out: float | None, noise: float, *, moves: bool = True) ->
 
 
 _POSE = (
-    "  {target}: {distance_m:.2f} m away, tilted {tilt_deg:.0f} deg, rolled {roll_by_deg:+.0f} deg"
+    "{target}: {distance_m:.2f} m away, tilted {tilt_deg:.0f} deg, rolled {roll_by_deg:+.0f} deg"
 )
 _VIEWS = "between views (offset and tilts of whole images)", "within views"
 
@@ -306,25 +307,38 @@ def _error_table(report: Mapping[str, Any], kinds: Mapping[str, str]) -> list[st
     heads = [f"{half} {kind}, mm" for _, half in halves for kind in kinds.values()]
     rows = [[report["model"], *heads]]
     for stage, errors in report["error_mm"].items():
-        name = stage.replace("hand_eye", "hand-eye").replace("_", " ")
         own = [errors[half][kind] for half, _ in halves for kind in kinds]
-        rows.append([name, *("-" if one is None else f"{one:.2f}" for one in own)])
+        rows.append([stage_words(stage), *("-" if one is None else f"{one:.2f}" for one in own)])
     return aligned(rows)
+
+
+def stage_words(stage: str) -> str:
+    """Return what a stage of `error_mm` is called in tables and pictures."""
+    return stage.replace("hand_eye", "hand-eye").replace("_", " ")
+
+
+def advice_words(advice: Mapping[str, Any]) -> tuple[str, list[str]]:
+    """Return what is least well known, and the poses that would help, the most helpful first.
+
+    Args:
+        advice: That of the report.
+    """
+    # Of more kinds than two a reader remembers the first two.
+    mixed = " against the ".join(advice["of"][:2])
+    poses = []
+    for pose in advice["poses"]:
+        lower = 1 - pose["worst_sigma_mm_or_mrad"] / advice["worst_sigma_mm_or_mrad"]
+        poses.append(f"{_POSE.format(**pose)}: uncertainty falls by {100 * lower:.0f} %")
+    return f"Least well known: the {mixed}, to {advice['sigma_mm_or_mrad']:.1f} mm at 1 m.", poses
 
 
 def _advice_lines(report: Mapping[str, Any], number: int) -> list[str]:
     """Return what is least well known, and the poses that would help most; empty without advice."""
-    if not (advice := report["advice"]):
+    if not report["advice"]:
         return []
-    # Of more kinds than two a reader remembers the first two.
-    mixed = " against the ".join(advice["of"][:2])
-    helpful = "Poses that would help most, in this order:" if advice["poses"] else ""
-    size = f"{advice['sigma_mm_or_mrad']:.1f} mm at 1 m"
-    lines = [f"Least well known: the {mixed}, to {size}. {helpful}".rstrip()]
-    for pose in advice["poses"][:number]:
-        lower = 1 - pose["worst_sigma_mm_or_mrad"] / advice["worst_sigma_mm_or_mrad"]
-        lines.append(f"{_POSE.format(**pose)}: uncertainty falls by {100 * lower:.0f} %")
-    return lines
+    known, poses = advice_words(report["advice"])
+    helpful = " Poses that would help most, in this order:" if poses else ""
+    return [known + helpful, *(f"  {one}" for one in poses[:number])]
 
 
 def _warnings(report: Mapping[str, Any]) -> list[str]:
@@ -364,16 +378,31 @@ def _hand_eye_lines(report: Mapping[str, Any]) -> list[str]:
     return lines + [f"  not in these ±: {size:.1f} mm for {error}" for size, error in moved]
 
 
+def report_of_run(run: Path) -> dict[str, Any]:
+    """Return the content of the report.json of a run.
+
+    Raises:
+        CalibrationDataError: There is none, or it is damaged.
+    """
+    file = run / "report.json"
+    with reading(file):
+        text = file.read_text(encoding="utf-8")
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise CalibrationDataError(f"{file}: is no report ({error}).") from None
+
+
 def verdict_of_run(run: Path) -> str:
     """Return what the report of a run says of it; nothing without one.
 
     Raises:
-        CalibrationDataError: `tofcorr train` gave it no corrector.ts: it is not to be used.
+        CalibrationDataError: `tofcorr train` gave it no corrector.ts: it is not to be used; or its
+            report is damaged.
     """
-    file = run / "report.json"
-    if not file.is_file():
+    if not (run / "report.json").is_file():
         return ""
-    report = json.loads(file.read_text(encoding="utf-8"))
+    report = report_of_run(run)
     if report["verdict"] == DO_NOT_USE and not (run / "corrector.ts").exists():
         said = f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']}"
         raise CalibrationDataError(f"{said} Train with --force, if so.")
