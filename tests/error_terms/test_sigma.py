@@ -9,6 +9,7 @@ from synthetic_scene import EB
 from torch import Generator
 
 from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.torchscript import scripted
 from tofcorr.geometry.rays import ray_directions
 
 SPLINES = {"kind": "distance_spline", "segments": 5}, {"kind": "tensor_spline"}
@@ -33,7 +34,7 @@ def test_calibration_sigma_is_the_spread_of_models_drawn_from_the_covariance(
     covariance = root @ root.T
     state = calibration(None, MODELS[name], "radial", covariance=covariance)
     depth, amplitude = frames(generator)
-    runtime = torch.jit.script(DepthCorrector.from_state(state))
+    runtime = scripted(DepthCorrector.from_state(state))
     _, found = runtime.sigma(depth, amplitude)
     # The error is linear: columns of the root are the model's errors with those coefficients.
     model = state.model().error

@@ -8,7 +8,7 @@ their value at the edge beyond it. All functions but those of lists compile with
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, log
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -20,6 +20,10 @@ from torch import Tensor, nn
 from tofcorr.conditions import CONDITIONS
 from tofcorr.errors import CalibrationDataError, StateError
 from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size, among
+
+# Random points at which functions are compared. Splines, which are zero on most, need many. Set by
+# hand.
+_PROBES = 2048
 
 Variable = Literal["distance", "amplitude", "normalised_amplitude", "log_amplitude"]
 """What a signal term is a function of; the normalised amplitude is N = I D^2."""
@@ -109,6 +113,44 @@ class Domain:
             low, high = self.amplitude
             inside &= (amplitude >= low) & (amplitude <= high)
         return inside
+
+    def joined(self, other: "Domain") -> "Domain":
+        """Return the smallest ranges that hold these and another domain's, of the same image size.
+
+        The mean of a condition is the middle of both. What one of them does not know is unknown.
+
+        Raises:
+            CalibrationDataError: The images or the modulation frequencies differ.
+        """
+        for name in ("height", "width", "modulation_frequency"):
+            own, its = getattr(self, name), getattr(other, name)
+            if own != its:
+                raise CalibrationDataError(f"One camera's {name} cannot be both {own} and {its}.")
+        ranges = {
+            name: Interval(min(own.low, its.low), max(own.high, its.high))
+            for name in ("radial_distance", "amplitude", "normalised_amplitude")
+            if (own := getattr(self, name)) and (its := getattr(other, name))
+        }
+        both = {
+            name: (min(own[0], its[0]), max(own[1], its[1]), (own[2] + its[2]) / 2)
+            for name, own in self.conditions.items()
+            if (its := other.conditions.get(name))
+        }
+        nothing = dict.fromkeys(("amplitude", "normalised_amplitude"))
+        return replace(self, **{**nothing, **ranges}, conditions=both)
+
+    def probes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return distances (M,), amplitudes (M,) and conditions (M, C) of the ranges, float64.
+
+        They are random and always the same ones. Amplitudes are 1 and conditions 0 where unknown.
+        """
+        known = [self.conditions.get(name, (0.0, 0.0, 0.0))[:2] for name in CONDITIONS]
+        ends = torch.tensor([self.radial_distance, self.amplitude or (1.0, 1.0), *known])
+        generator = torch.Generator().manual_seed(0)  # No result depends on the random points.
+        random = torch.rand(len(ends), _PROBES, generator=generator, dtype=torch.float64)
+        low, high = ends.double().T[:, :, None]
+        distance, amplitude, *conditions = low + (high - low) * random
+        return distance, amplitude, torch.stack(conditions, dim=1)
 
     def amplitude_floor(self) -> float:
         """Return the amplitude below which the logarithm is constant.

@@ -21,6 +21,7 @@ from tofcorr.error_terms.base import (
 )
 from tofcorr.error_terms.registry import TermOptions, build_term
 from tofcorr.error_terms.residual import ResidualNetwork
+from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 
 
@@ -304,3 +305,52 @@ class ErrorModel(DescribedModule):
 
     def _ordered(self) -> list[nn.Parameter]:
         return [self.constant, *(term.coefficients for term in self.terms())]
+
+
+def columns_on(options: ErrorModelOptions, domain: Domain, other: Domain) -> Tensor:
+    """Return a model's functions on one domain as combinations of those on another, shape (C, C).
+
+    With functions f = S g the coefficients change by the transpose: b . f = (S^T b) . g. Term by
+    term, the combinations are those of least squares over random points of both domains, so that
+    nothing has to be known of a kind of term.
+
+    Args:
+        options: The terms.
+        domain: Ranges that scale the functions f.
+        other: Ranges that scale the functions g, of the same image size and frequency.
+
+    Returns:
+        The matrix S, in the order of `ErrorModel.coefficient_vector`, float64.
+
+    Raises:
+        CalibrationDataError: A term has other functions there, as splines have whose knots differ.
+    """
+    own, its, every = ErrorModel(options, domain), ErrorModel(options, other), domain.joined(other)
+    # A condition is clamped to its range: functions of it are compared where both ranges hold.
+    each = domain.conditions, other.conditions
+    shared = {
+        name: (max(one[name][0] for one in each), min(one[name][1] for one in each), both[2])
+        for name, both in every.conditions.items()
+    }
+    *signal, conditions = replace(every, conditions=shared).probes()
+    size = own.coefficient_vector().numel()
+    found, start = torch.eye(size, dtype=torch.float64), 1
+    for one, another in zip(own.terms(), its.terms(), strict=True):
+        place = slice(start, start := start + len(one.symbols))
+        if isinstance(one, PixelTerm):
+            continue
+        given = (conditions,) if isinstance(one, ConditionTerm) else signal
+        with torch.no_grad():
+            f, g = (term.basis(*given) for term in (one, another))  # type: ignore[operator]
+        columns = torch.cat([torch.ones_like(g[:1]), g]).T
+        solution = torch.linalg.lstsq(columns, f.T).solution.T
+        if not torch.allclose(solution @ columns.T, f, rtol=_SAME, atol=_SAME):
+            kind = one.options.kind  # type: ignore[attr-defined]
+            advice = "Choose a polynomial, or train on all recordings together."
+            raise CalibrationDataError(f"{kind}: its functions depend on the range. {advice}")
+        found[place, 0], found[place, place] = solution[:, 0], solution[:, 1:]
+    return found
+
+
+# Largest deviation of a function, relative to its size and absolute, that counts as rounding.
+_SAME = 1e-9

@@ -29,17 +29,13 @@ from tofcorr.error_terms.signal_terms import SignalPolynomial
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.geometry.rays import Rays
 
-# Random points at which products of functions are compared. Products whose randomly weighted sums
-# over them agree to ten digits count as one function. Splines, which are zero on most points, need
-# many. A wrong match could only merge products that differ by less than the rounding of their sums.
-# Set by hand.
-_PROBES = 2048
-
 
 def distinct_products(values: Float[Tensor, "F probes"]) -> Int[Tensor, "F F"]:
     """Return which of the distinct products each product of two functions is, by their values.
 
-    They are numbered as they appear, row by row: the functions' products with the first one first.
+    Products whose randomly weighted sums agree to ten digits count as one function. A wrong match
+    could only merge products that differ by less than the rounding of their sums. They are numbered
+    as they appear, row by row: the functions' products with the first one first.
     """
     generator = torch.Generator().manual_seed(0)  # No result depends on the random points.
     random = torch.rand(values.shape[1], 2, generator=generator, dtype=values.dtype)
@@ -78,10 +74,10 @@ class Design:
         num_pixel = len(self.pixel_functions) - 1
         self.signal = torch.tensor([1, 0, *range(2, 2 + num_signal), *[0] * num_pixel])
         self.pixel = torch.tensor([0, 0, *[0] * num_signal, *range(1, 1 + num_pixel)])
-        probes = _probes(domain)
+        probes = domain.probes()[:2]
         self.signal_pairs = distinct_products(self.signal_functions(*probes))
         self.distance_as = self._affine(*probes)
-        some = torch.linspace(0, self.pixel_functions[0].numel() - 1, _PROBES).long()
+        some = torch.linspace(0, self.pixel_functions[0].numel() - 1, len(probes[0])).long()
         self.pixel_pairs = distinct_products(self.pixel_functions.flatten(1)[:, some])
 
     def signal_functions(
@@ -106,17 +102,6 @@ class Design:
                     return number, float(form.centre), float(form.half_width)
             number += len(term.symbols)
         return None
-
-
-def _probes(domain: Domain) -> tuple[Float[Tensor, "probes"], Float[Tensor, "probes"]]:
-    """Return random distances and amplitudes of the domain, always the same ones."""
-    random = torch.rand(2, _PROBES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    low, high = domain.radial_distance
-    distance = low + (high - low) * random[0]
-    if domain.amplitude is None:
-        return distance, torch.ones_like(distance)
-    low, high = domain.amplitude
-    return distance, low + (high - low) * random[1]
 
 
 # Pixels whose products are formed at once: on a CPU they stay in its cache, on a GPU they fill it.

@@ -38,16 +38,22 @@ def export_torchscript(
             written; nothing is written.
     """
     jit = _torchscript()
-    for name in _METHODS:
-        jit.export(getattr(DepthCorrector, name))
     with staged_file(path) as part:
         content = io.BytesIO()
-        with warnings.catch_warnings():
-            # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
-            warnings.filterwarnings("ignore", message=".*torch.jit")
-            jit.save(jit.script(corrector), content)
+        jit.save(scripted(corrector), content)
         part.write_bytes(with_calibration(content, reference))
         require_parity(load_torchscript(part), reference)
+
+
+def scripted(corrector: DepthCorrector) -> Any:  # noqa: ANN401 - a module of TorchScript
+    """Return the corrector compiled by TorchScript, with every method that a file has."""
+    jit = _torchscript()
+    for name in _METHODS:
+        jit.export(getattr(DepthCorrector, name))
+    with warnings.catch_warnings():
+        # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
+        warnings.filterwarnings("ignore", message=".*torch.jit")
+        return jit.script(corrector)
 
 
 def load_torchscript(path: Path | str) -> LoadedCorrector:
