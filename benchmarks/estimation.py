@@ -27,7 +27,8 @@ from tofcorr.estimation.uncertainty import jackknife_covariance
 from tofcorr.fit.problem import build_model
 from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, covered_domain
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.pixels.passes import image_moments
 from tofcorr.training.calibration import TrainingOptions
 

@@ -28,7 +28,8 @@ from tofcorr.estimation.robust import student_quantile
 from tofcorr.fit.fitting import fit
 from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, covered_domain
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.training.calibration import TrainingOptions
 
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")

@@ -112,7 +112,8 @@ def _imported(data: Path, mount: str, walls: tuple[str, ...], folder: Path) -> "
 
 def _fit(recording: "Recording", degree: int, frames: np.ndarray | None = None) -> "Fit":
     from tofcorr.fit.fitting import fit
-    from tofcorr.pixels.dataset import Dataset, covered_domain
+    from tofcorr.pixels.dataset import Dataset
+    from tofcorr.pixels.lattice import covered_domain
     from tofcorr.training.calibration import TrainingOptions
 
     terms = [{"kind": "distance_polynomial", "degree": degree}]

@@ -16,7 +16,8 @@ from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, covered_domain
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.robot import draw_plan

@@ -17,7 +17,8 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.geometry.rays import plane_in_frame, ray_plane_distance
-from tofcorr.pixels.dataset import Dataset, covered_domain
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.pixels.passes import frame_errors
 from tofcorr.training.calibration import TrainingOptions
 

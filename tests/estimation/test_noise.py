@@ -10,7 +10,7 @@ from torch import Generator
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
-from tofcorr.pixels.sample import estimate_noise
+from tofcorr.pixels.lattice import estimate_noise
 
 TRUE = DistanceNoise(1e-6, 2e-3, 0.5, "repeats")
 

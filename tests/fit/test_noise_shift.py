@@ -13,7 +13,8 @@ from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import Fit, Shift
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, covered_domain
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.report import hand_eye_accuracy
 

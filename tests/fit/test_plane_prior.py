@@ -12,7 +12,8 @@ from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.planes import within_prior
 from tofcorr.estimation.solvers import minimise
 from tofcorr.geometry.rays import plane_moves, plane_precision
-from tofcorr.pixels.dataset import Dataset, covered_domain, recorded_hand_eye
+from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.pixels.passes import frame_errors, views_mm
 from tofcorr.training.calibration import without_correction
 

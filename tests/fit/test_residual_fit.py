@@ -12,7 +12,8 @@ from tofcorr.correction.state import load_calibration, save_calibration
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.residual import gate
-from tofcorr.pixels.dataset import Dataset, covered_domain
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.pixels.passes import frame_errors
 from tofcorr.simulation.signal import PixelDelayOptions, pixel_delay
 from tofcorr.training.calibration import TrainingOptions

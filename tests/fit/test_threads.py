@@ -9,8 +9,9 @@ from simulated_walls import EA, simulated_wall
 
 from tofcorr.estimation.solvers import Solution
 from tofcorr.fit.fitting import fit
-from tofcorr.pixels import dataset as dataset_module
-from tofcorr.pixels.dataset import covered_domain, threads_at_once
+from tofcorr.pixels import lattice as lattice_module
+from tofcorr.pixels.dataset import threads_at_once
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.training.calibration import TrainingOptions
 
 
@@ -23,7 +24,7 @@ def test_solver_and_pass_each_use_threads_as_they_should(
     options = TrainingOptions.from_mapping({"name": "EA", "model": EA}, "test")
     of_pass: list[int] = []
     of_solver: list[int] = []
-    in_threads = dataset_module.in_threads
+    in_threads = lattice_module.in_threads
 
     def watched(work: object, items: object, threads: int | None = None) -> object:
         of_pass.append(threads or threads_at_once())
@@ -32,7 +33,7 @@ def test_solver_and_pass_each_use_threads_as_they_should(
     def watcher(_: Solution) -> None:
         of_solver.append(torch.get_num_threads())
 
-    monkeypatch.setattr(dataset_module, "in_threads", watched)
+    monkeypatch.setattr(lattice_module, "in_threads", watched)
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(2)

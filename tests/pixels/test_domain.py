@@ -11,7 +11,8 @@ from tofcorr.conditions import CONDITIONS
 from tofcorr.diagnosis.sums.base import BaseModel
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.lattice import covered_domain, domain_from
 
 CAMERA = camera((4, 3), (3.0, 3.0), (1.5, 1.0))
 

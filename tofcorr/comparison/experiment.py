@@ -24,7 +24,8 @@ from tofcorr.estimation.planes import estimate_walls
 from tofcorr.fit.fitting import fit, hand_eye_alone
 from tofcorr.fit.problem import FitOptions, Problem, build_model, refuse_missing_inputs
 from tofcorr.fit.walls import FoundWalls, recorded_walls, walls_alone, with_every_wall
-from tofcorr.pixels.dataset import Dataset, covered_domain, hand_eye_is_free, recorded_hand_eye
+from tofcorr.pixels.dataset import Dataset, hand_eye_is_free, recorded_hand_eye
+from tofcorr.pixels.lattice import Lattice, covered_domain, lattice_of
 from tofcorr.pixels.passes import FittedModel, FrameErrors, held_out_errors, image_moments, views_mm
 from tofcorr.pixels.sample import MaskOptions, usable_pixels
 from tofcorr.plausibility.finding import Inspection
@@ -240,9 +241,10 @@ class ModelFitter:
         self.frames = used = np.setdiff1d(np.arange(dataset.num_frames), list(left_out))
         self._trainings = {model.name: options.training(model) for model in options.models}
         self.measured = usable_pixels(dataset, options, robust=False)
-        self.domain = covered_domain(self.measured, used)
+        self._lattice = lattice_of(self.measured, used)
+        self.domain = covered_domain(self.measured, used, self._lattice)
         self.warnings: list[str] = []
-        self._of_all_frames: dict[str, ImageMoments] = {}
+        self._of_all_frames: dict[str, tuple[ImageMoments, Lattice]] = {}
         for training in self._trainings.values():
             refuse_missing_inputs(dataset, training.model)
         self._geometry = self._moments(self.measured, ErrorModelOptions())
@@ -251,15 +253,17 @@ class ModelFitter:
     def fit(self, model: ComparedModel, train: np.ndarray, held_out: np.ndarray) -> FittedModel:
         """Fit one model to training frames, to be measured on held-out ones (global numbers)."""
         training = self._trainings[model.name]
-        dataset, moments = self._usable(training, train), None
+        dataset, moments, lattice = self._usable(training, train), None, None
         own_window = masks_of(training) != masks_of(self._options) and training.outlier_window_mm
         if not (training.weights.noise or training.weights.robust != "none" or own_window):
             # The pixels are those of any other split: they are read once.
             if model.name not in self._of_all_frames:
                 # Those of one model at a time: they take most of the memory.
-                self._of_all_frames = {model.name: self._moments(dataset, training.model)}
-            moments = self._of_all_frames[model.name].images(train.tolist())
-        found = fit(dataset, train, training, self.domain, moments=moments)
+                both = self._moments(dataset, training.model), lattice_of(dataset)
+                self._of_all_frames = {model.name: both}
+            moments, lattice = self._of_all_frames[model.name]
+            moments, lattice = moments.images(train.tolist()), lattice.frames(train)
+        found = fit(dataset, train, training, self.domain, moments=moments, lattice=lattice)
         if not found.solution.converged:
             fitted = f"{model.name}, fitted to {len(train)} frames"
             self.warnings.append(f"{fitted}: {found.solution.message}")
@@ -292,7 +296,9 @@ class ModelFitter:
             moments = self._geometry.images(train.tolist()).columns([])
             given, nothing = self._options, ErrorModelOptions()
             options = FitOptions(model=nothing, hand_eye=given.hand_eye, solver=given.solver)
-            best = hand_eye_alone(Problem(self.measured, train, options, self.domain), moments)
+            lattice = self._lattice.frames(np.searchsorted(self.frames, train))
+            problem = Problem(self.measured, train, options, self.domain, lattice)
+            best = hand_eye_alone(problem, moments)
             if self._options.planes == "unknown":
                 found = recorded_walls(self._dataset, train)
                 best, walls = estimate_walls(moments, best, found.walls)

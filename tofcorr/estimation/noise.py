@@ -226,8 +226,8 @@ def neighbour_differences(
     amplitude: Float[Tensor, "B H W"],
     valid: Bool[Tensor, "B H W"],
     ray_directions: Float[Tensor, "H W 3"],
-) -> tuple[Float[Tensor, "S"], Float[Tensor, "S"]]:
-    """Return differences of pixels side by side that are about equally bright.
+) -> tuple[Float[Tensor, "B H W-2"], Float[Tensor, "B H W-2"]]:
+    """Return differences of pixels side by side, NaN unless they are about equally bright.
 
     On a plane 1/z is linear in the pixel, so that the second difference of three neighbours is
     noise, whatever the tilt.
@@ -240,7 +240,7 @@ def neighbour_differences(
 
     Returns:
         Differences, scaled to the variance of the difference of two distances, metres, and mean
-        amplitudes, each (S,).
+        amplitudes, each (B, H, W - 2).
     """
     z_of_ray = ray_directions[..., 2].to(radial_distance)
     inverse = 1 / (radial_distance * z_of_ray)
@@ -251,7 +251,7 @@ def neighbour_differences(
     usable = valid[..., :-2] & valid[..., 1:-1] & valid[..., 2:]
     chosen = usable & (around.amax(dim=0) < _ALIKE * around.amin(dim=0))
     # A second difference has six variances, the difference of two distances has two.
-    return along_ray[chosen] / 3**0.5, around.mean(dim=0)[chosen]
+    return torch.where(chosen, along_ray / 3**0.5, torch.nan), around.mean(dim=0)
 
 
 # What neighbours and successive frames share.

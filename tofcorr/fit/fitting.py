@@ -57,8 +57,9 @@ from tofcorr.fit.walls import recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights
 from tofcorr.geometry.rays import plane_precision
 from tofcorr.pixels.dataset import Dataset, Frames, thread_number
+from tofcorr.pixels.lattice import Lattice, estimate_noise, lattice_of, spread_pixels
 from tofcorr.pixels.passes import image_moments
-from tofcorr.pixels.sample import distance_to_plane, estimate_noise, pixels_of_image
+from tofcorr.pixels.sample import distance_to_plane
 
 
 def fit(
@@ -69,6 +70,7 @@ def fit(
     watcher: Watcher | None = None,
     resumed: Parameters | None = None,
     moments: ImageMoments | None = None,
+    lattice: Lattice | None = None,
 ) -> Fit:
     """Fit one model to frames, from one pass over their pixels.
 
@@ -92,13 +94,16 @@ def fit(
         resumed: Where an interrupted fit stood; None starts anew.
         moments: Those of the frames with exactly the model's image columns, if they are known
             from an earlier pass, where all pixels weigh the same.
+        lattice: That of the frames, if it is known.
 
     Raises:
         CalibrationDataError: The recordings lack an input of the model, the images do not
             determine a direction and the options refuse that, or they determine nothing.
     """
     with solvable(dataset.first.path, "fit"), thread_number(1):
-        problem = Problem(dataset, np.asarray(frames), options, domain, watcher, resumed)
+        frames = np.asarray(frames)
+        seen = lattice_of(dataset, frames) if lattice is None else lattice
+        problem = Problem(dataset, frames, options, domain, seen, watcher, resumed)
         weights = None
         if moments is None:
             moments, weights = prepare(problem)
@@ -161,7 +166,8 @@ def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
     frames, options, seen = problem.frames, problem.options, problem.dataset
     _, design = build_model(seen, options.model, problem.domain)
     walls = recorded_walls(seen, frames).walls if problem.estimates_walls else None
-    weights = first_weights(seen, frames, options.weights.noise, options.weights.robust)
+    asked = options.weights
+    weights = first_weights(seen, frames, problem.lattice, asked.noise, asked.robust)
     moments = image_moments(seen, design, frames, weights, options.device)
     before = None
     for _ in range(0 if options.weights.robust == "none" else options.weights.passes):
@@ -300,7 +306,7 @@ def _noise(problem: Problem, weights: PixelWeights | None) -> DistanceNoise | No
         return weights.noise
     if problem.dataset.has_amplitude:
         with suppress(CalibrationDataError):  # The recording may not determine it.
-            return estimate_noise(problem.dataset, problem.frames)
+            return estimate_noise(problem.dataset, problem.frames, problem.lattice)
     return None
 
 
@@ -390,10 +396,9 @@ def _without_noise_shift(
 def _expected_moments(
     problem: Problem, core: Core, weights: PixelWeights | None, noise: DistanceNoise
 ) -> ImageMoments:
-    """Return what the noise adds to the moments, estimated from some frames and pixels.
+    """Return what the noise adds to the moments, estimated from some pixels of every frame.
 
-    The shift of about 50 000 pixels of 16 evenly spread frames is known far better than it needs to
-    be.
+    The shift of about 50 000 pixels is known far better than it needs to be.
 
     Args:
         problem: What was fitted.
@@ -401,23 +406,19 @@ def _expected_moments(
         weights: Of the pixels.
         noise: Of a measured distance.
     """
-    data, error = problem.dataset, ErrorModel(core.options, problem.domain)
-    count = min(max(16, 50_000 // (error.height * error.width)), len(problem.frames))
-    chosen = np.unique(np.linspace(0, len(problem.frames) - 1, count).astype(int))
-    rays, number = data.ray_directions().flatten(0, 1), iter(chosen.tolist())
+    some = spread_pixels(problem.dataset, problem.frames, problem.lattice, 50_000)
+    # Without amplitude the variance is infinite; no camera errs by more than this prior.
+    variance = noise.variance(some.pixels.amplitude).clamp(max=PRIOR_SIGMA**2)
+    if weights is not None:
+        variance = variance * weights.of_sample(some)
+    slopes = _slopes(ErrorModel(core.options, problem.domain), some.pixels)
+    own = (slopes[:, None, :] * some.ray.T).flatten(0, 1)
     gram = torch.zeros_like(core.moments.gram)
-    for batch in data.batches(problem.frames[chosen]):
-        weight = torch.ones_like(batch.radial_distance) if weights is None else weights(batch)
-        for k in range(len(batch.indices)):
-            used = batch.valid[k].flatten().nonzero()[:, 0]
-            some = used[:: max(1, len(used) * len(chosen) // 50_000)]
-            at = pixels_of_image(batch, k, some)
-            # Without amplitude the variance is infinite; no camera errs by more than this prior.
-            variance = noise.variance(at.amplitude).clamp(max=PRIOR_SIGMA**2)
-            variance = variance * weight[k].flatten()[some]
-            own = (_slopes(error, at)[:, None, :] * rays[some].T).flatten(0, 1)
-            share = len(used) / max(len(some), 1) * len(problem.frames) / len(chosen)
-            gram[next(number), :-1, :-1] = share * (own * variance) @ own.T
+    count = some.frame.bincount(minlength=len(gram))
+    parts = zip(own.split(count.tolist(), dim=1), variance.split(count.tolist()), strict=True)
+    for number, (columns, spread) in enumerate(parts):
+        share = core.moments.count[number] / count[number].clamp(min=1)
+        gram[number, :-1, :-1] = share * (columns * spread) @ columns.T
     return replace(core.moments, gram=gram)
 
 

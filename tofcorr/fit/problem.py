@@ -43,6 +43,7 @@ from tofcorr.pixels.dataset import (
     recorded_hand_eye,
     resolved_planes,
 )
+from tofcorr.pixels.lattice import Lattice
 
 
 class WeightOptions(Options):
@@ -169,6 +170,7 @@ class Problem:
         frames: Global numbers of the frames to fit, shape (N,).
         options: Model, hand-eye, solver and device.
         domain: The ranges that scale the model's variables.
+        lattice: Evenly spread pixels of the frames.
         watcher: Called after each iteration of the solver.
         resumed: Where an earlier fit stood; None starts anew.
         walls: The estimated walls; None as long as the recorded ones are used.
@@ -178,6 +180,7 @@ class Problem:
     frames: np.ndarray
     options: FitOptions
     domain: Domain
+    lattice: Lattice
     watcher: Watcher | None = None
     resumed: Parameters | None = None
     walls: FoundWalls | None = None

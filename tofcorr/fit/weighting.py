@@ -12,7 +12,8 @@ from tofcorr.estimation.moments import LEAST_RESIDUAL
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.robust import RobustLoss, robust_scale, robust_weights
 from tofcorr.pixels.dataset import Dataset, Frames
-from tofcorr.pixels.sample import FramePixels, distance_to_plane, estimate_noise
+from tofcorr.pixels.lattice import Lattice, estimate_noise
+from tofcorr.pixels.sample import FramePixels, distance_to_plane
 
 
 @dataclass(frozen=True)
@@ -90,13 +91,14 @@ class PixelWeights:
 
 
 def first_weights(
-    dataset: Dataset, frames: Frames, noise: bool, loss: RobustLoss
+    dataset: Dataset, frames: Frames, lattice: Lattice, noise: bool, loss: RobustLoss
 ) -> PixelWeights | None:
     """Return the weights before any fit; None if all pixels have the same.
 
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames to fit.
+        lattice: Evenly spread pixels of them.
         noise: Whether pixels are weighted by their noise.
         loss: The robust loss.
 
@@ -106,7 +108,7 @@ def first_weights(
     rays = dataset.ray_directions()
     if not noise:
         return None if loss == "none" else PixelWeights(rays, loss=loss)
-    model = estimate_noise(dataset, frames)
+    model = estimate_noise(dataset, frames, lattice)
     inverse = [
         (1 / model.variance(batch.amplitude[batch.valid])).mean()
         for batch in dataset.batches(frames)

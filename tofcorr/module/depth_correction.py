@@ -34,7 +34,8 @@ from tofcorr.estimation.solvers import Watcher
 from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.options import one_line, resolve_options
-from tofcorr.pixels.dataset import Dataset, Frames, Recordings, covered_domain, opened
+from tofcorr.pixels.dataset import Dataset, Frames, Recordings, opened
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.judgement import report_text
 from tofcorr.training.report import training_report

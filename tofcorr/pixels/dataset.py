@@ -18,8 +18,6 @@ from pydantic import Field, NonNegativeInt, field_validator
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from tofcorr.conditions import CONDITIONS
-from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import (
     CHUNK_PIXELS,
     FrameBatch,
@@ -28,12 +26,8 @@ from tofcorr.data.recording import (
     iterate_frames,
     pose_numbers,
     repeat_numbers,
-    valid_pixels,
 )
-from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.robust import without_strays
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import Chosen, Rays, ray_directions
 from tofcorr.options import Options
 
@@ -298,104 +292,6 @@ def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
         advice = "record more, or ask for fewer folds"
         raise CalibrationDataError(f"{dataset.first.path}: {said}; {advice}.")
     return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(poses, num_folds)]
-
-
-def covered_domain(dataset: Dataset, frames: Frames) -> Domain:
-    """Return image size, and the central 99.8 % of distances and amplitudes of usable pixels.
-
-    A regular sample of 200 000 pixels, at least 50 a frame, is looked at.
-
-    Args:
-        dataset: The recordings.
-        frames: Global numbers of the frames.
-
-    Raises:
-        CalibrationDataError: No pixel of these frames is usable.
-    """
-    first = dataset.first
-    per_frame = max(200_000 // max(len(frames), 1), 50)
-    step = max(first.camera.height * first.camera.width // per_frame, 1)
-    if dataset.exclude is None:
-        parts = [_sample(one, local, step) for one, _, local in dataset.by_recording(frames)]
-    else:
-        parts = [
-            _both(one.radial_distance, one.amplitude)[:, one.valid][:, ::step]
-            for one in dataset.batches(frames)
-        ]
-    distance, amplitude = torch.cat(parts, dim=1)
-    if not distance.numel():
-        advice = "check mask.npy, saturation_amplitude and the unit of depth.npy (metres)"
-        said = f"no pixel of the {len(frames)} frames asked for is usable; {advice}"
-        raise CalibrationDataError(f"{first.path}: {said}.")
-    light = amplitude if dataset.has_amplitude else None, first.modulation_frequency
-    return domain_from(first.camera, distance, *light, dataset.conditions(frames))
-
-
-def domain_from(
-    camera: CameraIntrinsics,
-    radial_distance: Float[Tensor, "M"],
-    amplitude: Float[Tensor, "M"] | None,
-    modulation_frequency: float | None,
-    conditions: Float[Tensor, "N C"],
-) -> Domain:
-    """Return the ranges that some pixels cover, without 0.1 % of the values at either end.
-
-    Args:
-        camera: Gives the image size.
-        radial_distance: Of the pixels, shape (M,), metres.
-        amplitude: Of the same pixels, shape (M,); None if not recorded.
-        modulation_frequency: Of the light, Hz; None if unknown.
-        conditions: Of the frames, in the order of `CONDITIONS`, shape (N, C); NaN: unknown.
-    """
-    normalised = None if amplitude is None else amplitude * radial_distance.square()
-    near_and_far, *others = (
-        None if values is None else Interval(*without_strays(values.numpy()))
-        for values in (radial_distance, amplitude, normalised)
-    )
-    assert near_and_far is not None
-    known = zip(CONDITIONS, conditions.unbind(1), strict=True)
-    return Domain(
-        height=camera.height,
-        width=camera.width,
-        radial_distance=near_and_far,
-        amplitude=others[0],
-        normalised_amplitude=others[1],
-        modulation_frequency=modulation_frequency,
-        # Of those that are known of all frames.
-        conditions={
-            name: (float(column.min()), float(column.max()), float(column.mean()))
-            for name, column in known
-            if bool(column.isfinite().all())
-        },
-    )
-
-
-def _both(distance: Tensor, amplitude: Tensor | None) -> Float[Tensor, "2 *pixels"]:
-    """Return distances and amplitudes (NaN without any) in one tensor, float64."""
-    amplitude = torch.full_like(distance, torch.nan) if amplitude is None else amplitude
-    return torch.stack([distance.double(), amplitude.double()])
-
-
-def _sample(recording: Recording, frames: np.ndarray, step: int) -> Float[Tensor, "2 M"]:
-    """Return distances and amplitudes of every so many pixels that are usable."""
-    # A step that shares no factor with the width visits all columns.
-    while step > 1 and np.gcd(step, recording.camera.width) > 1:
-        step -= 1
-    z_of_ray = ray_directions(recording.camera)[..., 2].reshape(-1)[::step]
-
-    def of_frame(frame: int) -> Tensor:
-        depth, amplitude, mask = (
-            None
-            if array is None
-            else torch.from_numpy(read_frames(array, np.array([frame])).reshape(-1)[::step])
-            for array in (recording.depth, recording.amplitude, recording.mask)
-        )
-        assert depth is not None  # Every recording has it.
-        valid = valid_pixels(depth, amplitude, mask, recording.saturation_amplitude)
-        radial = depth.double() / z_of_ray if recording.depth_kind == "z" else depth
-        return _both(radial, amplitude)[:, valid]
-
-    return torch.cat([*in_threads(of_frame, frames.tolist())], dim=1)
 
 
 Item = TypeVar("Item")

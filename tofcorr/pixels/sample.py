@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from pydantic import Field, PositiveFloat
 from torch import Tensor
 
@@ -15,7 +15,6 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import Pixels
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
 from tofcorr.geometry.rays import Images, Rays
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset, Frames, recorded_hand_eye
@@ -197,63 +196,6 @@ def errors_along_ray(
     rays = dataset.ray_directions().to(batch.radial_distance)
     residual, cosine = distance_to_plane(model, batch, rays)
     return torch.where(batch.valid, 1e3 * residual / cosine, torch.nan), cosine
-
-
-def estimate_noise(dataset: Dataset, frames: Frames) -> DistanceNoise:
-    """Return the noise of a measured distance as a function of its amplitude.
-
-    It is estimated from repeats, frames that differ by noise alone. Without any, neighbouring
-    pixels give an upper bound.
-
-    Args:
-        dataset: The recordings.
-        frames: Global numbers of the frames.
-
-    Raises:
-        CalibrationDataError: There are no amplitudes, too few pixels, or most differences are zero.
-    """
-    dataset.require("amplitude", "the noise model")
-    frames = np.asarray(frames)
-    poses = dataset.repeat_groups()[frames]
-    _, group, count = np.unique(poses, return_inverse=True, return_counts=True)
-    repeated = frames[count[group] > 1]
-    if len(repeated):
-        sets = (frames[group == k] for k in np.flatnonzero(count > 1))
-        parts = [_repeat_differences(dataset, own) for own in sets]
-    else:
-        camera = dataset.first.camera
-        # Two million pixels, in eight images at least: more would hardly change the result.
-        enough = max(2_000_000 // (camera.height * camera.width), 8)
-        some = np.linspace(0, len(frames) - 1, min(len(frames), enough)).astype(int)
-        rays = dataset.ray_directions()
-        parts = [
-            neighbour_differences(one.radial_distance, one.amplitude, one.valid, rays)
-            for one in dataset.batches(frames[some])
-            if one.amplitude is not None  # Required above.
-        ]
-    share = max(sum(len(part[0]) for part in parts) // 500_000, 1)
-    difference = torch.cat([part[0][::share] for part in parts])
-    amplitude = torch.cat([part[1][::share] for part in parts])
-    return fit_noise(difference, amplitude, "repeats" if len(repeated) else "neighbours")
-
-
-def _repeat_differences(
-    dataset: Dataset, frames: np.ndarray
-) -> tuple[Float[Tensor, "S"], Float[Tensor, "S"]]:
-    """Return differences between successive frames of one pose, less their median."""
-    batches = list(dataset.batches(frames))
-    distance = torch.cat([batch.radial_distance for batch in batches])
-    amplitude = torch.cat([one.amplitude for one in batches if one.amplitude is not None])
-    valid = torch.cat([batch.valid for batch in batches])
-    found = [distance.new_zeros(2, 0)]
-    for k in range(0, len(distance) - 1, 2):
-        both = valid[k] & valid[k + 1]
-        change = (distance[k + 1] - distance[k])[both]
-        if change.numel():
-            mean = (amplitude[k] + amplitude[k + 1])[both] / 2
-            found.append(torch.stack([change - change.median(), mean]))
-    differences, amplitudes = torch.cat(found, dim=1)
-    return differences, amplitudes
 
 
 def _within_window(dataset: Dataset, half_width: float, frames: Frames | None) -> Dataset:

@@ -20,11 +20,11 @@ from tofcorr.fit.walls import with_every_wall
 from tofcorr.pixels.dataset import (
     Dataset,
     SplitOptions,
-    covered_domain,
     recorded_hand_eye,
     split_frames,
     thread_number,
 )
+from tofcorr.pixels.lattice import covered_domain, lattice_of
 from tofcorr.pixels.passes import frame_errors
 from tofcorr.pixels.sample import MaskOptions
 
@@ -84,8 +84,9 @@ class Calibration:
     ) -> None:
         halves = split_frames(data, options.split)
         self.train, self.test = (own[~np.isin(own, list(left_out))] for own in halves)
-        domain = covered_domain(data, self.train)
-        found = fit(data, self.train, options, domain, watcher, resumed)
+        lattice = lattice_of(data, self.train)
+        domain = covered_domain(data, self.train, lattice)
+        found = fit(data, self.train, options, domain, watcher, resumed, lattice=lattice)
         self.data = data = with_every_wall(data, found.walls, found.model)
         self.stages = {
             "before": without_correction(domain, recorded_hand_eye(data)),

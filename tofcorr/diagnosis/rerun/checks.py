@@ -21,7 +21,8 @@ from tofcorr.diagnosis.sums.study import Study
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions
 from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
-from tofcorr.pixels.dataset import Dataset, HandEyeOptions, covered_domain
+from tofcorr.pixels.dataset import Dataset, HandEyeOptions
+from tofcorr.pixels.lattice import covered_domain
 from tofcorr.pixels.sample import thinned
 from tofcorr.sensor.degrade import conditions_of_frames
 from tofcorr.sensor.model import SensorModel, SensorWarning

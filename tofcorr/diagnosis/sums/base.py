@@ -56,7 +56,8 @@ from tofcorr.estimation.robust import sigma_from_mad
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.geometry import se3
-from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from, resolved_planes
+from tofcorr.pixels.dataset import Dataset, resolved_planes
+from tofcorr.pixels.lattice import covered_domain, domain_from
 from tofcorr.plausibility.look import Look
 from tofcorr.simulation.effects.base import CatalogueEffect, EffectInputs
 
