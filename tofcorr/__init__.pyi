@@ -20,6 +20,8 @@ from tofcorr.errors import StateError as StateError
 from tofcorr.errors import TofcorrError as TofcorrError
 from tofcorr.examples.example import example as example
 from tofcorr.geometry.camera import CameraIntrinsics as CameraIntrinsics
+from tofcorr.live.calibration import Known as Known
+from tofcorr.live.calibration import LiveCalibration as LiveCalibration
 from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
 from tofcorr.module.loading import load_corrector as load_corrector
 from tofcorr.plausibility.examine import inspect as inspect

@@ -22,8 +22,8 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Fit]:
     return dataset, fitted(dataset)
 
 
-def pool_of(dataset: Dataset, fit: Fit, **how: int) -> PosePool | None:
-    return draw_pool(dataset, np.arange(dataset.num_frames), fit, np.random.default_rng(0), **how)
+def pool_of(dataset: Dataset, fit: Fit, size: int = 300) -> PosePool | None:
+    return draw_pool(dataset, np.arange(dataset.num_frames), fit, np.random.default_rng(0), size)
 
 
 @pytest.fixture(scope="module")

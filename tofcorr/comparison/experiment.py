@@ -241,8 +241,7 @@ class ModelFitter:
         self.frames = used = np.setdiff1d(np.arange(dataset.num_frames), list(left_out))
         self._trainings = {model.name: options.training(model) for model in options.models}
         self.measured = usable_pixels(dataset, options, robust=False)
-        self._lattice = lattice_of(self.measured, used)
-        self.domain = covered_domain(self.measured, used, self._lattice)
+        self.domain = covered_domain(self.measured, used)
         self.warnings: list[str] = []
         self._of_all_frames: dict[str, tuple[ImageMoments, Lattice]] = {}
         for training in self._trainings.values():
@@ -296,8 +295,7 @@ class ModelFitter:
             moments = self._geometry.images(train.tolist()).columns([])
             given, nothing = self._options, ErrorModelOptions()
             options = FitOptions(model=nothing, hand_eye=given.hand_eye, solver=given.solver)
-            lattice = self._lattice.frames(np.searchsorted(self.frames, train))
-            problem = Problem(self.measured, train, options, self.domain, lattice)
+            problem = Problem(self.measured, train, options, self.domain)
             best = hand_eye_alone(problem, moments)
             if self._options.planes == "unknown":
                 found = recorded_walls(self._dataset, train)

@@ -70,6 +70,17 @@ class FrameTable(FrameRow[np.ndarray]):
         """Return the number of frames."""
         return len(self.timestamp)
 
+    @classmethod
+    def of(cls, rows: Sequence[FrameRow]) -> Self:
+        """Return the table of these rows; what none of them knows is None."""
+        columns = {one.name: [getattr(row, one.name) for row in rows] for one in fields(cls)}
+        known = {
+            name: np.array([("" if name == "pose_id" else np.nan) if x is None else x for x in own])
+            for name, own in columns.items()
+            if any(x is not None for x in own)
+        }
+        return cls(**known)
+
     def select(self, indices: Sequence[int] | np.ndarray) -> Self:
         """Return the table of these frames, in this order."""
         chosen = np.asarray(indices, dtype=np.int64)

@@ -13,6 +13,7 @@ W numbers to a few dozen, then onto those of the columns; the static images then
 Where these are not smooth, pixel by pixel is summed, and nothing is lost but speed.
 """
 
+from copy import copy
 from functools import lru_cache
 from itertools import combinations_with_replacement, islice, pairwise, product
 from typing import Any
@@ -76,7 +77,7 @@ class Design:
         self.pixel = torch.tensor([0, 0, *[0] * num_signal, *range(1, 1 + num_pixel)])
         probes = domain.probes()[:2]
         self.signal_pairs = distinct_products(self.signal_functions(*probes))
-        self.distance_as = self._affine(*probes)
+        self.distance_as = self.affine(*probes)
         some = torch.linspace(0, self.pixel_functions[0].numel() - 1, len(probes[0])).long()
         self.pixel_pairs = distinct_products(self.pixel_functions.flatten(1)[:, some])
 
@@ -89,7 +90,7 @@ class Design:
             ones = torch.ones_like(radial_distance)[None]
             return torch.cat([ones, radial_distance[None], *bases])
 
-    def _affine(
+    def affine(
         self, distance: Float[Tensor, "probes"], amplitude: Float[Tensor, "probes"]
     ) -> tuple[int, float, float] | None:
         """Return a signal function u and numbers c, h so that c + h u is the distance; or None."""
@@ -157,6 +158,13 @@ class MomentAccumulator:
         index = torch.tensor([[place.get(k, 0) for k in row] for row in pairs.tolist()])
         self._gather = _gather_index(design, index).to(device)
         self._block = _BLOCK_PIXELS_CUDA if device.startswith("cuda") else _BLOCK_PIXELS
+
+    def on(self, model: ErrorModel, domain: Domain) -> "MomentAccumulator":
+        """Return one for the same terms scaled to another domain; it shares all static images."""
+        other, other.design = copy(self), copy(self.design)
+        other.design.signal_terms = list(model.signal_terms)  # type: ignore[arg-type]
+        other.design.distance_as = other.design.affine(*domain.probes()[:2])
+        return other
 
     def __call__(
         self, batch: Images, weights: Float[Tensor, "B H W"] | None = None

@@ -46,6 +46,7 @@ from tofcorr.estimation.regularisation import (
 from tofcorr.estimation.solvers import Watcher, minimise
 from tofcorr.estimation.uncertainty import (
     PRIOR_SIGMA,
+    Covariance,
     effective_variance,
     jackknife_covariance,
     observability,
@@ -107,11 +108,8 @@ def fit(
         weights = None
         if moments is None:
             moments, weights = prepare(problem)
-        problem, core = _on_walls(problem, moments)
-        refuse_diverged(core.solution.parameters)
-        optimum, prior, poses = core.solution.parameters, core.total_prior, problem.poses()
-        # At the least loss, where the gradients of the poses sum to zero.
-        covariance = jackknife_covariance(core.moments, optimum, prior, poses, problem.estimated)
+        problem, core, covariance = estimate(problem, moments)
+        optimum = core.solution.parameters
         hand_eye_only = hand_eye_alone(problem, core.moments)
         noise = _noise(problem, weights)
         outcome, with_network, best = None, None, optimum
@@ -139,6 +137,23 @@ def fit(
             noise=noise,
             noise_shift=shift,
         )
+
+
+def estimate(problem: Problem, moments: ImageMoments) -> tuple[Problem, Core, Covariance]:
+    """Find the least loss of moments, on walls that are estimated where they are unknown.
+
+    Returns:
+        The problem, on those walls; the solution; and its covariance, by leaving out poses.
+
+    Raises:
+        CalibrationDataError: The frames do not determine the model, or are of fewer than 3 poses.
+    """
+    problem, core = _on_walls(problem, moments)
+    refuse_diverged(core.solution.parameters)
+    optimum, prior, poses = core.solution.parameters, core.total_prior, problem.poses()
+    # At the least loss, where the gradients of the poses sum to zero.
+    covariance = jackknife_covariance(core.moments, optimum, prior, poses, problem.estimated)
+    return problem, core, covariance
 
 
 def hand_eye_alone(problem: Problem, moments: ImageMoments) -> Parameters:
@@ -406,6 +421,7 @@ def _expected_moments(
         weights: Of the pixels.
         noise: Of a measured distance.
     """
+    assert problem.lattice is not None  # Whoever knows the noise has it.
     some = spread_pixels(problem.dataset, problem.frames, problem.lattice, 50_000)
     # Without amplitude the variance is infinite; no camera errs by more than this prior.
     variance = noise.variance(some.pixels.amplitude).clamp(max=PRIOR_SIGMA**2)

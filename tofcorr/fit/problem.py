@@ -170,7 +170,7 @@ class Problem:
         frames: Global numbers of the frames to fit, shape (N,).
         options: Model, hand-eye, solver and device.
         domain: The ranges that scale the model's variables.
-        lattice: Evenly spread pixels of the frames.
+        lattice: Evenly spread pixels of the frames; None: nothing asks for the noise.
         watcher: Called after each iteration of the solver.
         resumed: Where an earlier fit stood; None starts anew.
         walls: The estimated walls; None as long as the recorded ones are used.
@@ -180,7 +180,7 @@ class Problem:
     frames: np.ndarray
     options: FitOptions
     domain: Domain
-    lattice: Lattice
+    lattice: Lattice | None = None
     watcher: Watcher | None = None
     resumed: Parameters | None = None
     walls: FoundWalls | None = None

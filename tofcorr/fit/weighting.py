@@ -91,14 +91,14 @@ class PixelWeights:
 
 
 def first_weights(
-    dataset: Dataset, frames: Frames, lattice: Lattice, noise: bool, loss: RobustLoss
+    dataset: Dataset, frames: Frames, lattice: Lattice | None, noise: bool, loss: RobustLoss
 ) -> PixelWeights | None:
     """Return the weights before any fit; None if all pixels have the same.
 
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames to fit.
-        lattice: Evenly spread pixels of them.
+        lattice: Evenly spread pixels of them; None: they are read.
         noise: Whether pixels are weighted by their noise.
         loss: The robust loss.
 

@@ -93,6 +93,23 @@ def log(transform: Tensor) -> Tensor:
     return twist.reshape(*transform.shape[:-2], 6)
 
 
+def change_of_log(twist: Tensor) -> Tensor:
+    """Return the derivative (6, 6) of log(exp(twist) exp(step)) by the step, at no step.
+
+    It is the inverse of the integral of exp(-s ad) over s from 0 to 1, with ad the matrix of the
+    Lie bracket with the twist (6,); Sola, Deray, Atchuthan (2018), "A micro Lie theory", section
+    II-G.
+    """
+    turn, shift = (
+        (part[:, None, None] * GENERATORS[3:, :3, :3].to(twist)).sum(0)
+        for part in (twist[3:], twist[:3])
+    )
+    bracket = torch.cat([torch.cat([turn, shift], 1), torch.cat([0 * turn, turn], 1)])
+    unit = torch.eye(6).to(twist)
+    flow = torch.cat([torch.cat([-bracket, unit], 1), torch.zeros(6, 12).to(twist)])
+    return torch.linalg.inv(torch.linalg.matrix_exp(flow)[:6, 6:])
+
+
 def inverse(transform: Tensor) -> Tensor:
     """Return the inverse of rigid transforms of shape (..., 4, 4)."""
     rotation_t = transform[..., :3, :3].transpose(-1, -2)

@@ -20,7 +20,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
 from tofcorr.estimation.robust import without_strays
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.geometry.rays import Rays, plane_in_frame
 from tofcorr.pixels.dataset import Dataset, Frames, in_threads
 from tofcorr.pixels.sample import FramePixels
 
@@ -66,32 +66,32 @@ def joined(parts: list[Lattice]) -> Lattice:
 def lattice_of(dataset: Dataset, frames: Frames | None = None) -> Lattice:
     """Return the lattice of frames, in increasing order: one pass over the images."""
     rays = dataset.ray_directions()
+    return joined([*in_threads(lambda batch: lattice_in(batch, rays), dataset.batches(frames))])
+
+
+def lattice_in(batch: FrameBatch, rays: Rays) -> Lattice:
+    """Return the lattice of the frames of a batch, whose unit rays are (H, W, 3)."""
     height, width = rays.shape[:2]
     step = int(np.ceil((height * width / _MOST) ** 0.5))
     rows, columns = (torch.arange((size - 1) % step // 2, size, step) for size in (height, width))
-    place = (rows[:, None] * width + columns).flatten()
     # A pixel and its neighbours; at the border it is its own, which tells nothing.
     beside = (columns[:, None] + torch.tensor([-1, 0, 1])).clamp(0, width - 1)
     inside = (beside.diff(dim=1) > 0).all(dim=1).repeat(len(rows))
     three = (rows[:, None, None] * width + beside).view(-1, 3)
+    distance, valid = (image.flatten(1)[:, three] for image in (batch.radial_distance, batch.valid))
+    distance = distance.double()
+    amplitude = torch.full_like(distance, torch.nan)
+    if batch.amplitude is not None:
+        amplitude = batch.amplitude.flatten(1)[:, three].double()
     near = rays.flatten(0, 1)[three]
-
-    def of_batch(batch: FrameBatch) -> Lattice:
-        def at(image: Tensor) -> Tensor:
-            return image.flatten(1)[:, three]
-
-        distance, valid = at(batch.radial_distance), at(batch.valid)
-        amplitude = torch.full_like(distance, torch.nan)
-        if batch.amplitude is not None:
-            amplitude = at(batch.amplitude)
-        own = torch.where(valid, distance, torch.nan)[..., 1]
-        found = neighbour_differences(distance, amplitude, valid, near)
-        difference, brightness = (
-            torch.where(inside, image[..., 0], torch.nan).float() for image in found
-        )
-        return Lattice(place, own.float(), amplitude[..., 1].float(), difference, brightness)
-
-    return joined([*in_threads(of_batch, dataset.batches(frames))])
+    between, mean = neighbour_differences(distance, amplitude, valid, near)
+    return Lattice(
+        place=three[:, 1],
+        radial_distance=torch.where(valid, distance, torch.nan)[..., 1].float(),
+        amplitude=amplitude[..., 1].float(),
+        difference=torch.where(inside, between[..., 0], torch.nan).float(),
+        brightness=mean[..., 0].float(),
+    )
 
 
 def covered_domain(dataset: Dataset, frames: Frames, lattice: Lattice | None = None) -> Domain:

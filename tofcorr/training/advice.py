@@ -112,6 +112,12 @@ class PosePool:
     brightness: Tensor
     described: Tensor
 
+    def only(self, chosen: np.ndarray) -> "PosePool":
+        """Return some of the poses, by number."""
+        names = [target for k, target in enumerate(self.target) if k in chosen]
+        parts = {k: v[chosen] for k, v in vars(self).items() if k != "target"}
+        return PosePool(target=names, **parts)
+
     def moments(
         self, design: Design, tool_from_camera: Tensor, pixel_share: float = 1.0, enough: int = 4000
     ) -> ImageMoments:
@@ -248,7 +254,12 @@ def _sees_wall(
 
 
 def draw_pool(
-    dataset: Dataset, frames: np.ndarray, fit: Fit, generator: np.random.Generator, size: int = 300
+    dataset: Dataset,
+    frames: np.ndarray,
+    fit: Fit,
+    generator: np.random.Generator,
+    size: int = 300,
+    brightness: Mapping[str, Tensor] | None = None,
 ) -> PosePool | None:
     """Draw poses that look at the same wall, tilted, rolled and at other distances.
 
@@ -262,6 +273,7 @@ def draw_pool(
         fit: The calibration so far.
         generator: Source of randomness.
         size: How many.
+        brightness: Of the targets, as `target_brightness` returns it; None: it is read.
 
     Returns:
         The poses; None if none was found where the wall fills the image, and for a fit that takes
@@ -287,7 +299,8 @@ def draw_pool(
         longest_ray=ranges.high * (1 + 1 / 20),
     )
     wall, rays = (normal, offset), dataset.ray_directions()
-    brightness = target_brightness(dataset, frames, hand_eye)
+    if brightness is None:
+        brightness = target_brightness(dataset, frames, hand_eye)
     return draw_views(camera, wall, hand_eye, space, brightness, rays, generator, size)
 
 

@@ -1,0 +1,195 @@
+"""A calibration that grows frame by frame, against one of the finished recording."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from simulated_walls import simulated_wall
+
+import tofcorr
+from tofcorr.fit.problem import Fit
+from tofcorr.geometry import se3
+from tofcorr.live.calibration import Known, LiveCalibration
+from tofcorr.pixels.dataset import Dataset
+
+CONFIG = {
+    "name": "live",
+    "model": {
+        "terms": [
+            {"kind": "distance_polynomial", "degree": 3},
+            {"kind": "pixel_polynomial", "degree": 2},
+            {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
+        ]
+    },
+    "split": {"test_fraction": 0.0},
+}
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("live") / "wall"
+    return simulated_wall(folder, shots=(("white", 12), ("checkerboard", 12)))
+
+
+def add(live: LiveCalibration, wall: Dataset, k: int, *, with_plane: bool = True) -> Known:
+    recording, at = wall.first, np.array([k])
+    row = recording.frames.row(k)
+    plane = np.append(row.normal_world, row.offset) if with_plane else None
+    depth, amplitude = (recording.read(name, at) for name in ("depth", "amplitude"))
+    assert depth is not None
+    assert amplitude is not None
+    pose, named = row.world_from_tool, {"target": row.target, "timestamp": row.timestamp}
+    return live.add(depth[0], amplitude[0], pose, plane=plane, **named)
+
+
+def same(one: Fit, other: Fit) -> None:
+    found, expected = one.solution.parameters, other.solution.parameters
+    shift = (found.tool_from_camera - expected.tool_from_camera).abs().max()
+    assert float(shift) < 1e-9
+    assert torch.allclose(found.coefficients, expected.coefficients, rtol=0, atol=1e-9)
+    assert torch.allclose(one.covariance.matrix, other.covariance.matrix, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_is_what_train_finds_whatever_the_order(wall: Dataset, seed: int) -> None:
+    live = LiveCalibration(wall.first, CONFIG)
+    for k in np.random.default_rng(seed).permutation(wall.num_frames):
+        add(live, wall, int(k))
+    trained = tofcorr.train(wall.first, CONFIG)
+    same(live.result(), trained.fit)
+    known = live.known
+    assert known is not None
+    assert known.fit is not None
+    apart = se3.apart(known.fit.optimum.tool_from_camera, trained.fit.optimum.tool_from_camera)
+    assert apart == pytest.approx((0, 0), abs=2e-4)  # What the ranges change of it.
+
+
+def test_walls_that_nobody_measured_are_estimated(wall: Dataset) -> None:
+    live = LiveCalibration(wall.first, CONFIG)
+    for k in range(wall.num_frames):
+        add(live, wall, k, with_plane=False)
+    starts = {one.row.target: one.row for one in live._frames.values()}
+    table = wall.first.frames
+    rows = [starts[name] for name in table.target]
+    planes = {
+        "normal_world": np.stack([row.normal_world for row in rows]),
+        "offset": np.array([row.offset for row in rows]),
+    }
+    recording = replace(wall.first, frames=replace(table, **planes), planes="estimated")
+    same(live.result(), tofcorr.train(recording, CONFIG).fit)
+
+
+def test_a_removed_frame_was_never_there(wall: Dataset) -> None:
+    one, other = LiveCalibration(wall.first, CONFIG), LiveCalibration(wall.first, CONFIG)
+    for k in range(10):
+        add(one, wall, k)
+        if k != 4:
+            add(other, wall, k)
+    one.remove(4)
+    same(one.result(), other.result())
+    with pytest.raises(tofcorr.CalibrationDataError, match="no frame 4"):
+        one.remove(4)
+
+
+def test_what_was_added_is_there_after_a_crash(wall: Dataset, tmp_path: Path) -> None:
+    live = LiveCalibration(wall.first.camera, CONFIG, folder=tmp_path / "live")
+    for k in range(16):
+        add(live, wall, k, with_plane=False)
+    (tmp_path / "live" / ".half-written").write_bytes(b"0")
+    again = LiveCalibration.resume(tmp_path / "live")
+    assert len(again) == 16
+    same(again.result(), live.result())
+    add(again, wall, 16, with_plane=False)
+    assert len(LiveCalibration.resume(tmp_path / "live")) == 17
+    (tmp_path / "live" / "frame-000003.pt").write_bytes(b"nothing")
+    with pytest.raises(tofcorr.CalibrationDataError, match="frame-000003"):
+        LiveCalibration.resume(tmp_path / "live")
+
+
+def test_intervals_shrink_and_the_next_pose_is_one_that_is_reachable(wall: Dataset) -> None:
+    live = LiveCalibration(wall.first, CONFIG)
+    assert live.next_pose() is None
+    first = [add(live, wall, k) for k in range(2)]
+    assert all(not one.enough and np.isinf(one.translation_mm) for one in first)
+    assert "not determined" in repr(first[-1])
+    every = [add(live, wall, k) for k in range(2, wall.num_frames)]
+    assert every[-1].translation_mm < every[9].translation_mm
+    assert every[-1].poses == wall.num_frames
+    pose = live.next_pose()
+    assert pose is not None
+    assert float(np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()) < 1e-9
+    assert live.next_pose(lambda pose: bool(pose[2, 3] > 1e3)) is None
+    live.wanted_mm, live.wanted_deg = 1e3, 90.0
+    assert add(live, wall, 0).enough
+
+
+def test_an_odd_frame_is_named(wall: Dataset) -> None:
+    live = LiveCalibration(wall.first, CONFIG)
+    known = [add(live, wall, k) for k in range(20)]
+    assert [one for one in known if one.odd] == []
+    row = wall.first.frames.row(20)
+    depth, amplitude = (wall.first.read(x, np.array([20])) for x in ("depth", "amplitude"))
+    assert depth is not None
+    assert amplitude is not None
+    plane, pose = np.append(row.normal_world, row.offset), row.world_from_tool
+
+    def odd(depth: np.ndarray, at: np.ndarray, time: float) -> tuple[str, ...]:
+        found = live.add(depth, amplitude[0], at, plane=plane, target=row.target, timestamp=time)
+        live.remove(found.frame)
+        return found.odd
+
+    bent = depth[0] + 0.3 * (np.arange(depth.shape[2]) > depth.shape[2] / 2)
+    assert "shows no plane" in odd(bent.astype(np.float32), pose, 1e3)[0]
+    off = pose.copy()
+    off[:3, 3] += 0.1 * row.normal_world
+    assert "disagrees" in odd(depth[0], off, 1e3)[0]
+    late = wall.first.frames.timestamp[19] + 0.1
+    assert "while the robot moved" in odd(depth[0], pose, late)[0]
+    assert odd(depth[0], pose, 1e3) == ()
+
+
+def test_bad_input_is_refused_and_nothing_is_lost(wall: Dataset) -> None:
+    live = LiveCalibration(wall.first, CONFIG)
+    add(live, wall, 0)
+    size, pose = (wall.first.camera.height, wall.first.camera.width), np.eye(4)
+    good = np.ones(size, np.float32)
+    for depth, amplitude, said in [
+        (good[1:], good, "expected shape"),
+        (good * np.nan, good, "no pixel"),
+        (good, None, "with every frame, or with none"),
+        (good, -good, "amplitude"),
+    ]:
+        with pytest.raises(tofcorr.CalibrationDataError, match=said):
+            live.add(depth, amplitude, pose, plane=np.array([0.0, 0, -1, 1]))
+    with pytest.raises(tofcorr.CalibrationDataError, match="no condition"):
+        live.add(good, good, pose, plane=np.array([0.0, 0, -1, 1]), exposure=3.0)
+    assert len(live) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"weights": {"robust": "huber"}}, "weights.robust"),
+        ({"model": {"terms": [{"kind": "distance_spline"}]}}, "depend on the range"),
+        ({"model": {"terms": [{"kind": "fixed_pattern"}]}}, "fixed pattern"),
+    ],
+)
+def test_what_needs_all_pixels_at_once_is_refused(wall: Dataset, change: dict, said: str) -> None:
+    with pytest.raises(tofcorr.ConfigError, match=said):
+        LiveCalibration(wall.first, CONFIG | change)
+
+
+def test_the_saved_corrector_corrects(wall: Dataset, tmp_path: Path) -> None:
+    live = LiveCalibration(wall.first, CONFIG)
+    for k in range(wall.num_frames):
+        add(live, wall, k)
+    live.save(tmp_path / "run")
+    corrector = tofcorr.load_corrector(tmp_path / "run")
+    depth, amplitude = (
+        torch.from_numpy(getattr(wall.first, name)[:1].copy()) for name in ("depth", "amplitude")
+    )
+    corrected, valid = corrector(depth, amplitude)
+    expected, _ = live.state().corrected(depth, amplitude)
+    assert torch.allclose(corrected[valid].double(), expected[valid].double(), atol=1e-5)

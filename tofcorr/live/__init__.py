@@ -1,0 +1,1 @@
+"""Calibration while a recording grows: frame by frame, and as a page in the browser."""

@@ -1,0 +1,673 @@
+"""`tofcorr.LiveCalibration`: a calibration that grows frame by frame.
+
+A frame is kept as its moments, which hold all that the loss needs, and a lattice of its pixels,
+which gives the ranges and the noise: 70 kB in place of 2.5 MB of a VGA image. Its moments are those
+of its own ranges; a linear map takes them to the ranges of all frames. So the finished calibration
+is that of `tofcorr.train` on the same frames, in any order.
+
+What `add` returns is a fit of the moments alone, on ranges that are a little wider than any frame's
+so that they seldom change, and without what the noise moves (`fit.fitting`).
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from pydantic import TypeAdapter
+from torch import Tensor
+
+from tofcorr.conditions import CONDITIONS, condition
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.torchscript import export_torchscript
+from tofcorr.correction.state import (
+    STATE_FILE,
+    CalibrationState,
+    read_values,
+    save_calibration,
+    save_values,
+)
+from tofcorr.data.arrays import IMAGE_ARRAYS
+from tofcorr.data.recording import STANDSTILL, Recording
+from tofcorr.data.table import FrameRow, FrameTable
+from tofcorr.error_terms.base import Domain, Interval
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, columns_on
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.estimation.accumulator import Design, MomentAccumulator
+from tofcorr.estimation.moments import (
+    HAND_EYE_SYMBOLS,
+    ImageMoments,
+    MomentObjective,
+    Parameters,
+    concatenate,
+)
+from tofcorr.estimation.planes import within_prior
+from tofcorr.estimation.robust import outlying_images, robust_scale, student_quantile
+from tofcorr.estimation.uncertainty import posterior_covariance, worst_axes
+from tofcorr.files import refuse_existing, staged_folder
+from tofcorr.fit.fitting import calibrated, estimate, fit
+from tofcorr.fit.problem import Fit, Problem
+from tofcorr.geometry import se3
+from tofcorr.geometry.camera import CameraIntrinsics, DepthKind, FrameNames
+from tofcorr.geometry.rays import plane_in_frame, planes_through
+from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset, thread_number
+from tofcorr.pixels.lattice import Lattice, covered_domain, joined, lattice_in
+from tofcorr.pixels.sample import usable_pixels
+from tofcorr.training.advice import advise, draw_pool
+from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.run import Config, calibration_state
+
+_FRAME = "tofcorr-live-frame"
+_START = "tofcorr-live"
+_START_FILE = "live.pt"
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What is kept of a frame: its row, its ranges, its moments on them, and its lattice."""
+
+    row: FrameRow
+    domain: Domain
+    moments: ImageMoments
+    lattice: Lattice
+
+    @cached_property
+    def noise(self) -> float:
+        """Typical standard deviation of a distance, metres, from neighbours; 1 if unknown."""
+        between = self.lattice.difference[self.lattice.difference.isfinite()]
+        return robust_scale(between) if len(between) else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """How well a calibration is known, and what its newest frame has to do with it.
+
+    Attributes:
+        frame: Number of the newest frame, by which `remove` takes it out.
+        poses: How many poses there are.
+        odd: What is odd about the newest frame, a sentence each.
+        translation_mm: Half the 95 % interval of the hand-eye transform along its worst axis, mm;
+            infinite while it is not determined.
+        rotation_deg: The same of the rotation, degrees.
+        terms_mm: Standard error of each coefficient, mm: of its term's largest error in range.
+        weakest: The direction known least, in words.
+        gained: By how much the newest frame has shrunk the wider of both intervals, a share of it.
+        enough: Whether both intervals are as narrow as wanted.
+        fit: The fit of the moments; None of fewer than three poses.
+    """
+
+    frame: int
+    poses: int
+    odd: tuple[str, ...] = ()
+    translation_mm: float = math.inf
+    rotation_deg: float = math.inf
+    terms_mm: Mapping[str, float] | None = None
+    weakest: str = ""
+    gained: float = 0.0
+    enough: bool = False
+    fit: Fit | None = None
+
+    def __repr__(self) -> str:
+        """Say in two lines what is known, and what is odd."""
+        if math.isinf(self.translation_mm + self.rotation_deg):
+            known = f"{self.poses} poses: the hand-eye transform is not determined yet"
+        else:
+            size = f"{self.translation_mm:.2f} mm and {self.rotation_deg:.3f} degrees"
+            known = f"{self.poses} poses: the hand-eye transform is known to {size}"
+        said = f"{known}{', which is enough' if self.enough else ''}."
+        return "\n".join([said, *(f"Frame {self.frame} {one}" for one in self.odd)])
+
+
+class LiveCalibration:
+    """Calibrates a camera while it records; the frames need not be kept.
+
+    Args:
+        camera: The intrinsics; or a recording whose camera, units and start are taken.
+        config: As of `tofcorr.train`; terms whose functions depend on the range (splines), a
+            fixed pattern, networks, and robust or noise weights need all pixels at once.
+        tool_from_camera: A guess of the hand-eye transform, shape (4, 4); None: the identity.
+        depth_kind: `radial`: along the viewing ray; `z`: along the optical axis.
+        modulation_frequency: Hz; None if unknown.
+        saturation_amplitude: Pixels at or above it are not used; None if unknown.
+        wanted_mm: Half the 95 % interval of the translation that is enough, along its worst axis.
+        wanted_deg: The same of the rotation, degrees.
+        folder: Where every frame's sums are written as it comes, so that `resume` loses nothing;
+            None: they are in memory alone.
+
+    Raises:
+        ConfigError: The configuration needs all pixels at once.
+        CalibrationDataError: Something is at `folder` already.
+
+    Example:
+        live = tofcorr.LiveCalibration(camera, "e0", folder="live")
+        known = live.add(depth, None, world_from_tool)
+        print(known, known.enough, live.next_pose())
+    """
+
+    def __init__(  # noqa: PLR0913 - a camera has many numbers
+        self,
+        camera: CameraIntrinsics | Recording,
+        config: Config = "ea",
+        *,
+        tool_from_camera: np.ndarray | None = None,
+        depth_kind: DepthKind = "radial",
+        modulation_frequency: float | None = None,
+        saturation_amplitude: float | None = None,
+        wanted_mm: float = 0.5,
+        wanted_deg: float = 0.05,
+        folder: Path | str | None = None,
+    ) -> None:
+        self.options = _suitable(resolve_options(TrainingOptions, config))
+        self.wanted_mm, self.wanted_deg = wanted_mm, wanted_deg
+        self._folder = None if folder is None else Path(folder)
+        if isinstance(camera, Recording):
+            self._like = camera
+        else:
+            guess = np.eye(4) if tool_from_camera is None else np.asarray(tool_from_camera, float)
+            self._like = Recording(
+                path=self._folder or Path("live calibration"),
+                camera=camera,
+                depth_kind=depth_kind,
+                modulation_frequency=modulation_frequency,
+                saturation_amplitude=saturation_amplitude,
+                tool_from_camera=se3.nearest_rigid(guess),
+                **dict.fromkeys(("frames", "depth", "amplitude", "mask", "raw")),  # type: ignore[arg-type]
+                planes="estimated",
+                frame_names=FrameNames(),
+            )
+        self._frames: dict[int, _Frame] = {}
+        self._accumulator: MomentAccumulator | None = None
+        # The ranges of what `add` returns, the moments on them, and where its fit stands.
+        self._domain: Domain | None = None
+        self._sums: dict[int, Tensor] = {}
+        self._last: Parameters | None = None
+        self._known: Known | None = None
+        self._seen: Dataset | None = None
+        if self._folder is not None:
+            refuse_existing(self._folder)
+            with staged_folder(self._folder) as staged:
+                save_values(staged / _START_FILE, _START, self._start(), CalibrationDataError)
+
+    @classmethod
+    def resume(cls, folder: Path | str) -> "LiveCalibration":
+        """Return the calibration that a folder holds, with every frame that was added.
+
+        Raises:
+            CalibrationDataError: The folder holds none, or a frame of it is damaged.
+        """
+        folder = Path(folder)
+        start = read_values(folder / _START_FILE, _START)
+        if start is None:
+            raise CalibrationDataError(f"{folder}: holds no live calibration ({_START_FILE}).")
+        camera, config = CameraIntrinsics(**start.pop("camera")), start.pop("config")
+        guess = start.pop("tool_from_camera").numpy()
+        live = cls(camera, config, tool_from_camera=guess, **start)
+        live._folder = folder
+        for file in sorted(folder.glob("frame-*.pt")):
+            values = read_values(file, _FRAME)
+            if values is None:
+                raise CalibrationDataError(f"{file}: is damaged; remove it to go on without it.")
+            live._like = replace(live._like, **values.pop("like"))
+            live._take(int(file.stem.removeprefix("frame-")), _frame_of(values))
+        if live._frames:
+            live._known = live._learn(max(live._frames))
+        return live
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._frames)
+
+    @property
+    def known(self) -> Known | None:
+        """How well the calibration is known now; None before the first frame."""
+        return self._known
+
+    def add(
+        self,
+        depth: np.ndarray | Tensor,
+        amplitude: np.ndarray | Tensor | None,
+        world_from_tool: np.ndarray,
+        *,
+        plane: np.ndarray | None = None,
+        target: str = "wall",
+        mask: np.ndarray | Tensor | None = None,
+        timestamp: float | None = None,
+        pose_id: str | None = None,
+        **conditions: float,
+    ) -> Known:
+        """Take a frame, and say what is known with it.
+
+        Args:
+            depth: Shape (H, W), metres; NaN or <= 0: no return.
+            amplitude: The camera's units, shape (H, W); None if the camera has none.
+            world_from_tool: Pose of the robot's tool, shape (4, 4).
+            plane: The wall (nx, ny, nz, d), n . x + d = 0 in the world; None: it is estimated, as
+                one wall for all frames of one target.
+            target: Name of the wall.
+            mask: 1 where the pixel sees the wall, shape (H, W); None: everywhere.
+            timestamp: Seconds; orders the frames. None: the number of the frame.
+            pose_id: Frames with the same id were taken without moving.
+            conditions: By column of frames.csv, such as `integration_time_us`.
+
+        Raises:
+            CalibrationDataError: Shape or values are not allowed, no pixel is usable, or earlier
+                frames had amplitudes, planes or conditions and this has not, or the reverse.
+        """
+        number = max(self._frames, default=-1) + 1
+        images = self._images(number, depth=depth, amplitude=amplitude, mask=mask)
+        si = {name: conditions.pop(condition(name).column, None) for name in CONDITIONS[1:]}
+        if conditions:
+            known = ", ".join(condition(name).column for name in CONDITIONS[1:])
+            raise CalibrationDataError(f"{', '.join(conditions)}: no condition. Known: {known}.")
+        factor = {name: condition(name).si_per_unit for name in CONDITIONS}
+        row = FrameRow(
+            timestamp=float(number if timestamp is None else timestamp),
+            world_from_tool=se3.nearest_rigid(np.asarray(world_from_tool, dtype=np.float64)),
+            normal_world=np.array([0.0, 0.0, -1.0]),
+            offset=0.0,
+            target=target,
+            pose_id=pose_id,
+            **{name: None if x is None else x * factor[name] for name, x in si.items()},
+        )
+        if plane is not None:
+            size = float(np.linalg.norm(plane[:3]))
+            row = replace(row, normal_world=np.asarray(plane[:3]) / size, offset=plane[3] / size)
+        planes = "estimated" if plane is None else "recorded"
+        with thread_number(1):  # Threads would wait longer than they compute.
+            return self._added(number, self._summed(row, images, planes))
+
+    def _added(self, number: int, frame: _Frame) -> Known:
+        """Keep a frame, on disk first, and say what is known with it."""
+        if self._folder is not None:
+            name = self._folder / f"frame-{number:06d}.pt"
+            like = {"planes": self._like.planes, "amplitude": self._like.amplitude}
+            save_values(name, _FRAME, {"like": like, **_values_of(frame)}, CalibrationDataError)
+        self._take(number, frame)
+        self._known = self._learn(number)
+        return self._known
+
+    def remove(self, frame: int) -> Known | None:
+        """Take a frame out again, and say what is known without it; None: it was the only one.
+
+        Raises:
+            CalibrationDataError: There is no such frame.
+        """
+        if frame not in self._frames:
+            raise CalibrationDataError(f"There is no frame {frame} to remove.")
+        if self._folder is not None:
+            (self._folder / f"frame-{frame:06d}.pt").unlink()
+        del self._frames[frame], self._sums[frame]
+        self._known = self._learn(max(self._frames)) if self._frames else None
+        return self._known
+
+    def next_pose(
+        self,
+        reachable: Callable[[np.ndarray], bool] | None = None,
+        *,
+        candidates: int = 60,
+        seed: int = 0,
+    ) -> np.ndarray | None:
+        """Return the pose world_from_tool (4, 4) that would help most; None if none was found.
+
+        Args:
+            reachable: Whether the robot reaches a pose (4, 4); None: it reaches those that turn,
+                roll and move the camera as far as it was before.
+            candidates: How many poses are compared.
+            seed: Of the candidates.
+        """
+        dataset, frames = self._seen, np.arange(len(self))
+        if self._known is None or self._known.fit is None or dataset is None:
+            return None
+        fitted, random = self._known.fit, np.random.default_rng([seed, len(self)])
+        pool = draw_pool(dataset, frames, fitted, random, candidates, self._brightness())
+        if pool is not None and reachable is not None:
+            reached = [reachable(pose) for pose in pool.world_from_tool.numpy()]
+            pool = pool.only(np.flatnonzero(reached)) if any(reached) else None
+        if pool is None:
+            return None
+        order, _ = advise(dataset, pool, fitted, number=1, enough=500)
+        return pool.world_from_tool[order[0]].numpy()
+
+    def result(self) -> Fit:
+        """Return the calibration of all frames, as `tofcorr.train` finds it.
+
+        Raises:
+            CalibrationDataError: The frames do not determine it.
+        """
+        order = self._order()
+        dataset, frames = self._dataset([self._frames[k].row for k in order]), np.arange(len(order))
+        lattice = joined([self._frames[k].lattice for k in order])
+        domain = covered_domain(dataset, frames, lattice)
+        moments = concatenate([self._on(domain, self._frames[k]) for k in order])
+        return fit(dataset, frames, self.options, domain, moments=moments, lattice=lattice)
+
+    def state(self) -> CalibrationState:
+        """Return the calibration as the numbers that a corrector is built from."""
+        rows = [self._frames[k].row for k in self._order()]
+        return calibration_state(self._dataset(rows), self.options, self.result())
+
+    def save(self, folder: Path | str) -> None:
+        """Write `state.pt` and `corrector.ts` into a new folder, whole or not at all.
+
+        Raises:
+            CalibrationDataError: The frames do not determine the calibration, or the folder cannot
+                be written.
+        """
+        state = self.state()
+        with staged_folder(folder) as staged:
+            save_calibration(staged / STATE_FILE, state)
+            export_torchscript(DepthCorrector.from_state(state), staged / "corrector.ts", state)
+
+    def _brightness(self) -> dict[str, Tensor]:
+        """Return dark and bright log normalised amplitude of each target, as far as it is known."""
+        found = {}
+        for name in {frame.row.target for frame in self._frames.values()}:
+            seen = joined([x.lattice for x in self._frames.values() if x.row.target == name])
+            light = seen.amplitude * seen.radial_distance.square()
+            light = light[light > 0].double()  # Not where it is unknown.
+            ends = torch.tensor([1 / 10, 9 / 10]).double()
+            found[name] = light.quantile(ends).log() if len(light) else torch.zeros_like(ends)
+        return found
+
+    def _start(self) -> dict[str, Any]:
+        """Return what `resume` starts from."""
+        like = self._like
+        names = "depth_kind", "modulation_frequency", "saturation_amplitude"
+        return {
+            "camera": asdict(like.camera),
+            "config": self.options.to_mapping(),
+            "tool_from_camera": torch.from_numpy(like.tool_from_camera),
+            **{name: getattr(like, name) for name in names},
+            **{name: getattr(self, name) for name in ("wanted_mm", "wanted_deg")},
+        }
+
+    def _images(self, number: int, **given: Any) -> dict[str, np.ndarray | None]:  # noqa: ANN401
+        """Return the images of one frame (1, H, W) as the recording format has them."""
+        size, images = (self._like.camera.height, self._like.camera.width), {}
+        for name, image in given.items():
+            images[name] = None
+            if image is not None:
+                kind = IMAGE_ARRAYS[name]
+                images[name] = np.array(image, dtype=kind.dtype)[None]
+                if images[name].shape[1:] != size:
+                    got = f"got {images[name].shape[1:]}"
+                    raise CalibrationDataError(f"{name}: expected shape {size}, {got}.")
+                kind.check(images[name], [number], self._like.path)
+        return images
+
+    def _summed(
+        self,
+        row: FrameRow,
+        images: Mapping[str, np.ndarray | None],
+        planes: Literal["estimated", "recorded"],
+    ) -> _Frame:
+        """Return what is kept of a frame."""
+        before = self._like.planes, self._like.amplitude is None
+        if self._frames and before != (planes, images["amplitude"] is None):
+            said = "give amplitude and plane with every frame, or with none"
+            raise CalibrationDataError(f"This frame differs from those before: {said}.")
+        known: Any = None if images["amplitude"] is None else True  # The image itself is not kept.
+        self._like = replace(self._like, planes=planes, amplitude=known)
+        data = usable_pixels(
+            Dataset((replace(self._like, frames=FrameTable.of([row]), **images),)),
+            self.options,
+            robust=False,
+        )
+        # Radial distances were recorded in float32, which holds them without loss.
+        exact = self._like.depth_kind == "radial" and data.exclude is None
+        dtype = torch.float32 if exact else torch.float64
+        batch = next(data.batches(image_dtype=dtype))
+        lattice = lattice_in(batch, data.ray_directions())
+        # What is known of the frames scales the condition terms, which the sums do not hold.
+        domain = replace(covered_domain(data, [0], lattice), conditions={})
+        model = ErrorModel(_of_images(self.options.model), domain)
+        if self._accumulator is None:
+            self._accumulator = MomentAccumulator(Design(model, domain, data.ray_directions()))
+        moments = self._accumulator.on(model, domain)(batch)
+        if planes == "estimated":
+            row = self._on_its_wall(row, moments)
+        pose, normal = (torch.from_numpy(x)[None] for x in (row.world_from_tool, row.normal_world))
+        offset = torch.tensor([row.offset], dtype=torch.float64)
+        normal, offset = plane_in_frame(normal, offset, pose)
+        moments = replace(moments, normal_tool=normal, offset_tool=offset)
+        return _Frame(row, domain, moments, lattice)
+
+    def _on_its_wall(self, row: FrameRow, moments: ImageMoments) -> FrameRow:
+        """Return the row with the plane where its target's wall starts: that of its first frame."""
+        for one in self._frames.values():
+            if one.row.target == row.target:
+                return replace(row, normal_world=one.row.normal_world, offset=one.row.offset)
+        # The points' entries of the columns: x, y, z and 1.
+        points = moments.gram[0, [0, 1, 2, -1]][:, [0, 1, 2, -1]]
+        plane = planes_through(points, torch.zeros(3, dtype=torch.float64))
+        camera = torch.from_numpy(row.world_from_tool @ self._like.tool_from_camera)
+        normal, offset = plane_in_frame(*plane, se3.inverse(camera))
+        return replace(row, normal_world=normal.numpy(), offset=float(offset))
+
+    def _dataset(self, rows: list[FrameRow]) -> Dataset:
+        """Return the frames as a recording whose images were not kept: no pixel has a return."""
+        like, size = self._like, (self._like.camera.height, self._like.camera.width)
+        nothing = np.broadcast_to(np.float32(np.nan), (len(rows), *size))
+        amplitude = None if like.amplitude is None else nothing
+        table = FrameTable.of(rows)
+        return Dataset(
+            (replace(like, frames=table, depth=nothing, amplitude=amplitude, mask=None),)
+        )
+
+    def _order(self) -> list[int]:
+        """Return the frames' numbers in the order of their time stamps."""
+        return sorted(self._frames, key=lambda k: (self._frames[k].row.timestamp, k))
+
+    def _on(self, domain: Domain, frame: _Frame) -> ImageMoments:
+        """Return the moments of a frame with the columns scaled to other ranges."""
+        of_images = _of_images(self.options.model)
+        return replace(
+            frame.moments,
+            gram=_mapped(frame.moments.gram, columns_on(of_images, domain, frame.domain)),
+        )
+
+    def _take(self, number: int, frame: _Frame) -> None:
+        """Add a frame to those that are fitted, on ranges that hold it."""
+        before, of_images = self._domain, _of_images(self.options.model)
+        if before is None or before.joined(frame.domain) != before:
+            self._domain = _wider(frame.domain if before is None else before.joined(frame.domain))
+            if before is not None:
+                change = columns_on(of_images, self._domain, before)
+                self._sums = {k: _mapped(gram, change) for k, gram in self._sums.items()}
+                self._last = None
+        assert self._domain is not None
+        self._frames[number] = frame
+        self._sums[number] = self._on(self._domain, frame).gram
+
+    def _learn(self, number: int) -> Known:
+        """Fit the moments of all frames, and say how well the calibration is known."""
+        order = self._order()
+        rows, here = [self._frames[k].row for k in order], self._domain
+        dataset, frames = self._dataset(rows), np.arange(len(order))
+        assert here is not None
+        poses = len(np.unique(dataset.pose_groups()))
+        moments = concatenate([self._frames[k].moments for k in order])
+        moments = replace(moments, gram=torch.cat([self._sums[k] for k in order]))
+        if any(_is_of_frames(term) for term in self.options.model.terms):
+            every = covered_domain(dataset, frames, self._frames[number].lattice)
+            here, self._last = replace(here, conditions=every.conditions), None
+        # Where few frames do not determine it, further steps of the solver tell no more.
+        few = self.options.solver.model_copy(update={"max_iterations": _MOST_STEPS})
+        options = self.options.model_copy(update={"solver": few})
+        problem = Problem(dataset, frames, options, here, resumed=self._last)
+        try:
+            problem, core, covariance = estimate(problem, moments)
+        except CalibrationDataError:  # So few frames do not determine it.
+            return Known(number, poses)
+        assert core.observability is not None
+        best = core.solution.parameters
+        self._last, self._seen = best, problem.dataset
+        found = Fit(
+            **vars(core),
+            model=calibrated(ErrorModel(core.options, here), best),
+            domain=here,
+            optimum=best,
+            hand_eye_only=best,
+            covariance=covariance,
+            residual=None,
+            weights=None,
+            walls=problem.walls,
+            noise=None,
+            noise_shift=None,
+        )
+        return self._judged(Known(number, poses, fit=found), core.moments, order.index(number))
+
+    def _judged(self, now: Known, moments: ImageMoments, place: int) -> Known:
+        """Return the same with intervals, gain and what is odd about one image of the moments."""
+        found, before = now.fit, self._known
+        assert found is not None
+        best = found.optimum
+        # Of few poses the scatter between them may be small by chance, but not what they determine.
+        expected = posterior_covariance(found.observability.precision)[:6, :6]
+        both = zip(worst_axes(found.hand_eye_covariance), worst_axes(expected), strict=True)
+        quantile = student_quantile(39 / 40, found.covariance.degrees_of_freedom)
+        shift, turn = (quantile * max(pair) for pair in both)
+        free = {name for one in found.observability.undetermined for name in one.shares}
+        if free & {*HAND_EYE_SYMBOLS}:
+            shift = turn = math.inf
+        shift, turn, gained = 1e3 * shift, math.degrees(turn), 0.0
+        if before is not None and math.isfinite(shift):
+            gained = 1 - max(shift / before.translation_mm, turn / before.rotation_deg)
+        spread = 1e3 * found.covariance.matrix.diagonal().clamp(min=0).sqrt()[best.twist_size :]
+        return replace(
+            now,
+            odd=tuple(self._odd(found, moments, place, compared=math.isfinite(shift))),
+            translation_mm=shift,
+            rotation_deg=turn,
+            terms_mm=dict(zip(moments.symbols, spread.tolist(), strict=True)),
+            weakest=found.directions[0].in_words(),
+            gained=gained,
+            enough=shift <= self.wanted_mm and turn <= self.wanted_deg,
+        )
+
+    def _odd(self, found: Fit, moments: ImageMoments, place: int, *, compared: bool) -> list[str]:
+        """Return what is odd about an image, beside the others if compared, a sentence each."""
+        best, number = found.optimum, np.arange(len(moments.count))
+        # Of each image's plane nothing is known, but for one ray, which shows no tilt.
+        ridge = moments.count[:, None, None] * torch.eye(3).double() / 1e9
+
+        noise = np.array([self._frames[k].noise for k in self._order()])
+
+        def rms(own: ImageMoments) -> np.ndarray:
+            losses = MomentObjective(own).image_losses(best).clamp(min=0)
+            return (losses / own.count).sqrt().numpy()
+
+        def is_outlying(sizes: np.ndarray) -> bool:
+            return any(one["frame"] == place for one in outlying_images(number, sizes))
+
+        said = []
+        if compared and len(number) >= _ENOUGH_TO_COMPARE:
+            within, whole = rms(within_prior(moments, best, ridge)), rms(moments)
+            # Dark targets have more noise: within an image it is the unit.
+            if is_outlying(within / noise):
+                said.append(f"shows no plane: {1e3 * within[place]:.1f} mm are left within it.")
+            elif is_outlying(whole):
+                size = f"{1e3 * whole[place]:.1f} mm"
+                said.append(f"disagrees with the others by {size}: pose, plane or time?")
+            own, usual = float(moments.count[place]), float(moments.count.median())
+            if 2 * own < usual:
+                said.append(f"has {own:.0f} usable pixels, where {usual:.0f} are usual.")
+        rows = [self._frames[k].row for k in self._order()][max(place - 1, 0) : place + 1]
+        if len(rows) > 1 and rows[1].timestamp - rows[0].timestamp <= _STREAM_S:
+            moved = np.abs(rows[1].world_from_tool - rows[0].world_from_tool).max()
+            if moved > STANDSTILL:
+                said.append("was taken while the robot moved: stand still for each frame.")
+        return said
+
+
+# Steps of the solver for what `add` returns. Chosen: from the last fit it takes three to five.
+_MOST_STEPS = 25
+# Frames from which on one is compared with the others. Chosen: the spread of fewer is chance.
+_ENOUGH_TO_COMPARE = 8
+# Time between frames of a stream, seconds: no robot moves and stands still again within it. Chosen.
+_STREAM_S = 0.2
+
+
+def _suitable(options: TrainingOptions) -> TrainingOptions:
+    """Refuse what needs the pixels of all frames at once.
+
+    Raises:
+        ConfigError: The message names it.
+    """
+    asked = {
+        "weights.robust": options.weights.robust != "none",
+        "weights.noise": options.weights.noise,
+        "residual": options.residual is not None,
+        "outlier_window_mm": options.outlier_window_mm is not None,
+        "a fixed pattern": any(not term.has_columns for term in options.model.terms),
+    }
+    for name in [name for name, given in asked.items() if given]:
+        raise ConfigError(f"{name} looks at all frames at once; train on the recording for it.")
+    near, far = Interval(1.0, 2.0), Interval(1.5, 3.0)
+    one = Domain(
+        height=4,
+        width=4,
+        radial_distance=near,
+        amplitude=near,
+        normalised_amplitude=near,
+        modulation_frequency=1e7,
+    )
+    other = replace(one, radial_distance=far, amplitude=far, normalised_amplitude=far)
+    try:
+        columns_on(_of_images(options.model), one, other)
+    except CalibrationDataError as error:
+        raise ConfigError(str(error)) from None
+    return options
+
+
+def _is_of_frames(term: Any) -> bool:  # noqa: ANN401 - options of any term
+    """Whether a term is a function of a frame's conditions, which no sum over pixels holds."""
+    return any(name in CONDITIONS for name in term.needs)
+
+
+def _of_images(options: ErrorModelOptions) -> ErrorModelOptions:
+    """Return the terms that have columns of pixels."""
+    terms = tuple(term for term in options.terms if not _is_of_frames(term))
+    return ErrorModelOptions(terms=terms)
+
+
+def _wider(domain: Domain) -> Domain:
+    """Return ranges wider by a quarter to both sides, so that the next frame hardly leaves them."""
+
+    def wider(one: Interval | None) -> Interval | None:
+        margin = 0.0 if one is None else (one.high - one.low) / 4
+        return one and Interval(one.low - min(margin, one.low / 2), one.high + margin)
+
+    names = "radial_distance", "amplitude", "normalised_amplitude"
+    return replace(domain, **{name: wider(getattr(domain, name)) for name in names})
+
+
+def _mapped(gram: Tensor, functions: Tensor) -> Tensor:
+    """Return moments (N, S, S) of other functions, given as combinations of theirs (C, C)."""
+    columns = torch.block_diag(torch.eye(1).double(), functions)
+    entries = torch.block_diag(torch.kron(columns, torch.eye(3).double()), torch.eye(1).double())
+    return entries @ gram @ entries.T
+
+
+_ROW_ARRAYS = ("world_from_tool", "normal_world")
+_DOMAIN = TypeAdapter(Domain)
+
+
+def _values_of(frame: _Frame) -> dict[str, Any]:
+    """Return a frame as plain values and tensors."""
+    row = {name: value for name, value in vars(frame.row).items() if value is not None}
+    row |= {name: torch.from_numpy(row[name]) for name in _ROW_ARRAYS}
+    sums = {"moments": vars(frame.moments), "lattice": vars(frame.lattice)}
+    return {"row": row, "domain": _DOMAIN.dump_python(frame.domain, mode="json"), **sums}
+
+
+def _frame_of(values: dict[str, Any]) -> _Frame:
+    """Return the frame that `_values_of` wrote."""
+    row = values["row"] | {name: values["row"][name].numpy() for name in _ROW_ARRAYS}
+    moments, lattice = ImageMoments(**values["moments"]), Lattice(**values["lattice"])
+    return _Frame(FrameRow(**row), _DOMAIN.validate_python(values["domain"]), moments, lattice)
