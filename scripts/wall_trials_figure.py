@@ -2,7 +2,9 @@
 
 The data are the trials of Sifferman et al. (2022), `wall_trials_l3cx`. Nobody measured the walls or
 where the sensor sits. Each mount is calibrated before all walls together, before each wall alone,
-and before every three walls, to predict the distances to the fourth.
+and before every three walls, to predict the distances to the fourth. Beside the errors of these
+predictions stands what bounds them: what fits leave in the walls that they were fitted to, and how
+well the readings at a pose repeat.
 """
 
 import json
@@ -75,7 +77,7 @@ def command(data: Path, out: Path) -> None:
         mount: {
             "together": one["together"].to_mapping(),
             "alone": {wall: origin.to_mapping() for wall, origin in one["alone"].items()},
-            "held_out_rms_mm": one["held_out_rms_mm"],
+            **one["errors_mm"],
         }
         for mount, one in found.items()
     }
@@ -87,14 +89,25 @@ def command(data: Path, out: Path) -> None:
 def _fitted_mount(data: Path, mount: str, folder: Path) -> dict[str, Any]:
     recording = _imported(data, mount, tuple(WALLS), folder)
     together = _origin(_fit(recording, _LINE))
-    alone = {wall: _origin(_fit(_imported(data, mount, (wall,), folder), _LINE)) for wall in WALLS}
+    singly = {wall: _imported(data, mount, (wall,), folder) for wall in WALLS}
+    alone = {wall: _origin(_fit(one, _LINE)) for wall, one in singly.items()}
     scores = [
         float(one.apart(together) @ axis / np.hypot(one.error(axis), together.error(axis)))
         for one in alone.values()
         for axis in np.eye(3)[:2]
     ]
-    held_out = {wall: round(_predicted_rms(recording, wall), 2) for wall in WALLS}
-    return {"together": together, "alone": alone, "scores": scores, "held_out_rms_mm": held_out}
+    errors: dict[str, dict[str, float]] = {}
+    for wall, one in singly.items():
+        others = recording.frames.target != wall
+        found = {
+            "held_out_rms_mm": _rms(recording, wall, others),
+            "fitted_rms_mm": _rms(recording, wall, others | True),
+            "fitted_alone_rms_mm": _rms(one, wall, np.ones(one.num_frames, dtype=bool)),
+            "repeat_rms_mm": _repeats(data / f"L3CX_{wall}_{mount}" / "measurements.csv"),
+        }
+        for name, value in found.items():
+            errors.setdefault(name, {})[wall] = round(value, 2)
+    return {"together": together, "alone": alone, "scores": scores, "errors_mm": errors}
 
 
 def _imported(data: Path, mount: str, walls: tuple[str, ...], folder: Path) -> "Recording":
@@ -132,18 +145,30 @@ def _origin(result: "Fit") -> Origin:
     return Origin(1e3 * transform[:3, 3], 1e6 * covariance, rotation[:, 2], undetermined)
 
 
-def _predicted_rms(recording: "Recording", wall: str) -> float:
-    """Fit the other walls; estimate this wall's plane alone; return its distances' RMS, mm."""
+def _rms(recording: "Recording", wall: str, fitted: np.ndarray) -> float:
+    """Fit these frames (N,); estimate a wall's plane alone; return its distances' RMS, mm."""
     from tofcorr.fit.walls import walls_alone
     from tofcorr.pixels.dataset import Dataset
     from tofcorr.pixels.passes import frame_errors
 
     data = Dataset((recording,))
-    seen = np.flatnonzero(data.targets != wall)
-    unseen = np.flatnonzero(data.targets == wall)
-    model = _fit(recording, _PARABOLA, seen).model
-    data = walls_alone(data, unseen, model).put_into(data)
-    return frame_errors(data, {"after": model})["after"]["to_plane"].rms_mm(unseen)
+    seen = np.flatnonzero(data.targets == wall)
+    model = _fit(recording, _PARABOLA, np.flatnonzero(fitted)).model
+    data = walls_alone(data, seen, model).put_into(data)
+    return frame_errors(data, {"after": model})["after"]["to_plane"].rms_mm(seen)
+
+
+def _repeats(path: Path) -> float:
+    """Return the root mean square error of a median, mm: half of how far those of halves differ.
+
+    Readings that follow each other are alike: one divided by the root of their number is too small.
+    """
+    differences = []
+    for line in path.read_text().splitlines():
+        readings = [float(cell) for cell in line.split(",")[1:] if cell.strip()]
+        halves = readings[: len(readings) // 2], readings[len(readings) // 2 :]
+        differences += [np.median(halves[0]) - np.median(halves[1])] if readings else []
+    return float(np.sqrt(np.mean(np.square(differences))) / 2)
 
 
 def _drawn(found: dict[str, dict[str, Any]]) -> "Figure":
@@ -153,7 +178,7 @@ def _drawn(found: dict[str, dict[str, Any]]) -> "Figure":
     bars, *panels = figure.subplots(1, 3, width_ratios=(1.2, 1, 1))
     places = np.arange(len(WALLS))
     for shift, (mount, name) in zip((-0.2, 0.2), MOUNTS.items(), strict=True):
-        values = list(found[mount]["held_out_rms_mm"].values())
+        values = list(found[mount]["errors_mm"]["held_out_rms_mm"].values())
         drawn = bars.bar(places + shift, values, width=0.38, color=COLOURS[mount], label=name)
         bars.bar_label(drawn, fmt="%.2f", fontsize=8)
     bars.set_xticks(places, list(WALLS.values()))

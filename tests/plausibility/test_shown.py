@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plausibility.test_faults import drifting
+from plausibility.test_faults import drifting, without_robot
 from scipy.spatial.transform import Rotation
 
 from benchmarks.wrong_recordings.parts import Parts
@@ -70,6 +70,7 @@ SHOWN: dict[str, tuple[Callable[[Parts], Parts], float, float]] = {
     "within a pose": (lambda p: thrice(p, away=0.113), 105, 121),
     "second reflection": (reflecting, 25, 55),
     "noise of the depth": (lambda p: p.changed(amplitude=9 / p.depth**2), -2.1, -1.9),
+    "times the relative noise": (lambda p: p.changed(amplitude=9 / p.depth), -1.1, -0.9),
     "light with that of 2": (passive, -0.5, 0.8),
 }
 
@@ -87,3 +88,17 @@ def test_what_a_recording_shows_is_named_with_its_size(
 
 def test_repeats_that_differ_by_noise_are_let_through(parts: Parts, tmp_path: Path) -> None:
     assert inspect(thrice(parts).write(tmp_path / "repeated")).headline is None
+
+
+@pytest.mark.parametrize("words", ["of the one before it", "From first to last"])
+def test_a_camera_on_a_tripod_that_filters_or_drifts_is_named_without_a_robot(
+    words: str, parts: Parts, tmp_path: Path
+) -> None:
+    """Both passed without a word where no robot moves the camera."""
+    still = without_robot(parts, inspect(parts.write(tmp_path / "moved")).look.given.hand_eye)
+    away = np.linspace(0, 0.06, len(still.depth))[:, None, None]
+    changed = filtered(still) if "before" in words else still.changed(depth=still.depth + away)
+    found = inspect(changed.write(tmp_path / "shown"))
+    assert words in str(found.headline)
+    assert "robot" not in repr(found)
+    assert "pose" not in str(found.headline)

@@ -80,16 +80,13 @@ class NoiseMeasurement:
             variance, self.correlation, self.pose_correlation, self.left_out = found
             variance = variance * level_of_repeats(_brightness(table), repeats, variance)
             self.variance = np.where(np.isfinite(repeats), repeats, variance)
-        known = self.variance[np.isfinite(self.variance)]
-        temporal = max(float(known.mean()), 0.0) if len(known) else 0.0
         curve = _curve_of(table, self.variance, filter_width(self.correlation.mean(0).tolist()))
-        if self.source == "neighbours":
-            # Single pixels between edges have no difference; the curve covers them too. It has a
-            # least noise where differences, less those of the pattern, leave none.
-            at = table.amplitude if curve.needs_amplitude else table.distance
-            lit = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
-            squares = curve.sigma(table.distance[lit], table.amplitude[lit]) ** 2
-            temporal = float(squares.mean()) if lit.any() else 0.0
+        # Pixels at edges have no noise of their own; the curve covers them too. It has a least
+        # noise where differences, less those of the pattern, leave none.
+        at = table.amplitude if curve.needs_amplitude else table.distance
+        lit = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
+        squares = curve.sigma(table.distance[lit], table.amplitude[lit]) ** 2
+        temporal = float(squares.mean()) if lit.any() else 0.0
         pattern = observed.pattern
         share = pattern / (pattern + temporal) if pattern > 0 and temporal > 0 else 0.0
         self.curve = curve.with_fixed_share(share)

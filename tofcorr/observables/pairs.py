@@ -279,18 +279,22 @@ def _shared_poses(real: Observed, sim: Observed) -> dict[int, int] | None:
     same_size = real.map_frames.shape == sim.map_frames.shape
     if not same_size or not np.allclose(cameras[0].matrix, cameras[1].matrix):
         return None
-    places = []  # Pose and plane of the first frame of each pose, (P, 20).
+    # Pose and plane of the first frame of each pose, (P, 20); its target and exposure, (P, 2).
+    places, seen = [], []
     for recording in (real.recording, sim.recording):
         first, table = [frames[0] for frames in repeats_of(recording)], recording.frames
         poses = table.world_from_tool.reshape(len(table), 16)
         every = np.column_stack([poses, table.normal_world, table.offset])
         places.append(every[first])
+        times = np.zeros(len(table)) if table.integration_time is None else table.integration_time
+        seen.append(np.column_stack([table.target, times.astype(str)])[first])
     found, free = {}, np.ones(len(places[1]), dtype=bool)
     for number, place in enumerate(places[0]):
         same = np.flatnonzero(free & (np.abs(places[1] - place).max(axis=1) <= _SAME_POSE))
-        if len(same):
-            found[number] = int(same[0])
-            free[same[0]] = False
+        if len(same):  # Targets and exposures may change at a pose, in another order.
+            alike = (seen[1][same] == seen[0][number]).sum(axis=1)
+            found[number] = int(same[alike.argmax()])
+            free[found[number]] = False
     return found if len(found) >= _LEAST_SHARED * len(places[0]) else None
 
 

@@ -23,6 +23,9 @@ a variance: it is then known to 14 %."""
 # Deviations beyond this many robust standard deviations of pixels of their brightness are no noise:
 # normal noise of an image never reaches it, mixed pixels at edges do.
 _CLIP = 6.0
+# Pixels beyond this many robust standard deviations, and those next to them, may see an edge: 1 of
+# 16 000 pixels with normal noise does. Chosen.
+_EDGE = 4.0
 # Frames of a pose and pixels of it that are read at most. Chosen to bound time and memory: 30 give
 # the variance of a pixel to 26 %, and 60 poses 240 000 rows, whose mean is known to 0.3 %.
 _MOST_REPEATS, _MOST_OF_POSE = 30, 4000
@@ -47,8 +50,8 @@ class Observed:
             target: number of the target's name, in alphabetical order of all names;
             amplitude: mean over frames with a distance, counts;
             raw_amplitude: mean over all frames, as recorded;
-            of_repeats: variance over repeated frames, m^2;
-            of_neighbours: mean square of scaled second differences, m^2;
+            of_repeats: variance over repeated frames, m^2, of pixels that see one surface;
+            of_neighbours: mean square of their scaled second differences, m^2;
             of_nearest: mean half square of the differences to nearest pixels of like brightness;
             frames, missing, saturated: in how many frames the pixel looks at the target, has no
             distance, is saturated.
@@ -112,6 +115,8 @@ class _PoseImages:
     Attributes:
         residual: Measured distance less the smooth surface of the mean image, and less the offset
             of the frame, without gross outliers, shape (R, h, w), metres; NaN where not usable.
+        deviation: Of it from its mean over the frames, shape (R, h, w), metres; NaN at edges.
+        edge: Where the mean image shows edges, the pattern being in it, shape (h, w), bool.
         weight: Of the pixels, by the noise of their brightness, shape (h, w), 1/m^2.
         amplitude: Counts, shape (R, h, w), as recorded; None if not recorded.
         on_target: Where the pixels look at the target, shape (R, h, w), bool.
@@ -119,7 +124,7 @@ class _PoseImages:
         saturated: Pixels on the target at or above the stated saturation, shape (R, h, w), bool.
         distance: To the plane of the images, shape (h, w), metres; NaN where unknown.
         cosine: Of the angle of incidence on that plane, shape (h, w); NaN where unknown.
-        varying: What neighbours are compared by, shape (R, h, w), metres; NaN at edges of squares.
+        varying: What neighbours are compared by, shape (R, h, w), metres; NaN at edges.
         second: Its second differences by axis, as of `second_differences`.
         place: Rows and columns of the rectangle.
     """
@@ -157,18 +162,30 @@ class _PoseImages:
         # Each by its own spread: else a pixel that is far off in all frames would lose its noise.
         still, self.weight = _clipped(of_mean[None], self.amplitude)
         self.residual = _clipped(around, self.amplitude)[0] + still
+        self.edge = self._edges(still)
 
     def compare(self, varying: np.ndarray) -> None:
-        """Take what changes from pose to pose, (R, h, w), as what neighbours are compared by.
+        """Take what changes from pose to pose, (R, h, w), as what neighbours are compared by."""
+        self.deviation = self.residual - known_mean(self.residual)
+        edge = self._edges(self.deviation, varying)
+        self.deviation[:, edge], self.varying = np.nan, np.where(edge, np.nan, varying)
+        self.second = {k: second_differences(self.varying, self.amplitude, k) for k in AXES}
 
-        A pixel that sees two squares, or is next to one that does, has errors of its own.
+    def _edges(self, *residuals: np.ndarray) -> np.ndarray:
+        """Return the pixels that see two surfaces or squares, or are next to one that does, (h, w).
+
+        They have errors of their own. Bright and dark meet there, or one of the residuals, each
+        (R, h, w) or (1, h, w), is far larger than at pixels as bright. None: too few others are
+        left.
         """
+        far = [(np.abs(r) > _EDGE * _spread(r, self.amplitude)).any(0) for r in residuals]
+        edge = np.asarray(maximum_filter(np.any(far, axis=0), 3), dtype=bool)
         if self.amplitude is not None:
             mean = known_mean(self.amplitude)
-            high, low = (f(mean, 3) for f in (maximum_filter, minimum_filter))
-            varying = np.where(high - low > SAME_BRIGHTNESS * (high + low), np.nan, varying)
-        self.varying = varying
-        self.second = {k: second_differences(varying, self.amplitude, k) for k in AXES}
+            high, low = (np.asarray(f(mean, 3)) for f in (maximum_filter, minimum_filter))
+            edge |= high - low > SAME_BRIGHTNESS * (high + low)
+        others = np.isfinite(self.residual).any(0) & ~edge
+        return edge & (others.sum() >= FEWEST_PIXELS)
 
 
 class _SurfaceFit:
@@ -243,6 +260,18 @@ def _clipped(residual: np.ndarray, amplitude: np.ndarray | None) -> tuple[np.nda
     Returns:
         The clipped residuals, and the weights (H, W) that those standard deviations give, 1/m^2.
     """
+    spread = _spread(residual, amplitude)
+    # A group that repeats exactly has the rounding of float32 depth of 1 m.
+    rounding = np.finfo(np.float32).eps
+    weight = known_mean(1.0 / np.where(np.isinf(spread), rounding, spread) ** 2)
+    return np.clip(residual, -_CLIP * spread, _CLIP * spread), np.nan_to_num(weight)
+
+
+def _spread(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:
+    """Return the robust standard deviation of residuals (R, H, W) of the brightness of each.
+
+    It is infinite where most are equal, and NaN where a residual is unknown.
+    """
     known = np.flatnonzero(np.isfinite(residual))
     values = residual.ravel()[known]
     order = np.arange(len(known))
@@ -253,13 +282,9 @@ def _clipped(residual: np.ndarray, amplitude: np.ndarray | None) -> tuple[np.nda
     for part in np.array_split(order, min(8, len(order))) if len(order) else ():
         around = np.abs(values[part] - np.median(values[part]))
         spread[part] = sigma_from_mad(float(np.median(around))) or np.inf
-    clipped, weight = np.full((2, residual.size), np.nan)
-    clipped[known] = np.clip(values, -_CLIP * spread, _CLIP * spread)
-    # A group that repeats exactly has the rounding of float32 depth of 1 m.
-    rounding = np.finfo(np.float32).eps
-    weight[known] = 1.0 / np.where(np.isfinite(spread), spread, rounding) ** 2
-    weight = known_mean(weight.reshape(residual.shape))
-    return clipped.reshape(residual.shape), np.nan_to_num(weight)
+    found = np.full(residual.size, np.nan)
+    found[known] = spread
+    return found.reshape(residual.shape)
 
 
 def known_mean(images: np.ndarray) -> np.ndarray:
@@ -332,7 +357,7 @@ class _BetweenPoses:
     @staticmethod
     def _parts(images: _PoseImages) -> np.ndarray:
         mean = known_mean(images.residual)
-        weight = np.where(np.isfinite(mean), images.weight, 0.0)
+        weight = np.where(np.isfinite(mean) & ~images.edge, images.weight, 0.0)
         value = weight * np.nan_to_num(mean)
         return np.stack([value, value**2, weight, weight**2])
 
@@ -393,7 +418,7 @@ def _of_neighbours(images: _PoseImages) -> np.ndarray:
         differences in one image, where there is a second difference too; shape (2, 3, 2, 2).
     """
     sums = np.zeros((2, 3, len(AXES), len(LAGS)))
-    deviation = images.residual - known_mean(images.residual)
+    deviation = images.deviation
     for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
         if len(deviation) > 1:
             first, later = _shifted_pair(deviation, axis, lag)
@@ -431,7 +456,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
         strength = images.amplitude[chosen]
         amplitude = known_mean(np.where(known, strength, np.nan))
         raw = known_mean(np.where(on_target, strength, np.nan))
-    squares = np.nansum((values - known_mean(values)) ** 2, axis=0)
+    deviation = images.deviation[chosen]
     distance, cosine = images.distance[at], images.cosine[at]
     second = [known_mean(images.second[axis] ** 2)[at] for axis in AXES]
     fields = {
@@ -443,7 +468,7 @@ def _rows(images: _PoseImages, pose: int, target: int, shape: tuple[int, int]) -
         "target": np.full(len(pixel), target),
         "amplitude": amplitude,
         "raw_amplitude": raw,
-        "of_repeats": quotient(squares, known.sum(0) - 1),
+        "of_repeats": quotient(np.nansum(deviation**2, 0), np.isfinite(deviation).sum(0) - 1),
         "of_neighbours": known_mean(np.stack(second)),
         "of_nearest": _of_nearest(images.varying, images.amplitude)[at],
         "frames": on_target.sum(0),

@@ -345,7 +345,7 @@ def places_on_wall(problem: LinearResiduals) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pose_drift(problem: LinearResiduals, *, warming: bool = False) -> Estimate | None:
-    """Estimate by how much the robot's poses, or the wall, move steadily away.
+    """Estimate by how much the robot's poses, the camera, or the wall, move steadily away.
 
     The world shifts and turns in proportion to the frame's number. The size of the estimate is the
     root mean square of how far points move off their planes from the first frame to the last.
@@ -355,10 +355,10 @@ def pose_drift(problem: LinearResiduals, *, warming: bool = False) -> Estimate |
         warming: Whether all distances may change steadily too, as those of a warming camera.
 
     Returns:
-        None where there is none, there are too few frames, or no robot moves.
+        None where there is none, or there are too few frames.
     """
     scene, used = problem.scene, problem.used
-    if not scene.moves or len(scene.poses) < problem.frames_for(4, times=2):
+    if len(scene.poses) < problem.frames_for(4, times=2):
         return None
     shifted = np.broadcast_to(scene.normal[:, None], problem.world.shape)
     turned = np.cross(problem.world - problem.world[used].mean(0), scene.normal[:, None])
@@ -378,7 +378,9 @@ Late = tuple[tuple[str, str], float, Estimate]
 moves points off their planes, metres."""
 
 
-def lateness(problem: LinearResiduals, before: np.ndarray, after: np.ndarray) -> Late | None:
+def lateness(
+    problem: LinearResiduals, before: np.ndarray, after: np.ndarray, planes: np.ndarray
+) -> Late | None:
     """Estimate whether poses and images are of different moments, by a share of each move.
 
     A pose may hold a share of the move from the frame before, or to the next. A camera that filters
@@ -388,21 +390,23 @@ def lateness(problem: LinearResiduals, before: np.ndarray, after: np.ndarray) ->
         problem: The residuals.
         before: world_from_tool of the frame recorded before each, shape (F, 4, 4), metres.
         after: The same of the frame after it.
+        planes: Normal and offset of the plane of the frame before, in the world, (F, 4), metres.
 
     Returns:
-        What explains most; None where nothing surely is late, or no robot moves.
+        What explains most; None where nothing surely is late. Without a robot no pose is.
     """
     scene, place = problem.scene, problem.scene.poses[:, None, :3, 3]
-    if not scene.moves or len(scene.poses) < problem.frames_for(1, times=2):
+    if len(scene.poses) < problem.frames_for(1, times=2):
         return None
     columns: dict[tuple[str, str], np.ndarray] = {}
-    for move, other in (("before", before), ("after", after)):
+    for move, other in (("before", before), ("after", after)) if scene.moves else ():
         turn = Rotation.from_matrix(other[:, :3, :3] @ scene.poses[:, :3, :3].mT).as_rotvec()
         step = other[:, None, :3, 3] - place + np.cross(turn[:, None], problem.world - place)
         columns["pose", f"the move {move} it"] = np.einsum("fpa,fa->fp", step, scene.normal)
     camera, seen = before @ problem.hand_eye, problem.distance[problem.used]
-    height = (camera[:, :3, 3] * scene.normal).sum(-1) + scene.offset
-    cosine = np.einsum("fpa,fba,fb->fp", problem.rays, camera[:, :3, :3].mT, scene.normal)
+    normal, offset = planes[:, :3], planes[:, 3]
+    height = (camera[:, :3, 3] * normal).sum(-1) + offset
+    cosine = np.einsum("fpa,fba,fb->fp", problem.rays, camera[:, :3, :3].mT, normal)
     # Where no wall was seen, something as far as the walls are is in the image.
     held = (-height[:, None] / np.minimum(cosine, -_GRAZING)).clip(seen.min(), seen.max())
     columns["image", "the one before it"] = problem.cosine * (held - problem.distance)

@@ -175,16 +175,21 @@ class Look:
         self.noise, self.noise_rms = _noise_of(np.concatenate(second))
 
     @cached_property
-    def neighbours(self) -> list[np.ndarray]:
-        """world_from_tool of the frames before and after those of the linear residuals.
+    def neighbours(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The frames before and after those of the linear residuals, of F.
 
-        Two arrays of shape (F, 4, 4), metres. The first and the last frame of a recording stand for
-        those that it does not have.
+        The first and the last frame of a recording stand for those that it does not have.
+
+        Returns:
+            world_from_tool of the frame before, and of the one after, shape (F, 4, 4), metres;
+            normal and offset of the plane of the one before, in the world, shape (F, 4), metres.
         """
         ends = np.cumsum([0, *(one.num_frames for one in self.data.recordings)])
         seen, poses = self.frames[self.scene.known], self.data.column("world_from_tool").numpy()
         own = np.searchsorted(ends, seen, side="right")
-        return [poses[(seen + k).clip(ends[own - 1], ends[own] - 1)] for k in (-1, 1)]
+        before, after = ((seen + k).clip(ends[own - 1], ends[own] - 1) for k in (-1, 1))
+        normal, offset = (self.data.column(k).numpy() for k in ("normal_world", "offset"))
+        return poses[before], poses[after], np.column_stack([normal, offset])[before]
 
     def condition(self, name: str) -> np.ndarray:
         """Return a condition of the frames looked at, shape (F,); NaN: unknown."""

@@ -40,7 +40,7 @@ def test_three_real_walls_predict_the_distances_to_the_fourth(
 ) -> None:
     recordings = [import_trials(real_data, mount, tmp_path / mount).done for mount in MOUNTS]
     result = tofcorr.evaluate(recordings, "zones")
-    assert "P2, W1, wall" in repr(result)
+    assert "P2, W1, wall" in result.markdown()
     found = {(s.name, w): e["D"] for s in result.sets for w, e in s.by_wall("walls").items()}
     # Seven poses of this trial are up to 200 mm farther from the wall than any other pose: there
     # the fitted curve is extended.

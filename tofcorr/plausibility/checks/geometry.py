@@ -260,10 +260,12 @@ def drift(look: Look) -> Iterator[Finding]:
         # Frames miss their planes by a quarter of it in the middle of each half.
         size = f"{1e3 * found.size:.0f} mm (standard error {1e3 * found.size_error:.0f} mm)"
         said = f"From first to last frame the points move {size} off the recorded planes"
-        cause = "the poses drift, or robot, target or camera was moved; record again, or in parts"
+        moved = "the poses drift, or robot, target" if look.scene.moves else "target"
+        cause = f"{moved} or camera was moved; record again, or in parts"
         severity = "impossible" if found.size > 4 * CAMERA else "doubtful"
         if found.size < CAMERA and pose_drift(look.of_camera, warming=True) is None:
-            severity, cause = "note", "a camera that warms up, or poses that drift"
+            severity = "note"
+            cause = "a camera that warms up" + ", or poses that drift" * look.scene.moves
         yield Finding(severity, f"{said}: {cause}.")
 
 
@@ -273,8 +275,9 @@ def late(look: Look) -> Iterator[Finding]:
         (kind, of), share, found = look.late
         size = f"{1e3 * found.size:.1f} mm (standard error {1e3 * found.size_error:.1f} mm)"
         said = f"Each {kind} holds {100 * share:.1f} % of {of}, which moves points by {size}"
-        cause = "the robot still moved, poses lag, or the camera filters over time"
-        yield doubtful(f"{said}: {cause}; wait after a move.", spoils=found.size > SPOILS)
+        cause = "the robot still moved, poses lag, or " * look.scene.moves
+        cause += "the camera filters over time; wait after a move"
+        yield doubtful(f"{said}: {cause}.", spoils=found.size > SPOILS)
 
 
 def agreement(look: Look) -> Iterator[Finding]:
