@@ -206,7 +206,7 @@ def _looking_at_walls(generator: np.random.Generator, one_wall: bool) -> np.ndar
     place = np.array([0.6, 0.6, 0.9]) + generator.uniform(-0.4, 0.4, 3)
     at = generator.uniform([0.8, -0.6, -0.1], [2.0, 2.2, 1.0])
     if one_wall:  # Tilted by less than 35 degrees.
-        at = place + [1.0, *generator.uniform(-0.5, 0.5, 2)]
+        at = place + np.array([1.0, *generator.uniform(-0.5, 0.5, 2)])
     return looking(place, at, generator.uniform(-np.pi, np.pi))
 
 

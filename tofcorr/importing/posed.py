@@ -313,7 +313,8 @@ class PosedImport:
             return lag
         times, walls = self._times[some], torch.from_numpy(found.walls)
         # With the error found at stops: else a constant, before one wall, would look like a lag.
-        fitted = Parameters(*map(torch.from_numpy, (found.tool_from_camera, found.error)))
+        hand_eye, error = torch.from_numpy(found.tool_from_camera), torch.from_numpy(found.error)
+        fitted = Parameters(hand_eye, error)
         seen = seen_planes(planes, torch.from_numpy(self._track.at(times)), 1)
 
         def losses(late: float) -> np.ndarray:

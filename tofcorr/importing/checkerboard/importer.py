@@ -8,12 +8,14 @@ Kinect v2 in `tests/importing/checkerboard/test_kinect2.py` they refuse at most 
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import torch
 from pydantic import Field
 
 from tofcorr.data.recording import DepthKind
@@ -36,9 +38,12 @@ from tofcorr.importing.images import (
     of_size,
     read_depth,
     read_grey,
+    times_in_names,
     turned,
 )
 from tofcorr.importing.intrinsics import GivenIntrinsics
+from tofcorr.importing.pose_files import read_poses
+from tofcorr.importing.robot_images import PosedOptions
 from tofcorr.importing.run import (
     Frame,
     PreparedImport,
@@ -48,6 +53,9 @@ from tofcorr.importing.run import (
     camera_mapping,
     run_import,
 )
+from tofcorr.importing.timing import pair
+from tofcorr.importing.walls.finding import walls_of_planes
+from tofcorr.importing.walls.image_planes import WallOptions, described
 from tofcorr.options import Options, PositiveNumber
 
 _FEWEST_PIXELS = 50
@@ -88,6 +96,8 @@ class CheckerboardOptions(Options):
             to 0 the corners surround every pixel used; 1 is the outer edge of the squares.
         max_reprojection_px: Views with a larger reprojection error (root mean square) are refused.
         modulation_frequency: Modulation frequency of the camera, Hz; None if unknown.
+        poses: File of the poses of the robot that carries the camera; None: there is none.
+        pose_format: Its format; None: told from the content.
     """
 
     depth_pattern: str = "{view}_depth.png"
@@ -100,6 +110,8 @@ class CheckerboardOptions(Options):
     margin_squares: Annotated[float, Field(gt=-1.0, le=2.0)] = 0.0
     max_reprojection_px: PositiveNumber = 0.5
     modulation_frequency: PositiveNumber | None = None
+    poses: Path | None = None
+    pose_format: str | None = None
 
 
 class BoardView(NamedTuple):
@@ -125,8 +137,10 @@ def import_checkerboard(
 ) -> dict[str, Any]:
     """Turn images of a board into a recording, with `import.json` beside the arrays.
 
-    The world is the camera frame: the plane of each frame comes from the board's corners in its own
-    infrared image. A view that cannot be used is left out and listed with its reason.
+    Without a robot the world is the camera frame: the plane of each frame comes from the board's
+    corners in its own infrared image. With poses of a robot, before a board that stands still, the
+    corners of all views give a start of the hand-eye transform and of the one plane. A view that
+    cannot be used is left out and listed with its reason.
 
     Args:
         folder: Where the images are.
@@ -167,16 +181,20 @@ class BoardImport:
         sieve.apply(detect, list(self._files), str, "finding boards")
         about_camera, warnings = self._calibrate()
         self._rays = ray_directions(self._camera).numpy()
+        poses = self._poses(sieve.refused)
         views = sieve.apply(self._place, list(self._corners), str, "placing boards")
         ratio = typical_ratio(views)
         refuse = partial(refuse_mixed_up, ratio=ratio)
         views = sieve.apply(refuse, views, lambda view: view.reported["view"], "comparing boards")
         warnings += agreement_warnings(views, ratio, options.depth_kind)
+        stand = None if poses is None else self._stand(views, poses)
         return PreparedImport(
             views=[view.reported for view in views],
-            frames=self._frames(views),
+            frames=self._frames(views, stand),
             writer=partial(
                 RecordingWriter,
+                tool_from_camera=None if stand is None else stand[1],
+                planes="recorded" if stand is None else "estimated",
                 camera=self._camera,
                 depth_kind=options.depth_kind,
                 modulation_frequency=options.modulation_frequency,
@@ -215,6 +233,42 @@ class BoardImport:
         self._camera, found = calibrate(corners, self._board, size)
         about = camera_mapping(self._camera, "calibrated from the boards") | found
         return about, [calibration_warning(self._camera, found)]
+
+    def _poses(self, refused: Refused) -> dict[str, np.ndarray] | None:
+        """Return world_from_tool (4, 4) of each view that has one; None without a robot.
+
+        Views without a pose are left out.
+        """
+        if self._options.poses is None:
+            return None
+        track, names = read_poses(self._options.poses, self._options.pose_format), [*self._corners]
+        near = PosedOptions().pose_tolerance_s
+        found, poses, alone, _ = pair(names, times_in_names(names), track, tolerance=near)
+        refused |= alone
+        self._corners = {names[k]: self._corners[names[k]] for k in found}
+        return dict(zip(self._corners, poses, strict=True))
+
+    def _stand(
+        self, views: Sequence[BoardView], poses: Mapping[str, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the poses of the tool, the hand-eye transform, and where the board stands.
+
+        Shapes (N, 4, 4), (4, 4) and (4,): the plane (n, d), n . x + d = 0 in the world.
+
+        As for walls without a board: which way round a symmetric board is seen does not matter.
+
+        Raises:
+            CalibrationDataError: No hand-eye transform puts the boards of all views onto one plane.
+        """
+        names, rays = [view.reported["view"] for view in views], torch.from_numpy(self._rays)
+        tool, planes = np.stack([poses[name] for name in names]), []
+        for view in views:
+            normal, offset = view.pose.plane()
+            area = torch.from_numpy(self._area(view.pose))
+            planes.append([described(rays, area, torch.from_numpy(-normal / offset))])
+        origin = str(self._options.poses)
+        found = walls_of_planes(planes, names, rays[..., 0].numel(), tool, WallOptions(), origin)
+        return tool, found.tool_from_camera, found.walls[0]
 
     def _read(self, view: str) -> DepthImage:
         return of_size(read_depth(self._files[view], self._coding), self._camera)
@@ -263,7 +317,9 @@ class BoardImport:
         }
         return BoardView(pose, float(np.median(measured / true)), columns @ columns.T, reported)
 
-    def _frames(self, views: Sequence[BoardView]) -> Iterator[Frame]:
+    def _frames(
+        self, views: Sequence[BoardView], stand: tuple[np.ndarray, ...] | None
+    ) -> Iterator[Frame]:
         for index, view in enumerate(views):
             normal, offset = view.pose.plane()
             row = FrameRow(
@@ -274,6 +330,9 @@ class BoardImport:
                 target=self._board.kind,
                 plane_covariance=view.pose.plane_covariance,
             )
+            if stand is not None:  # One plane, of no known covariance: a start for the fit.
+                row = replace(row, world_from_tool=stand[0][index], plane_covariance=None)
+                row = replace(row, normal_world=stand[2][:3], offset=float(stand[2][3]))
             depth, amplitude = self._read(view.reported["view"])
             yield row, depth, amplitude, self._area(view.pose)
 
