@@ -134,7 +134,7 @@ class SelectionResult:
     def tables(self) -> list[Table]:
         """Return a table for each grouping, the model with the smallest error first."""
         metric = _METRICS[self.options.metric]
-        found, header = [], ["model", "unknowns", "error", "behind the best", ""]
+        found, header = [], ["model", "unknowns", "error", "behind the best", "verdict"]
         for by, ranking in self.rankings.items():
             ordered = sorted(ranking.errors.items(), key=lambda item: item[1].mean)
             rows = [self._row(ranking, name) for name, _ in ordered]

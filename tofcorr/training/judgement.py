@@ -327,8 +327,7 @@ def advice_words(advice: Mapping[str, Any]) -> tuple[str, list[str]]:
     poses = []
     for pose in advice["poses"]:
         lower = 1 - pose["worst_sigma_mm_or_mrad"] / advice["worst_sigma_mm_or_mrad"]
-        falls = f"the largest standard error of all unknowns falls by {100 * lower:.0f} %"
-        poses.append(f"{_POSE.format(**pose)}: {falls}")
+        poses.append(f"{_POSE.format(**pose)}: largest standard error {100 * lower:.0f} % lower")
     return f"Least well known: the {mixed}, to {advice['sigma_mm_or_mrad']:.1f} mm at 1 m.", poses
 
 

@@ -15,7 +15,6 @@ from tofcorr.importing.command_line import (
     depth_kind_option,
     intrinsics_options,
     option,
-    pose_format_option,
     print_report,
     recording_out_option,
     take_intrinsics,
@@ -39,7 +38,6 @@ _MARGIN = "How far the mask extends beyond the outermost inner corners; 1: edge 
 @option("--square-mm", "Side of a square or tag, mm.", required=True, type=float)
 @option("--depth-unit-mm", "Millimetres per count; 0 counts mean no return.", default=1.0)
 @option("--poses", _POSES, type=click.Path(path_type=Path))
-@pose_format_option
 @depth_kind_option
 @intrinsics_options
 @option("--saturation", _FULL, "saturation_counts", default=65535.0)

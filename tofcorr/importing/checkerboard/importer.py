@@ -8,8 +8,7 @@ Kinect v2 in `tests/importing/checkerboard/test_kinect2.py` they refuse at most 
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -54,7 +53,7 @@ from tofcorr.importing.run import (
     run_import,
 )
 from tofcorr.importing.timing import pair
-from tofcorr.importing.walls.finding import walls_of_planes
+from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
 from tofcorr.importing.walls.image_planes import WallOptions, described
 from tofcorr.options import Options, PositiveNumber
 
@@ -97,7 +96,6 @@ class CheckerboardOptions(Options):
         max_reprojection_px: Views with a larger reprojection error (root mean square) are refused.
         modulation_frequency: Modulation frequency of the camera, Hz; None if unknown.
         poses: File of the poses of the robot that carries the camera; None: there is none.
-        pose_format: Its format; None: told from the content.
     """
 
     depth_pattern: str = "{view}_depth.png"
@@ -111,7 +109,6 @@ class CheckerboardOptions(Options):
     max_reprojection_px: PositiveNumber = 0.5
     modulation_frequency: PositiveNumber | None = None
     poses: Path | None = None
-    pose_format: str | None = None
 
 
 class BoardView(NamedTuple):
@@ -181,20 +178,19 @@ class BoardImport:
         sieve.apply(detect, list(self._files), str, "finding boards")
         about_camera, warnings = self._calibrate()
         self._rays = ray_directions(self._camera).numpy()
-        poses = self._poses(sieve.refused)
         views = sieve.apply(self._place, list(self._corners), str, "placing boards")
         ratio = typical_ratio(views)
         refuse = partial(refuse_mixed_up, ratio=ratio)
         views = sieve.apply(refuse, views, lambda view: view.reported["view"], "comparing boards")
         warnings += agreement_warnings(views, ratio, options.depth_kind)
-        stand = None if poses is None else self._stand(views, poses)
+        views, tool, wall = self._posed(views, sieve.refused)
         return PreparedImport(
             views=[view.reported for view in views],
-            frames=self._frames(views, stand),
+            frames=self._frames(views, tool, wall),
             writer=partial(
                 RecordingWriter,
-                tool_from_camera=None if stand is None else stand[1],
-                planes="recorded" if stand is None else "estimated",
+                tool_from_camera=wall and wall.tool_from_camera,
+                planes="estimated" if wall else "recorded",
                 camera=self._camera,
                 depth_kind=options.depth_kind,
                 modulation_frequency=options.modulation_frequency,
@@ -234,41 +230,30 @@ class BoardImport:
         about = camera_mapping(self._camera, "calibrated from the boards") | found
         return about, [calibration_warning(self._camera, found)]
 
-    def _poses(self, refused: Refused) -> dict[str, np.ndarray] | None:
-        """Return world_from_tool (4, 4) of each view that has one; None without a robot.
+    def _posed(
+        self, views: list[BoardView], refused: Refused
+    ) -> tuple[list[BoardView], np.ndarray, FoundWalls | None]:
+        """Return the views that have a pose, world_from_tool (N, 4, 4), and the wall of the board.
 
-        Views without a pose are left out.
-        """
-        if self._options.poses is None:
-            return None
-        track, names = read_poses(self._options.poses, self._options.pose_format), [*self._corners]
-        near = PosedOptions().pose_tolerance_s
-        found, poses, alone, _ = pair(names, times_in_names(names), track, tolerance=near)
-        refused |= alone
-        self._corners = {names[k]: self._corners[names[k]] for k in found}
-        return dict(zip(self._corners, poses, strict=True))
-
-    def _stand(
-        self, views: Sequence[BoardView], poses: Mapping[str, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the poses of the tool, the hand-eye transform, and where the board stands.
-
-        Shapes (N, 4, 4), (4, 4) and (4,): the plane (n, d), n . x + d = 0 in the world.
-
-        As for walls without a board: which way round a symmetric board is seen does not matter.
+        It is found as walls without a board: which way round a symmetric one is seen does not
+        matter. Without a robot all views are at the identity, and there is no wall.
 
         Raises:
             CalibrationDataError: No hand-eye transform puts the boards of all views onto one plane.
         """
-        names, rays = [view.reported["view"] for view in views], torch.from_numpy(self._rays)
-        tool, planes = np.stack([poses[name] for name in names]), []
+        file, names = self._options.poses, [view.reported["view"] for view in views]
+        if file is None:
+            return views, np.stack([np.eye(4)] * len(views)), None
+        track, near = read_poses(file), PosedOptions().pose_tolerance_s
+        kept, tool, alone, _ = pair(names, times_in_names(names), track, tolerance=near)
+        refused |= alone
+        views, rays, planes = [views[k] for k in kept], torch.from_numpy(self._rays), []
         for view in views:
-            normal, offset = view.pose.plane()
-            area = torch.from_numpy(self._area(view.pose))
-            planes.append([described(rays, area, torch.from_numpy(-normal / offset))])
-        origin = str(self._options.poses)
-        found = walls_of_planes(planes, names, rays[..., 0].numel(), tool, WallOptions(), origin)
-        return tool, found.tool_from_camera, found.walls[0]
+            area, gradient = self._area(view.pose), -np.divide(*view.pose.plane())
+            planes.append([described(rays, torch.from_numpy(area), torch.from_numpy(gradient))])
+        names = [view.reported["view"] for view in views]
+        options, pixels = WallOptions(), rays[..., 0].numel()
+        return views, tool, walls_of_planes(planes, names, pixels, tool, options, str(file))
 
     def _read(self, view: str) -> DepthImage:
         return of_size(read_depth(self._files[view], self._coding), self._camera)
@@ -318,21 +303,19 @@ class BoardImport:
         return BoardView(pose, float(np.median(measured / true)), columns @ columns.T, reported)
 
     def _frames(
-        self, views: Sequence[BoardView], stand: tuple[np.ndarray, ...] | None
+        self, views: Sequence[BoardView], tool: np.ndarray, wall: FoundWalls | None
     ) -> Iterator[Frame]:
         for index, view in enumerate(views):
-            normal, offset = view.pose.plane()
+            # A wall that is found is a start for the fit: its covariance is not known.
+            plane = np.append(*view.pose.plane()) if wall is None else wall.walls[0]
             row = FrameRow(
                 timestamp=float(index),  # The files do not say when an image was taken.
-                world_from_tool=np.eye(4),
-                normal_world=normal,
-                offset=offset,
+                world_from_tool=tool[index],
+                normal_world=plane[:3],
+                offset=float(plane[3]),
                 target=self._board.kind,
-                plane_covariance=view.pose.plane_covariance,
+                plane_covariance=None if wall else view.pose.plane_covariance,
             )
-            if stand is not None:  # One plane, of no known covariance: a start for the fit.
-                row = replace(row, world_from_tool=stand[0][index], plane_covariance=None)
-                row = replace(row, normal_world=stand[2][:3], offset=float(stand[2][3]))
             depth, amplitude = self._read(view.reported["view"])
             yield row, depth, amplitude, self._area(view.pose)
 
