@@ -1,5 +1,6 @@
 """The correction as an `nn.Module`: error terms, residual network and hand-eye as parameters."""
 
+# Long: one class, whose public methods have the docstrings of the API page.
 import copy
 import math
 import zipfile
