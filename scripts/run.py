@@ -19,6 +19,7 @@ import click
 import yaml
 
 from tofcorr.cli.main import group, set_up_threads
+from tofcorr.diagnosis.report.words import axis_label
 from tofcorr.errors import TofcorrError
 
 FIRST_CAMERA = """
@@ -96,7 +97,9 @@ def findings(out: Path) -> Iterator[str]:
     remain = f"{calibrated:.1f} mm of it remain after calibration"
     yield f"Camera 2 and its simulator differ by {as_given:.1f} mm; {remain}."
     where = diagnosis["where"][0]
-    along = f"{where['covariate']} from {where['from']:g} to {where['to']:g}"
+    name, *unit = axis_label(where["covariate"]).rsplit(", ", 1)
+    ends = f"{where['from']:g} to {where['to']:g}"
+    along = " ".join([name, "from", ends, *unit])
     yield f"Where: along {along} it changes by {where['bias_mm']:.1f} mm."
     effects = ", ".join(diagnosis["effects"]) or "no effect that it knows"
     yield f"Which: {effects} is missing, of probability {diagnosis['probability']:.2f}."

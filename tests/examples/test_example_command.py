@@ -50,7 +50,7 @@ def test_the_command_printed_with_an_example_makes_a_recording_with_nothing_odd(
     assert program(*shlex.split(following)[1:]).code == 0
     recording = tmp_path / shlex.split(following)[-1]
     assert tofcorr.inspect(recording).findings == ()
-    if name in ("bag", "images"):
+    if name in ("bag", "images", "board"):
         start = tofcorr.Recording.open(recording).tool_from_camera
         assert (apart(start, truth(tmp_path / name)) < (15, 1.5)).all()
     assert sum(map(len, content(tmp_path / name).values())) < 4e6

@@ -84,6 +84,7 @@ class Drive:
         move: Seconds of a move.
         tool_from_camera: The hand-eye transform.
         distortion: Of the lens.
+        one_wall: Whether all views look straight at the front wall, instead of around the room.
     """
 
     stops: int = 40
@@ -98,12 +99,15 @@ class Drive:
     move: float = 0.7
     tool_from_camera: np.ndarray = field(default_factory=HAND_EYE.copy)
     distortion: tuple[float, ...] = DISTORTION
+    one_wall: bool = False
 
     def record(self) -> Recorded:
         """Drive, and record."""
         generator = np.random.default_rng(self.seed)
         hand_eye = self.tool_from_camera
-        camera_poses = np.stack([_looking_at_walls(generator) for _ in range(self.stops)])
+        camera_poses = np.stack(
+            [_looking_at_walls(generator, self.one_wall) for _ in range(self.stops)]
+        )
         tool_poses = camera_poses @ np.linalg.inv(hand_eye)
         end = self.stops * (self.dwell + self.move) - self.move
         start = 1000.0
@@ -197,10 +201,12 @@ def systematic_error(
     return of_distance + of_pixel + slope * amplitude
 
 
-def _looking_at_walls(generator: np.random.Generator) -> np.ndarray:
-    """Draw a camera pose near the middle of the room that looks at walls or floor."""
+def _looking_at_walls(generator: np.random.Generator, one_wall: bool) -> np.ndarray:
+    """Draw a camera pose near the middle of the room that looks at walls or floor, or at one."""
     place = np.array([0.6, 0.6, 0.9]) + generator.uniform(-0.4, 0.4, 3)
     at = generator.uniform([0.8, -0.6, -0.1], [2.0, 2.2, 1.0])
+    if one_wall:  # Tilted by less than 35 degrees.
+        at = place + np.array([1.0, *generator.uniform(-0.5, 0.5, 2)])
     return looking(place, at, generator.uniform(-np.pi, np.pi))
 
 

@@ -143,7 +143,7 @@ def test_an_odd_frame_is_named(wall: Dataset) -> None:
     bent = depth[0] + 0.3 * (np.arange(depth.shape[2]) > depth.shape[2] / 2)
     assert "shows no plane" in odd(bent.astype(np.float32), pose, 1e3)[0]
     off = pose.copy()
-    off[:3, 3] += 0.1 * row.normal_world
+    off[:3, 3] += 0.4 * row.normal_world
     assert "disagrees" in odd(depth[0], off, 1e3)[0]
     late = wall.first.frames.timestamp[19] + 0.1
     assert "while the robot moved" in odd(depth[0], pose, late)[0]

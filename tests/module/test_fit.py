@@ -11,6 +11,7 @@ from module.modules import CAMERA
 from optional import present
 from simulated_walls import simulated_wall
 
+from tofcorr import load_corrector
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
 from tofcorr.module.depth_correction import DepthCorrection
@@ -171,3 +172,22 @@ def test_a_hand_eye_that_was_not_estimated_stays_so_through_file_and_state(
         with pytest.raises(ConfigError, match="needs an estimated hand-eye transform"):
             one.export("urdf", tmp_path / "camera.xacro")
     assert not loaded.hand_eye.twist.requires_grad
+
+
+def test_where_torch_has_no_torchscript_a_training_writes_all_else_and_says_so(
+    wall: Recording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.delattr(torch.jit, "script")
+    train(
+        wall,
+        resolve_options(TrainingOptions, "ea", ["advice=0", "figures=false"]),
+        out=tmp_path / "run",
+    )
+    assert not (tmp_path / "run" / "corrector.ts").exists()
+    assert "corrector.ts was not written" in caplog.text
+    corrected, valid = load_corrector(tmp_path / "run")(*some(wall))
+    assert bool(valid.any())
+    assert bool(corrected[valid].isfinite().all())

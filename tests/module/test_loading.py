@@ -126,6 +126,19 @@ def test_every_format_refuses_alike(what: str, name: str, folder: Path, frames: 
 
 
 @pytest.mark.skipif(WITHOUT_ONNX, reason="the extra tofcorr[onnx] is not installed")
+def test_an_onnx_file_corrects_as_the_run_does(
+    tmp_path: Path, folder: Path, frames: Frames
+) -> None:
+    write("onnx", calibration(), tmp_path / "model.onnx")
+    found, expected = (tofcorr.load_corrector(one) for one in (tmp_path / "model.onnx", folder))
+    for given in (frames, tuple(one[0] for one in frames)):
+        depth, valid = found(*given)
+        torch.testing.assert_close(depth, expected(*given)[0], rtol=0, atol=1e-6, equal_nan=True)
+        assert torch.equal(valid, expected(*given)[1])
+    assert isinstance(found(*(one.numpy() for one in frames))[0], np.ndarray)
+
+
+@pytest.mark.skipif(WITHOUT_ONNX, reason="the extra tofcorr[onnx] is not installed")
 def test_a_damaged_onnx_file_is_refused_in_words(tmp_path: Path) -> None:
     (tmp_path / "model.onnx").write_bytes(b"no model at all")
     with pytest.raises(CalibrationDataError, match=r"model\.onnx: is not an ONNX file"):

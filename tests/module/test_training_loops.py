@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from kinds_of_terms import KINDS
@@ -116,10 +117,38 @@ def test_the_correction_of_a_crop_is_the_crop_of_the_correction(kind: str, depth
     assert [id(one) for one in part.parameters()] == [id(one) for one in module.parameters()]
     rays = ray_directions(part.camera)
     torch.testing.assert_close(part.geometry.ray_directions, rays, rtol=0, atol=1e-12)
-    with pytest.raises(ConfigError, match="this module is a crop, and shares its parameters"):
+    with pytest.raises(ConfigError, match="is a crop or resized, and shares its parameters"):
         part.to_state()
     with pytest.raises(FrameError, match="a crop of rows 4 to 5, columns 0 to 6: the image has 5"):
         module.crop(4, 0, 2, 7)
+
+
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_module_enlarged_and_binned_is_the_module(kind: str, depth_kind: Any) -> None:
+    module = module_of(kind, depth_kind=depth_kind)
+    again, frame = module.resize(10, 14).bin(2), frames()
+    assert again.camera.matrix == pytest.approx(np.array(module.camera.matrix))
+    torch.testing.assert_close(again(*frame), module(*frame), rtol=0, atol=1e-9)
+    assert [id(one) for one in again.parameters()] == [id(one) for one in module.parameters()]
+    # A bin of a crop is the crop of a bin.
+    first, second = module.crop(2, 2, 2, 4).bin(2), module.bin(2).crop(1, 1, 1, 2)
+    part = [one[..., :1, :2] for one in frame]
+    torch.testing.assert_close(first(*part), second(*part), rtol=0, atol=1e-9)
+    rays = ray_directions(module.camera.bin(2))
+    torch.testing.assert_close(module.bin(2).geometry.ray_directions, rays, rtol=0, atol=1e-12)
+
+
+def test_the_error_of_a_binned_pixel_lies_between_those_of_its_pixels() -> None:
+    module, flat = module_of("pixel_polynomial"), torch.full((5, 7), 1.3)
+    error = module.error(flat, flat)
+    mean = torch.nn.functional.avg_pool2d(error[None], 2)[0]
+    found = module.bin(2).error(flat[:2, :3], flat[:2, :3])
+    # A quadratic is a quarter of its curvature less at the centre of two pixels than their mean.
+    bend = (
+        module.error(flat, flat).diff(n=2, dim=0)[0, 0] + module.error(flat, flat).diff(n=2)[0, 0]
+    )
+    torch.testing.assert_close(found, mean - bend / 8, rtol=0, atol=1e-7)
 
 
 def test_pixels_of_a_binned_camera_look_between_those_of_the_camera() -> None:

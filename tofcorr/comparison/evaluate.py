@@ -48,12 +48,11 @@ class EvaluationResult:
 
     def __repr__(self) -> str:
         """Return the best model, the held-out error of each, and a warning: 11 lines at most."""
-        columns = {k: [own[k] for own in self._errors.values()] for k in self.options.columns}
-        first, *_ = ordered = sorted(columns, key=lambda k: sum(one.mean for one in columns[k]))
-        both = zip(self._errors, columns[first], strict=True)
-        sizes = ", ".join(f"{own.mean:.2f} mm on {name}" for name, own in both)
+        sets = self._errors.items()
+        first, *_ = ordered = list(next(iter(self._errors.values())))
+        sizes = ", ".join(f"{own[first].mean:.2f} mm on {name}" for name, own in sets)
         verdict = f"{first} predicts held-out images best: off by {sizes}."
-        rows = [[column, *map(_interval, columns[column])] for column in ordered]
+        rows = [[name, *(_interval(own[name]) for _, own in sets)] for name in ordered]
         heads = ["mean absolute error, mm", *self._errors]
         table = at_most(6, aligned([heads, *rows]))
         said = [*self.headlines, *(f"Warning: {text}" for text in self.warnings)]
@@ -145,12 +144,14 @@ class EvaluationResult:
 
     @cached_property
     def _errors(self) -> dict[str, dict[str, Estimate]]:
-        """Held-out mean absolute errors by set and column."""
-        protocol, columns = "folds" if self.options.folds else "half", self.options.columns
-        return {
-            one.name: {k: one.estimate(protocol, "mean_abs_mm", k) for k in columns}
-            for one in self.sets
+        """Held-out mean absolute errors by set and column, the least of all sets first."""
+        protocol = "folds" if self.options.folds else "half"
+        found = {
+            k: [one.estimate(protocol, "mean_abs_mm", k) for one in self.sets]
+            for k in self.options.columns
         }
+        ordered = sorted(found, key=lambda k: sum(one.mean for one in found[k]))
+        return {one.name: {k: found[k][i] for k in ordered} for i, one in enumerate(self.sets)}
 
     def _best(self, name: str) -> str:
         """Return the model of the smallest error on a set."""

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import TYPE_CHECKING
 
-from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
 from tofcorr.comparison.statistics import Estimate, Table
 from tofcorr.pages.page import page_text
 
@@ -22,15 +21,14 @@ def held_out_figure(
         label: What the errors are.
         best: The model to be marked in each panel; none where it is empty.
     """
-    from tofcorr.pages.drawing import BLUE, GREY, RED, panels, plain_numbers
+    from tofcorr.pages.drawing import BLUE, STAGES, panels, plain_numbers
 
     names = list(next(iter(groups.values())))
     figure, found = panels(len(groups) * (1 + len(names) / 4), len(groups))
-    colours = {BEFORE: RED, HAND_EYE_ONLY: GREY}
     for number, (axes, (title, errors)) in enumerate(zip(found, groups.items(), strict=True)):
         for place, (name, one) in enumerate(errors.items()):
             marked = list(best[number : number + 1]) == [name]
-            look = {"color": colours.get(name, BLUE), "fmt": "D" if marked else "o", "capsize": 3}
+            look = {"color": STAGES.get(name, BLUE), "fmt": "D" if marked else "o", "capsize": 3}
             reach = one.half_width if isfinite(one.half_width) else 0.0
             # On a logarithmic axis an interval that reaches zero ends near it.
             ends = [[min(reach, one.mean * (1 - 1 / 50))], [reach]]

@@ -81,19 +81,24 @@ class SelectionResult:
     def __repr__(self) -> str:
         """Return the choice, the best models' held-out errors, and a warning: 11 lines at most."""
         rankings, decisive = self.rankings.values(), self.decisive
-        ordered = sorted(decisive.errors, key=lambda name: decisive.errors[name].mean)
         rows = [
             [name, str(decisive.complexity[name])]
             + [
                 f"{one.errors[name].mean:.2f} ± {one.errors[name].standard_error:.2f}"
                 for one in rankings
             ]
-            for name in ordered
+            for name in self._ordered
         ]
         heads = [f"{by}s held out, mm" for by in self.rankings]
         table = at_most(6, aligned([["model", "unknowns", *heads], *rows]))
         doubtful = [self.headline] if self.headline else []
         return "\n".join([self.verdict, *doubtful, *table, *at_most(2, self._warnings)])
+
+    @property
+    def _ordered(self) -> list[str]:
+        """The models, the one with the smallest decisive error first, as text and picture do."""
+        errors = self.decisive.errors
+        return sorted(errors, key=lambda name: errors[name].mean)
 
     @property
     def details(self) -> str:
@@ -113,7 +118,7 @@ class SelectionResult:
         """Return the same as one HTML page with a picture."""
         metric = _METRICS[self.options.metric]
         ordered = {
-            f"{by}s held out": dict(sorted(ranking.errors.items(), key=lambda item: item[1].mean))
+            f"{by}s held out": {name: ranking.errors[name] for name in self._ordered}
             for by, ranking in self.rankings.items()
         }
         best = [ranking.best for ranking in self.rankings.values()]
@@ -129,7 +134,7 @@ class SelectionResult:
     def tables(self) -> list[Table]:
         """Return a table for each grouping, the model with the smallest error first."""
         metric = _METRICS[self.options.metric]
-        found, header = [], ["model", "unknowns", "error", "behind the best", ""]
+        found, header = [], ["model", "unknowns", "error", "behind the best", "verdict"]
         for by, ranking in self.rankings.items():
             ordered = sorted(ranking.errors.items(), key=lambda item: item[1].mean)
             rows = [self._row(ranking, name) for name, _ in ordered]

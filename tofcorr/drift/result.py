@@ -58,7 +58,7 @@ class DriftResult:
         """Return the verdict and its numbers in a few sentences."""
         return "\n".join(self._sentences())
 
-    def _sentences(self) -> list[str]:
+    def _sentences(self, *, table: bool = True) -> list[str]:
         interval = 1e3 * self.interval[0], 1e3 * self.interval[1]
         offset = known(1e3 * self.offset, interval, most=2, sign="+")
         low, high = known_interval(interval, most=2, sign="+")
@@ -78,7 +78,7 @@ class DriftResult:
         lines = [
             _VERDICTS[self.verdict],
             self.headline,
-            *aligned(found),
+            *(aligned(found) if table else ()),
             self.unused and f"Not used, with too few usable pixels: {in_words(self.unused)}.",
             # Some are expected: the ranges are the central 99.8 % of the training pixels.
             self.outside > 1 / 10
@@ -122,7 +122,8 @@ class DriftResult:
         """
         from tofcorr.pages.page import page_text
 
-        verdict, *others = self._sentences()
+        # The page has the numbers of the table in boxes.
+        verdict, *others = self._sentences(table=False)
         values = {"run": run, "recordings": recordings, "headline_said": verdict}
         values |= {"others": others, **self.to_mapping()}
         figures, filters = {"drift": self.plot()}, {"mm": in_mm}

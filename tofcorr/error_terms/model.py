@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from pydantic import model_validator
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
 
 from tofcorr.error_terms.base import (
     EVERYTHING,
@@ -107,18 +108,36 @@ class ErrorModel(DescribedModule):
         self.residual: ResidualNetwork | None = None
         self.height: int = domain.height
         self.width: int = domain.width
-        self.origin: tuple[int, int] = (0, 0)
+        # Where row and column 0 lie in the image of the terms, and the size of a pixel there.
+        self.origin: tuple[float, ...] = (0, 0)
+        self.step: tuple[float, ...] = (1, 1)
         self.is_part: bool = False
 
-    def cropped(self, top: int, left: int, height: int, width: int) -> "ErrorModel":
-        """Return the model of a part of the image; it shares the parameters with this one."""
-        part = copy.copy(self)
+    def part(
+        self, top: int, left: int, height: int, width: int, size: tuple[int, int]
+    ) -> "ErrorModel":
+        """Return the model of a part of the image; it shares the parameters with this one.
+
+        Args:
+            top: First row.
+            left: First column.
+            height: Number of rows.
+            width: Number of columns.
+            size: Rows and columns to which the part is resized, its outer edges kept. A fixed
+                pattern is averaged over each new pixel.
+        """
+        part, steps = copy.copy(self), (height / size[0], width / size[1])
         part._modules = dict(self._modules)
-        part.height, part.width, part.is_part = height, width, True
-        part.origin = self.origin[0] + top, self.origin[1] + left
+        (part.height, part.width), part.is_part = size, True
+        own = list(zip(self.origin, self.step, (top, left), steps, strict=True))
+        # Pixel centres are integers, as in `CameraIntrinsics.resize`.
+        part.origin = tuple(o + s * (first + (step - 1) / 2) for o, s, first, step in own)
+        part.step = tuple(s * step for _, s, _, step in own)
         if self.fixed_pattern is not None:
             part.fixed_pattern = copy.copy(self.fixed_pattern)
             offset = self.fixed_pattern.offset[top : top + height, left : left + width]
+            if size != (height, width):
+                offset = interpolate(offset[None, None], size, mode="area")[0, 0]
             part.fixed_pattern._buffers = {"offset": offset}
         return part
 
@@ -176,8 +195,8 @@ class ErrorModel(DescribedModule):
 
     def pixel_grid(self) -> tuple[Tensor, Tensor]:
         """Return rows (H, 1) and columns (1, W) in pixels."""
-        sizes = zip(self.origin, (self.height, self.width), strict=True)
-        rows, columns = (torch.arange(o, o + size).to(self.constant) for o, size in sizes)
+        axes = zip(self.origin, self.step, (self.height, self.width), strict=True)
+        rows, columns = (o + step * torch.arange(size).to(self.constant) for o, step, size in axes)
         return rows[:, None], columns[None, :]
 
     def pixel_error(self) -> Tensor:

@@ -36,7 +36,7 @@ EXAMPLES = {
         "16-bit PNG images of a checkerboard, the poses of the robot, and the intrinsics.",
         "tofcorr import checkerboard {out} --depth 'depth/{{view}}.png' "
         "--infrared 'ir/{{view}}.png' --board 5x7 --square-mm 40 "
-        "--intrinsics {out}/camera.yaml --out wall",
+        "--poses {out}/poses.txt --intrinsics {out}/camera.yaml --out wall",
     ),
     "distances": Example(
         "Distances of a sensor of one ray and of one of 8 x 8 zones, before two walls.",

@@ -19,6 +19,7 @@ import torch
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.moments import Parameters
 from tofcorr.geometry import se3
 from tofcorr.importing.images import DepthImage
 from tofcorr.importing.pose_track import nearest
@@ -26,7 +27,7 @@ from tofcorr.importing.robot_images import ImagesOfPlanes, PosedOptions, RobotIm
 from tofcorr.importing.run import Frame, PreparedImport, Refused, Sieve, camera_mapping, run_import
 from tofcorr.importing.timing import Lag, estimate_lag, far_lags, find_stops, pair, refine_lag
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
-from tofcorr.importing.walls.hand_eye import distances, exact
+from tofcorr.importing.walls.hand_eye import distances
 from tofcorr.importing.walls.image_planes import ImagePlane, plane_masks, seen_planes
 from tofcorr.plausibility.finding import CAMERA, FAR_OFF
 from tofcorr.plausibility.mistakes import FAR_BETTER, IN_IMAGES, IN_POSES
@@ -311,13 +312,15 @@ class PosedImport:
         if sum(map(len, planes)) < 10:
             return lag
         times, walls = self._times[some], torch.from_numpy(found.walls)
-        hand_eye = exact(torch.from_numpy(found.tool_from_camera))
+        # With the error found at stops: else a constant, before one wall, would look like a lag.
+        hand_eye, error = torch.from_numpy(found.tool_from_camera), torch.from_numpy(found.error)
+        fitted = Parameters(hand_eye, error)
         seen = seen_planes(planes, torch.from_numpy(self._track.at(times)), 1)
 
         def losses(late: float) -> np.ndarray:
             pose = torch.from_numpy(self._track.at(times - late))
             moved = replace(seen, world_from_tool=pose[seen.image])
-            off = distances(*moved.in_world(hand_eye), walls).min(dim=1).values
+            off = distances(*moved.in_world(fitted), walls).min(dim=1).values
             # In units of 10 mm: the error of a camera that is not calibrated yet. A tool at 1 m/s
             # is off by 0.1 m after 0.1 s of lag: what is farther is on no wall.
             return (100 * off.clamp(max=1 / 10)).square().log1p().numpy()

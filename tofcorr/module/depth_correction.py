@@ -1,5 +1,6 @@
 """The correction as an `nn.Module`: error terms, residual network and hand-eye as parameters."""
 
+# Long: one class, whose public methods have the docstrings of the API page.
 import copy
 import math
 import zipfile
@@ -14,7 +15,13 @@ from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
-from tofcorr.correction.model import CalibrationModel, FrameCorrection, HandEye, required_amplitude
+from tofcorr.correction.model import (
+    CalibrationModel,
+    CameraGeometry,
+    FrameCorrection,
+    HandEye,
+    required_amplitude,
+)
 from tofcorr.correction.state import (
     STATE_FILE,
     CalibrationExtras,
@@ -254,12 +261,41 @@ class DepthCorrection(FrameCorrection):
         Raises:
             FrameError: The part is not inside the image.
         """
-        part = copy.copy(self)
+        return self._part(top, left, height, width)
+
+    def resize(self, height: int, width: int) -> Self:
+        """Return the module for the image resized, its outer edges kept.
+
+        Each new pixel has the error of the place where its centre lies; a fixed pattern is averaged
+        over it. All parameters are shared, as with `crop`. After `fit` resize anew.
+
+        Args:
+            height: Number of rows.
+            width: Number of columns.
+        """
+        return self._part(0, 0, self.camera.height, self.camera.width, (height, width))
+
+    def bin(self, number: int) -> Self:
+        """Return the module for the means of squares of `number` x `number` pixels, see `resize`.
+
+        What the last rows and columns lack of a square is cut off.
+        """
+        height, width = self.camera.height // number, self.camera.width // number
+        return self._part(0, 0, number * height, number * width, (height, width))
+
+    def _part(
+        self, top: int, left: int, height: int, width: int, size: tuple[int, int] | None = None
+    ) -> Self:
+        part, window = copy.copy(self), (top, left, height, width)
         part._modules = dict(self._modules)
-        part.camera = self.camera.crop(top, left, height, width)
-        part.domain = replace(self.domain, height=height, width=width)
-        part.error_model = self.error_model.cropped(top, left, height, width)
+        part.camera = self.camera.crop(*window)
         part.geometry = self.geometry.cropped(top, left, part.camera)
+        if size is not None:
+            part.camera = part.camera.resize(*size)
+            part.geometry = CameraGeometry(part.camera, self.depth_kind).to(self.geometry.matrix)
+        size = part.camera.height, part.camera.width
+        part.domain = replace(self.domain, height=size[0], width=size[1])
+        part.error_model = self.error_model.part(*window, size)
         return part
 
     def batches(
@@ -396,7 +432,7 @@ class DepthCorrection(FrameCorrection):
         """Return the module as a calibration, which exporters read.
 
         Raises:
-            ConfigError: It is a crop of another module.
+            ConfigError: It is another module, cropped or resized.
         """
         self._refuse_crop()
         return CalibrationState.of(
@@ -410,8 +446,10 @@ class DepthCorrection(FrameCorrection):
 
     def _refuse_crop(self) -> None:
         if self.error_model.is_part:
-            advice = "fit, save and export the module that it was cropped from"
-            raise ConfigError(f"this module is a crop, and shares its parameters: {advice}.")
+            advice = "fit, save and export the module that it was made from"
+            raise ConfigError(
+                f"this module is a crop or resized, and shares its parameters: {advice}."
+            )
 
     def labels(self) -> Labels:
         """Return what the module says of itself besides its numbers."""

@@ -18,6 +18,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 BLUE, RED, GREY = "#08519c", "#e34a33", "#777777"
 """The simulator, or what is corrected or explained; the recording, or an error or gap as it is
 without; what is neither. From ColorBrewer (Blues, OrRd): in grey, blue is darker than red."""
+STAGES = {"before": RED, "hand-eye only": GREY}
+"""Colours of what was not corrected, by the words for it; all else is blue."""
 PALE, LIGHT, TINT = "#6baed6", "#bbbbbb", "#f3e9e9"
 """A step towards what is blue; what is left or not used; no data."""
 SIGNED = "PuOr_r"

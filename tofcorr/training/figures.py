@@ -73,13 +73,6 @@ def frames_to_show(calibration: Calibration) -> np.ndarray:
     return thinned(errors.frames[used][order], 5)
 
 
-def stage_colour(stage: str) -> str:
-    """Return the colour of a stage of `error_mm` in every picture."""
-    from tofcorr.pages.drawing import BLUE, GREY, RED
-
-    return {"before": RED, "hand_eye_only": GREY}.get(stage, BLUE)
-
-
 def profile_figure(
     sample: PixelSample, covariates: Sequence[str], held_out: np.ndarray
 ) -> "Figure":
@@ -93,7 +86,7 @@ def profile_figure(
         covariates: Some of its covariates.
         held_out: Global numbers of the frames held out; may be empty.
     """
-    from tofcorr.pages.drawing import BLUE, GREY, PALE, line_across, panels
+    from tofcorr.pages.drawing import BLUE, GREY, PALE, STAGES, line_across, panels
 
     count, last = len(covariates), list(sample.errors_mm.values())[-1]
     figure, found = panels(5, 3, count, same_rows=True, shares=(3, 3, 1))
@@ -105,7 +98,8 @@ def profile_figure(
         x = sample.covariates[covariate]
         ends = without_strays(x)
         for stage, error in sample.errors_mm.items():
-            draw_profile(above, x, error, ends, stage_colour(stage), stage_words(stage))
+            words = stage_words(stage)
+            draw_profile(above, x, error, ends, STAGES.get(words, BLUE), words)
         for chosen, colour, label in halves:
             if chosen.any():
                 draw_profile(middle, x[chosen], last[chosen], ends, colour, label)
@@ -147,7 +141,7 @@ def draw_profile(
 
 def image_figure(sample: PixelSample, shape: tuple[int, int]) -> "Figure":
     """Draw the mean error over the image (H, W) at each stage, each on a scale of its own."""
-    from tofcorr.pages.drawing import SIGNED, image_map, panels
+    from tofcorr.pages.drawing import BLUE, SIGNED, STAGES, image_map, panels
 
     figure, found = panels(2, 1, len(sample.errors_mm))
     row, column = (sample.covariates[f"{name} [pixel]"] for name in ("row", "column"))
@@ -156,7 +150,8 @@ def image_figure(sample: PixelSample, shape: tuple[int, int]) -> "Figure":
         tiles = tile_means(pixel, error, shape)
         limit = float(np.nanmax(np.abs(tiles), initial=0.0)) or 1.0
         image_map(axes, tiles, "mean error, mm", (-limit, limit), SIGNED)
-        axes.set_title(stage_words(stage), fontsize=9, color=stage_colour(stage))
+        words = stage_words(stage)
+        axes.set_title(words, fontsize=9, color=STAGES.get(words, BLUE))
     return figure
 
 

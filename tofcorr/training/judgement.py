@@ -208,15 +208,14 @@ def _of_errors(fit: Fit, errors: Mapping[str, Any], look: Look) -> Iterator[tupl
 
 
 def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
-    """Yield what a fit lacks, and in what it is uncertain: the three weakest directions by name."""
+    """Yield what a fit lacks, and in what it is uncertain: the weakest direction by name."""
     solution, free = fit.solution, _is_free(fit)
     if fit.misfit is not None:
         yield "usable" if max(fit.misfit.size) > _WEAK else "good", fit.misfit.lacking()
     if not solution.converged and solution.stopped != "not_finite":
         yield "usable", solution.message
     if free and max(fit.hand_eye_errors) > _WEAK:
-        loose = f"The hand-eye is known to {_known(fit)} only"
-        yield "usable", f"{loose}: record more tilts and distances."
+        yield "usable", "The hand-eye is known too roughly: record more tilts and distances."
     wide, of_pose = 1e3 * PRIOR_SIGMA, "usable" if free else "good"
     curves = {"c0", *(symbol for term, _ in fit.model.error.penalised() for symbol in term.symbols)}
     weak = [one for one in fit.directions if one.sigma > _WEAK and not fit.is_unseen(one)]
@@ -229,9 +228,9 @@ def _of_directions(fit: Fit) -> Iterator[tuple[Verdict, str]]:
     if hidden := [one.in_words() for one in fit.directions if fit.is_unseen(one)]:
         yield "good", f"From no pose does one ray show {'; '.join(hidden)}: {held}."
     if uncertain := [one for one in others if not one.is_undetermined]:
-        words = "; ".join(f"{1e3 * one.sigma:.1f} of {one.in_words()}" for one in uncertain[:3])
-        count = f"{len(uncertain)} standard errors above {1e3 * _WEAK:g} mm (or mrad)"
-        yield "good", f"{count}: {words}."
+        worst = f"the largest is {1e3 * uncertain[0].sigma:.1f}, of {uncertain[0].in_words()}"
+        count = f"{len(uncertain)} standard errors are above {1e3 * _WEAK:g} mm (or mrad)"
+        yield "good", f"{count}; {worst}."
     if of_curves:
         size = f"their standard deviations reach {1e3 * max(of_curves):.0f} mm"
         yield "good", f"Parts of the curves are set by the smoothing penalty, not by data: {size}."
@@ -328,7 +327,7 @@ def advice_words(advice: Mapping[str, Any]) -> tuple[str, list[str]]:
     poses = []
     for pose in advice["poses"]:
         lower = 1 - pose["worst_sigma_mm_or_mrad"] / advice["worst_sigma_mm_or_mrad"]
-        poses.append(f"{_POSE.format(**pose)}: uncertainty falls by {100 * lower:.0f} %")
+        poses.append(f"{_POSE.format(**pose)}: largest standard error {100 * lower:.0f} % lower")
     return f"Least well known: the {mixed}, to {advice['sigma_mm_or_mrad']:.1f} mm at 1 m.", poses
 
 

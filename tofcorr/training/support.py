@@ -84,7 +84,7 @@ def shortcomings(
         roll = support.roll_deg or 0.0
         # More makes up for tilt about one axis only.
         hint = "" if roll > 10 else f" and hardly rolled ({roll:.1f} degrees)"
-        needed = f"(standard deviation {strong:.1f} and {weak:.1f} degrees, {_ENOUGH_TILT} needed)"
+        needed = f"(standard deviation about the other {weak:.1f} degrees, {_ENOUGH_TILT} needed)"
         yield False, f"The camera is tilted about one axis only {needed}{hint}: tilt or roll it."
     low, high = support.distance_m
     # Below half of its centre the distance term can hardly be separated from the constant.

@@ -1,5 +1,6 @@
 """Depth images and robot poses in files, of all formats, become one recording."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 from cameras import apart
 from importing import scene_files
 from importing.frames.imported import Imported, assert_equal_recordings, import_png, import_written
-from importing.posed_scene import Recorded
+from importing.posed_scene import FRONT, Drive, Recorded, unit_rays
 from optional import present
 
 from tofcorr.examples import files
@@ -70,6 +71,35 @@ def test_a_late_image_clock_is_found_within_10_ms_and_named(
     assert abs(imported.report["lag"]["seconds"] - late) < 0.010
     assert_start_is_near(imported, drive)
     assert ("late" if late > 0 else "early") in imported.text
+
+
+@pytest.fixture(scope="module")
+def before_one_wall() -> Recorded:
+    """A drive before a single wall, by a camera that reads 40 mm too far."""
+    recorded = Drive(planes=(FRONT,), stops=20, one_wall=True).record()
+    height, width = recorded.depth_mm.shape[1:]
+    far = 40 * unit_rays(recorded.matrix, width, height, recorded.distortion)[..., 2]
+    depth = np.where(recorded.depth_mm > 0, recorded.depth_mm + np.round(far), 0)
+    return replace(recorded, depth_mm=depth.astype(np.uint16))
+
+
+@pytest.mark.parametrize("late", [0.0, 0.03])
+def test_of_a_constant_error_before_one_wall_and_a_late_clock_only_the_clock_is_named(
+    before_one_wall: Recorded, tmp_path: Path, late: float
+) -> None:
+    # The constant looked like a clock that is 35 ms late.
+    imported = import_png(before_one_wall.stamped_late(late), tmp_path)
+    assert abs(imported.report["lag"]["seconds"] - late) < 0.005
+    assert ("are stamped" in imported.text) == (late > 0)
+
+
+def test_a_robot_that_stands_still_in_every_image_tells_no_lag(
+    before_one_wall: Recorded, tmp_path: Path
+) -> None:
+    at_stops = before_one_wall.take(before_one_wall.stop >= 0)
+    imported = import_png(at_stops, tmp_path)
+    assert imported.done.num_frames > 0
+    assert "are stamped" not in imported.text
 
 
 @pytest.mark.slow

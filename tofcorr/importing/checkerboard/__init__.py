@@ -24,6 +24,7 @@ _BOARD = (
     "Inner corners (not squares), such as 5x7; or charuco:5x7:4X4_50:0.75 (squares, markers, their "
     "share of a square), or apriltag:6x6:APRILTAG_36H11:0.3 (tags, family, spacing)."
 )
+_POSES = "Poses of the tool that carries the camera before a board that stands still."
 _FULL = "Infrared counts from which a pixel is saturated and not used."
 _MARGIN = "How far the mask extends beyond the outermost inner corners; 1: edge of the squares."
 
@@ -36,6 +37,7 @@ _MARGIN = "How far the mask extends beyond the outermost inner corners; 1: edge 
 @option("--board", _BOARD, required=True, metavar="BOARD")
 @option("--square-mm", "Side of a square or tag, mm.", required=True, type=float)
 @option("--depth-unit-mm", "Millimetres per count; 0 counts mean no return.", default=1.0)
+@option("--poses", _POSES, type=click.Path(path_type=Path))
 @depth_kind_option
 @intrinsics_options
 @option("--saturation", _FULL, "saturation_counts", default=65535.0)

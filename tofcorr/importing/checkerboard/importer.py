@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import torch
 from pydantic import Field
 
 from tofcorr.data.recording import DepthKind
@@ -36,9 +37,12 @@ from tofcorr.importing.images import (
     of_size,
     read_depth,
     read_grey,
+    times_in_names,
     turned,
 )
 from tofcorr.importing.intrinsics import GivenIntrinsics
+from tofcorr.importing.pose_files import read_poses
+from tofcorr.importing.robot_images import PosedOptions
 from tofcorr.importing.run import (
     Frame,
     PreparedImport,
@@ -48,6 +52,9 @@ from tofcorr.importing.run import (
     camera_mapping,
     run_import,
 )
+from tofcorr.importing.timing import pair
+from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
+from tofcorr.importing.walls.image_planes import WallOptions, described
 from tofcorr.options import Options, PositiveNumber
 
 _FEWEST_PIXELS = 50
@@ -88,6 +95,7 @@ class CheckerboardOptions(Options):
             to 0 the corners surround every pixel used; 1 is the outer edge of the squares.
         max_reprojection_px: Views with a larger reprojection error (root mean square) are refused.
         modulation_frequency: Modulation frequency of the camera, Hz; None if unknown.
+        poses: File of the poses of the robot that carries the camera; None: there is none.
     """
 
     depth_pattern: str = "{view}_depth.png"
@@ -100,6 +108,7 @@ class CheckerboardOptions(Options):
     margin_squares: Annotated[float, Field(gt=-1.0, le=2.0)] = 0.0
     max_reprojection_px: PositiveNumber = 0.5
     modulation_frequency: PositiveNumber | None = None
+    poses: Path | None = None
 
 
 class BoardView(NamedTuple):
@@ -125,8 +134,10 @@ def import_checkerboard(
 ) -> dict[str, Any]:
     """Turn images of a board into a recording, with `import.json` beside the arrays.
 
-    The world is the camera frame: the plane of each frame comes from the board's corners in its own
-    infrared image. A view that cannot be used is left out and listed with its reason.
+    Without a robot the world is the camera frame: the plane of each frame comes from the board's
+    corners in its own infrared image. With poses of a robot, before a board that stands still, the
+    corners of all views give a start of the hand-eye transform and of the one plane. A view that
+    cannot be used is left out and listed with its reason.
 
     Args:
         folder: Where the images are.
@@ -172,11 +183,14 @@ class BoardImport:
         refuse = partial(refuse_mixed_up, ratio=ratio)
         views = sieve.apply(refuse, views, lambda view: view.reported["view"], "comparing boards")
         warnings += agreement_warnings(views, ratio, options.depth_kind)
+        views, tool, wall = self._posed(views, sieve.refused)
         return PreparedImport(
             views=[view.reported for view in views],
-            frames=self._frames(views),
+            frames=self._frames(views, tool, wall),
             writer=partial(
                 RecordingWriter,
+                tool_from_camera=wall and wall.tool_from_camera,
+                planes="estimated" if wall else "recorded",
                 camera=self._camera,
                 depth_kind=options.depth_kind,
                 modulation_frequency=options.modulation_frequency,
@@ -215,6 +229,31 @@ class BoardImport:
         self._camera, found = calibrate(corners, self._board, size)
         about = camera_mapping(self._camera, "calibrated from the boards") | found
         return about, [calibration_warning(self._camera, found)]
+
+    def _posed(
+        self, views: list[BoardView], refused: Refused
+    ) -> tuple[list[BoardView], np.ndarray, FoundWalls | None]:
+        """Return the views that have a pose, world_from_tool (N, 4, 4), and the wall of the board.
+
+        It is found as walls without a board: which way round a symmetric one is seen does not
+        matter. Without a robot all views are at the identity, and there is no wall.
+
+        Raises:
+            CalibrationDataError: No hand-eye transform puts the boards of all views onto one plane.
+        """
+        file, names = self._options.poses, [view.reported["view"] for view in views]
+        if file is None:
+            return views, np.stack([np.eye(4)] * len(views)), None
+        track, near = read_poses(file), PosedOptions().pose_tolerance_s
+        kept, tool, alone, _ = pair(names, times_in_names(names), track, tolerance=near)
+        refused |= alone
+        views, rays, planes = [views[k] for k in kept], torch.from_numpy(self._rays), []
+        for view in views:
+            area, gradient = self._area(view.pose), -np.divide(*view.pose.plane())
+            planes.append([described(rays, torch.from_numpy(area), torch.from_numpy(gradient))])
+        names = [view.reported["view"] for view in views]
+        options, pixels = WallOptions(), rays[..., 0].numel()
+        return views, tool, walls_of_planes(planes, names, pixels, tool, options, str(file))
 
     def _read(self, view: str) -> DepthImage:
         return of_size(read_depth(self._files[view], self._coding), self._camera)
@@ -263,16 +302,19 @@ class BoardImport:
         }
         return BoardView(pose, float(np.median(measured / true)), columns @ columns.T, reported)
 
-    def _frames(self, views: Sequence[BoardView]) -> Iterator[Frame]:
+    def _frames(
+        self, views: Sequence[BoardView], tool: np.ndarray, wall: FoundWalls | None
+    ) -> Iterator[Frame]:
         for index, view in enumerate(views):
-            normal, offset = view.pose.plane()
+            # A wall that is found is a start for the fit: its covariance is not known.
+            plane = np.append(*view.pose.plane()) if wall is None else wall.walls[0]
             row = FrameRow(
                 timestamp=float(index),  # The files do not say when an image was taken.
-                world_from_tool=np.eye(4),
-                normal_world=normal,
-                offset=offset,
+                world_from_tool=tool[index],
+                normal_world=plane[:3],
+                offset=float(plane[3]),
                 target=self._board.kind,
-                plane_covariance=view.pose.plane_covariance,
+                plane_covariance=None if wall else view.pose.plane_covariance,
             )
             depth, amplitude = self._read(view.reported["view"])
             yield row, depth, amplitude, self._area(view.pose)

@@ -25,6 +25,7 @@ class FoundWalls:
         gradient: Its plane g . x = 1 fitted in the image, camera frame, shape (V, 3); None: every
             pixel looks at the wall.
         tool_from_camera: The hand-eye transform that goes with the walls, shape (4, 4): a start.
+        error: A constant (metres) and a slope of the camera's error that go with it, shape (2,).
         deviation_mm: Root mean square distance of the planes of single images from their walls.
         misfit_mm: The same where each plane counts 60 mm at most, and on no wall that much.
         left_out: Why images, and planes of images, are on no wall, by their names.
@@ -40,6 +41,7 @@ class FoundWalls:
     wall: np.ndarray
     gradient: np.ndarray | None
     tool_from_camera: np.ndarray
+    error: np.ndarray
     deviation_mm: float
     misfit_mm: float
     left_out: dict[str, str]
@@ -124,6 +126,7 @@ def walls_of_planes(
         wall=joint.wall[views].numpy(),
         gradient=None if given is not None else planes.gradient[views].numpy(),
         tool_from_camera=joint.tool_from_camera.numpy(),
+        error=joint.parameters.coefficients.numpy(),
         deviation_mm=float(deviation[on_wall].square().mean().sqrt()),
         misfit_mm=float(off.square().mean().sqrt()),
         left_out=_left_out(names, planes, joint, options),

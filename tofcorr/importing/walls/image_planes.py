@@ -178,7 +178,7 @@ def planes_of_image(
         if valid.numel() == 1:
             return [ImagePlane(-ray[0], float(measured[0]), 1, ray * measured[:, None])]
         gradient = fit_plane(ray, measured[None], torch.ones(1, len(measured)).bool())[0]
-        return [_described(rays, valid, gradient)]
+        return [described(rays, valid, gradient)]
     step = max(1, math.isqrt(distance.numel() // _SEARCHED_PIXELS))
     start = step // 2
     seen = valid[start::step, start::step]
@@ -203,7 +203,7 @@ def planes_of_image(
         return []
     masks = plane_masks(distance, valid, rays, torch.stack(gradients), tolerance)
     planes = [
-        _described(rays, mask, gradient)
+        described(rays, mask, gradient)
         for mask, gradient in zip(masks, gradients, strict=True)
         if int(mask.sum()) >= options.least_share * distance.numel()
     ]
@@ -230,7 +230,7 @@ def plane_masks(
     return near & (near.sum(dim=0) == 1)
 
 
-def _described(rays: Tensor, mask: Tensor, gradient: Tensor) -> ImagePlane:
+def described(rays: Tensor, mask: Tensor, gradient: Tensor) -> ImagePlane:
     """Describe the plane g . x = 1 that was fitted to the pixels of a mask (H, W).
 
     About 20 000 of them do: noise of 10 mm then moves the plane by 0.1 mm.
