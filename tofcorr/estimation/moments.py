@@ -271,12 +271,8 @@ class Prior:
         by_twist = self.factor[:, : parameters.twist_size]
         if not bool(by_twist.any()):  # Linear in the coefficients.
             return self.factor
-        zero = torch.zeros(parameters.size, dtype=torch.float64)
-        slope = torch.autograd.functional.jacobian(
-            lambda step: self.centre.step_to(parameters.moved(step)), zero
-        )
-        assert isinstance(slope, Tensor)
-        return self.factor @ slope
+        slope = se3.log_slope(self.centre.step_to(parameters)[: parameters.twist_size])
+        return torch.cat([by_twist @ slope, self.factor[:, parameters.twist_size :]], dim=1)
 
     def rescaled(self, variance: float) -> "Prior":
         """Return the same prior on the scale of another effective variance of a residual."""

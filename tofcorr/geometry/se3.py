@@ -93,6 +93,22 @@ def log(transform: Tensor) -> Tensor:
     return twist.reshape(*transform.shape[:-2], 6)
 
 
+def log_slope(twist: Tensor) -> Tensor:
+    r"""Return the derivative of log(exp(twist) exp(step)) by the step at zero, shape (6, 6).
+
+    It is the inverse of :math:`\int_0^1 e^{-s\,\mathrm{ad}}\,ds`, ad being the twist's commutator
+    (Barfoot 2017, section 7.1.5).
+
+    Args:
+        twist: Translation and rotation, shape (6,).
+    """
+    axes = torch.eye(3).to(twist)
+    shift, turn = (torch.linalg.cross(part.expand(3, 3), axes).T for part in twist.split(3))
+    commutator = torch.cat([torch.cat([turn, shift], 1), torch.cat([0 * turn, turn], 1)])
+    corner = torch.cat([-commutator, torch.eye(6).to(twist)], dim=1)
+    return torch.linalg.inv(torch.matrix_exp(torch.nn.functional.pad(corner, (0, 0, 0, 6)))[:6, 6:])
+
+
 def inverse(transform: Tensor) -> Tensor:
     """Return the inverse of rigid transforms of shape (..., 4, 4)."""
     rotation_t = transform[..., :3, :3].transpose(-1, -2)

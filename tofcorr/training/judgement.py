@@ -271,6 +271,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     return "\n".join(
         [
             verdict_text(report),
+            *update_words(report)[:1],
             *_error_table(report, {"rms": "RMS"}),
             *_hand_eye_lines(report)[:1],
             *_advice_lines(report, 2),
@@ -285,7 +286,7 @@ def full_text(report: Mapping[str, Any]) -> str:
     Args:
         report: The content of report.json.
     """
-    lines = [verdict_text(report), report["message"]]
+    lines = [verdict_text(report), *update_words(report), report["message"]]
     lines += _error_table(report, {"mean_abs": "mean abs.", "rms": "RMS"})
     for half, own in report["views_mm"].items():
         if own["rms_z"] is not None:
@@ -299,6 +300,21 @@ def full_text(report: Mapping[str, Any]) -> str:
         lines += _advice_lines(report, len(report["advice"]["poses"]))
         lines.append(f"  In symbols it is {report['advice']['direction']}.")
     return "\n".join([*lines, *_warnings(report)])
+
+
+def update_words(report: Mapping[str, Any]) -> list[str]:
+    """Return what has changed since the old run, and the other explanations; empty of a training.
+
+    Args:
+        report: The content of report.json.
+    """
+    if (update := report.get("update")) is None:
+        return []
+    others = [
+        f"{one['changed'].replace('_', ' ')} {one['probability']:.2g}"
+        for one in update["explanations"][1:]
+    ]
+    return [update["sentence"], f"Other explanations: {', '.join(others)}.", *update["notes"]]
 
 
 def _error_table(report: Mapping[str, Any], kinds: Mapping[str, str]) -> list[str]:
