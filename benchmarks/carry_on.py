@@ -27,14 +27,20 @@ from tqdm import tqdm
 from benchmarks.hand_eye_bias import hand_eye_error
 from benchmarks.sealed.scores import share, table
 from benchmarks.timing import write
+from tofcorr.correction.state import save_values
 from tofcorr.data.recording import Recording
-from tofcorr.estimation.planes import marginal_hessian
+from tofcorr.errors import TofcorrError
+from tofcorr.estimation.moments import MomentObjective
+from tofcorr.estimation.planes import marginal_hessian, within_prior
 from tofcorr.estimation.robust import student_quantile
 from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset, PlaneChoice
+from tofcorr.pixels.passes import frame_errors
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.pool import CameraType, pool
 from tofcorr.training.run import TrainingResult, train
 from tofcorr.training.update import update
 
@@ -48,6 +54,7 @@ STATES = {
 }
 # Of the other wall's recorded plane, which is a mere start: metres and radians.
 UNMEASURED = 0.03
+POSES = (5, 7, 10, 15, 20, 30)
 
 
 def drawn_camera(rng: np.random.Generator, repeatability: float) -> Values:
@@ -102,7 +109,7 @@ def later(values: Values, state: str, rng: np.random.Generator, frames: int) -> 
 
 
 def one_draw(
-    number: int, seed: int, repeatability: float, frames: int, folder: Path
+    number: int, seed: int, repeatability: float, frames: int, planes: PlaneChoice, folder: Path
 ) -> list[Values]:
     """Calibrate once, and update in every state; return a line for each."""
     rng = np.random.default_rng([seed, 37, number])
@@ -115,8 +122,9 @@ def one_draw(
     for state, expected in STATES.items():
         new = SimulatorOptions.from_mapping(later(values, state, rng, frames), "drawn")
         path = folder / state.replace(" ", "_")
-        recording = moved_planes(simulate(new, path), rng)
-        found = update(folder / "run", recording, planes="unknown", figures=False)
+        recording = simulate(new, path)
+        recording = recording if planes == "known" else moved_planes(recording, rng)
+        found = update(folder / "run", recording, planes=planes, figures=False)
         said, fit = found.report["update"], found.fit
         true = new.hand_eye.tool_from_camera()
         error = hand_eye_error(true, fit.solution.parameters.tool_from_camera)
@@ -134,7 +142,7 @@ def one_draw(
                 "covered": (error.abs() <= half).flatten().tolist(),
                 "explanations": said["explanations"],
                 "sentence": said["sentence"],
-                "bound_mm": bound(found),
+                "bound_mm": bound(found, repeatability),
             }
         )
     return lines
@@ -149,16 +157,25 @@ def moved_planes(recording: Recording, rng: np.random.Generator) -> Recording:
     return replace(recording, frames=replace(frames, normal_world=normals, offset=offset))
 
 
-def bound(found: TrainingResult) -> float:
-    """Return the standard error of the hand-eye's place if all coefficients were known, mm.
+def bound(found: TrainingResult, repeatability: float) -> float:
+    """Return the least standard error of the hand-eye's place, all axes together, mm.
 
-    It is that of the poses, which scatter, before a wall at an unknown place: no prior can be
-    better. All directions together, root of the sum of squares.
+    It is that of generalised least squares with all coefficients known, and with the variances of
+    pixels and poses: no estimate from these frames of a wall in an unknown place can be better.
+
+    Args:
+        found: The update.
+        repeatability: Of the robot, mm and mrad.
     """
     fit = found.fit
-    hessian = marginal_hessian(fit.moments, fit.optimum, fit.walls and fit.walls.walls)
-    known = torch.linalg.inv(hessian[:6, :6] / fit.residual_variance)
-    return 1e3 * math.sqrt(float(known.diagonal()[:3].sum()))
+    moments, at, walls = fit.moments, fit.optimum, fit.walls and fit.walls.walls
+    each = torch.eye(3).double().expand(len(moments.count), 3, 3)
+    alone = MomentObjective(within_prior(moments, at, 1e-9 * each)).image_losses(at).sum()
+    noise = alone / moments.count.sum()
+    # A plane in the tool's frame turns and shifts as the tool does.
+    of_poses = noise / (1e-3 * repeatability) ** 2 * each
+    known = marginal_hessian(within_prior(moments, at, of_poses), at, walls)[:6, :6] / noise
+    return 1e3 * math.sqrt(float(torch.linalg.inv(known).diagonal()[:3].sum()))
 
 
 def tables(lines: list[Values]) -> str:
@@ -209,15 +226,104 @@ def group() -> None:
 @click.option("--count", default=40, show_default=True)
 @click.option("--repeatability", default=0.1, show_default=True, help="Of the robot, mm and mrad.")
 @click.option("--frames", default=10, show_default=True)
+@click.option("--planes", default="unknown", type=click.Choice(["unknown", "known"]))
 @click.option("--out", type=click.Path(path_type=Path), help="JSON file for every update.")
-def changes(seed: int, count: int, repeatability: float, frames: int, out: Path | None) -> None:
+def changes(seed: int, count: int, *, out: Path | None, **given: Any) -> None:  # noqa: ANN401
     """Name what changed, and find the mount again."""
     lines: list[Values] = []
     for number in tqdm(range(count), desc="cameras", disable=None):
         with tempfile.TemporaryDirectory() as folder:
-            lines += one_draw(number, seed, repeatability, frames, Path(folder))
+            lines += one_draw(number, seed, **given, folder=Path(folder))
     click.echo(tables(lines))
     write(lines, out)
+
+
+@group.command("pool")
+@click.option("--seed", type=int, required=True)
+@click.option("--count", default=10, show_default=True)
+@click.option("--units", default=6, show_default=True)
+@click.option("--repeatability", default=0.3, show_default=True, help="Of the robot, mm and mrad.")
+@click.option("--out", type=click.Path(path_type=Path), help="JSON file for every calibration.")
+def pooled(seed: int, count: int, units: int, repeatability: float, out: Path | None) -> None:
+    """Calibrate a new unit from few poses, with what others of its type have in common."""
+    lines: list[Values] = []
+    for number in tqdm(range(count), desc="types", disable=None):
+        with tempfile.TemporaryDirectory() as folder:
+            lines += one_type(number, seed, units, repeatability, Path(folder))
+    rows = []
+    for poses in POSES:
+        own = [one for one in lines if one["poses"] == poses]
+        each = {name: np.array([one["rms_mm"][name] for one in own]) for name in own[0]["rms_mm"]}
+        better = share(each["type"] < each["alone"])
+        rows.append((poses, len(own), *(f"{np.median(one):.2f}" for one in each.values()), better))
+    head = (
+        "poses",
+        "units",
+        "alone, median mm",
+        "with the type",
+        "coefficients known",
+        "type better",
+    )
+    click.echo(table(head, rows))
+    write(lines, out)
+
+
+def one_type(
+    number: int, seed: int, units: int, repeatability: float, folder: Path
+) -> list[Values]:
+    """Calibrate units of a type, and then one more from few poses; return a line for each."""
+    rng = np.random.default_rng([seed, 38, number])
+    base = drawn_camera(rng, repeatability)
+    options = resolve_options(TrainingOptions, "ea", ("split.test_fraction=0", "advice=0"))
+    options = options.model_copy(update={"figures": False})
+    for unit in range(units):
+        recorded(another_camera(base, rng, 10.0), rng, 30, folder / f"recording_{unit}")
+        train(folder / f"recording_{unit}", options, out=folder / f"run_{unit}")
+    pool([folder / f"run_{unit}" for unit in range(units)], out=folder / "type")
+    new = another_camera(base, rng, 10.0)
+    # Without noise, and at the poses reported: what is left is of the calibration. What the best
+    # model of these terms leaves there is no matter of poses.
+    held_out = recorded(new, rng, 30, folder / "held_out", noise=False)
+    best = train(held_out, options)
+    least, size = off(best, held_out), len(best.fit.optimum.coefficients)
+    # A type whose units are all this one: no prior can help more.
+    exact = CameraType(
+        error_model=best.fit.options,
+        domain=best.fit.domain,
+        mean=best.fit.optimum.coefficients,
+        covariance=1e-12 * torch.eye(size).double(),
+        units=("this", "this"),
+    )
+    save_values(folder / "exact", "tofcorr-camera-type", exact.model_dump(), TofcorrError)
+    priors = {"alone": None, "type": folder / "type", "coefficients known": folder / "exact"}
+    lines = []
+    for poses in POSES:
+        few = recorded(new, rng, poses, folder / f"few_{poses}")
+        found = {
+            name: math.sqrt(max(off(train(few, options, prior=prior), held_out) ** 2 - least**2, 0))
+            for name, prior in priors.items()
+        }
+        lines.append({"draw": number, "poses": poses, "rms_mm": found})
+    return lines
+
+
+def off(found: TrainingResult, held_out: Recording) -> float:
+    """Return the RMS distance of corrected points to their planes, mm."""
+    errors = frame_errors(Dataset((held_out,)), {"after": found.fit.model}, "cpu", 1.0)["after"]
+    return errors["to_plane"].rms_mm(np.arange(held_out.num_frames))
+
+
+def recorded(
+    values: Values, rng: np.random.Generator, poses: int, out: Path, *, noise: bool = True
+) -> Recording:
+    """Simulate a recording of so many poses, two in five before a white wall."""
+    white = max(2 * poses // 5, 1)
+    shots = [
+        {"target": "white", "poses": white},
+        {"target": "checkerboard", "poses": poses - white},
+    ]
+    own = values | {"seed": int(rng.integers(1 << 30)), "shots": shots}
+    return simulate(SimulatorOptions.from_mapping(own, "drawn"), out, noise=noise)
 
 
 if __name__ == "__main__":

@@ -29,10 +29,13 @@ def updated(
 ) -> Callable[..., TrainingResult]:
     """Return a function that simulates ten new frames, and updates the session's run by them."""
 
-    def run(name: str, out: Path | None = None, **parts: Any) -> TrainingResult:
+    def run(
+        name: str, out: Path | None = None, prior: Path | None = None, **parts: Any
+    ) -> TrainingResult:
         folder = tmp_path_factory.mktemp(name) / "new"
         new = simulated_wall(folder, seed=91, shots=(("white", 10),), **parts)
-        return tofcorr.update(trained.folder, new.first, planes="unknown", figures=False, out=out)
+        given: dict[str, Any] = {"out": out, "prior": prior, "planes": "unknown"}
+        return tofcorr.update(trained.folder, new.first, figures=False, **given)
 
     return run
 
@@ -117,8 +120,17 @@ def test_another_image_size_and_other_terms_are_refused(trained: Trained, tmp_pa
         tofcorr.train(trained.recording, CONFIG, prior=trained.folder / STATE_FILE)
 
 
-def test_a_camera_type_makes_up_for_poses(trained: Trained, tmp_path: Path) -> None:
+def test_a_camera_type_makes_up_for_poses(
+    updated: Callable[..., TrainingResult], trained: Trained, tmp_path: Path
+) -> None:
     tofcorr.pool([trained.folder, trained.folder], out=tmp_path / "type")
+    bumped = updated("typed", prior=tmp_path / "type", hand_eye=BUMPED)
+    # A camera of a type that does not vary is the same camera.
+    assert {one["changed"] for one in bumped.report["update"]["explanations"][:2]} == {
+        "mount",
+        "camera",
+    }
+    assert "what 2 units of its type have in common" in bumped.details
     few = simulated_wall(tmp_path / "few", seed=17, shots=(("white", 3), ("checkerboard", 2)))
     config = CONFIG | {"split": {"test_fraction": 0.0}, "figures": False, "advice": 0}
     other = simulated_wall(tmp_path / "other", seed=18)

@@ -112,7 +112,7 @@ def pool_command(runs: tuple[Path, ...], out: Path) -> None:
     """Find what the runs of several cameras of one type have in common.
 
     Mean and scatter of their coefficients, beyond what each run is uncertain by, are the prior of
-    the next camera: tofcorr train --prior then needs about a third of the poses.
+    the next camera: tofcorr train --prior then needs fewer poses.
     """
     from tofcorr.training.pool import pool
 

@@ -303,18 +303,21 @@ def full_text(report: Mapping[str, Any]) -> str:
 
 
 def update_words(report: Mapping[str, Any]) -> list[str]:
-    """Return what has changed since the old run, and the other explanations; empty of a training.
+    """Return what earlier calibrations say: what has changed since, and the other explanations.
 
     Args:
         report: The content of report.json.
     """
+    units = report.get("prior", {"units": []})["units"]
+    own = [f"The prior is what {len(units)} units of its type have in common."] if units else []
     if (update := report.get("update")) is None:
-        return []
+        return own
     others = [
         f"{one['changed'].replace('_', ' ')} {one['probability']:.2g}"
         for one in update["explanations"][1:]
     ]
-    return [update["sentence"], f"Other explanations: {', '.join(others)}.", *update["notes"]]
+    others = f"Other explanations: {', '.join(others)}."
+    return [update["sentence"], others, *own, *update["notes"]]
 
 
 def _error_table(report: Mapping[str, Any], kinds: Mapping[str, str]) -> list[str]:
@@ -370,7 +373,9 @@ def verdict_text(report: Mapping[str, Any]) -> str:
     Args:
         report: The content of report.json; older ones lack `expected`.
     """
-    said, expects = f"Verdict: {report['verdict']}. {report['reason']}", report.get("expected", "")
+    reason, expects = report["reason"], report.get("expected", "")
+    said = expects if expects.startswith(reason.rstrip(".")) else reason
+    said = f"Verdict: {report['verdict']}. {said}"
     return said if expects in said else f"{said} {expects}"
 
 

@@ -287,8 +287,8 @@ def train(
             and files for TensorBoard follow once it is there. None writes nothing;
             `TrainingResult.save` does later.
         resume: Folder of an interrupted run of the same model; the fit goes on where it stood.
-        prior: File of `tofcorr.pool`: what other cameras of this type have in common. A third of
-            the poses is then enough.
+        prior: File of `tofcorr.pool`: what other cameras of this type have in common. Fewer poses
+            are then enough.
         force: Fit whatever the recordings look like, and write a corrector whatever the verdict.
 
     Returns:

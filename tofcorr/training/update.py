@@ -114,7 +114,8 @@ def _carried(
     with solvable(first.path, "update"), thread_number(1):
         found = explain(data, frames, options, known, other)
     said = partial(update_report, run, known, found, older)
-    return Carried(data, found[0].known, lambda fit: {"update": said(fit)})
+    units = {} if of_type is None else {"prior": {"units": list(of_type.units)}}
+    return Carried(data, found[0].known, lambda fit: {"update": said(fit)} | units)
 
 
 def update_report(
