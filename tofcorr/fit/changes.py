@@ -56,20 +56,17 @@ class Explanation:
 
     Attributes:
         name: One of `EXPLANATIONS`.
+        parts: The parts of the calibration that it changes.
         probability: Of all explanations, given the frames.
         change: Covariance C of the change, shape (P, P), of the most probable size.
         known: What is believed before the frames, under it.
     """
 
     name: str
+    parts: tuple[str, ...]
     probability: float
     change: Tensor
     known: Known
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The parts of the calibration that it changes."""
-        return EXPLANATIONS[self.name]
 
 
 def explain(
@@ -104,8 +101,9 @@ def explain(
     hessian = marginal_hessian(core.moments, best, problem.estimated)
     data, found = NormalEquations(images.loss, images.gradient, hessian), []
     moves = known.parameters.hand_eye_is_free
-    tried = {name: own for name, own in EXPLANATIONS.items() if moves or "mount" not in own}
-    for name, parts in tried.items():
+    tried = [name for name in EXPLANATIONS if moves or not name.startswith("mount")]
+    for name in tried:
+        parts = tuple(one for one in EXPLANATIONS[name] if moves or one != "mount")
         sized = [dict(zip(parts, one, strict=True)) for one in product(SIZES, repeat=len(parts))]
         changes = [_change(known, one) for one in sized]
         beliefs = [_believed(known, one, of_type if "camera" in parts else None) for one in changes]
@@ -115,11 +113,13 @@ def explain(
         prior = _UNCHANGED if name == "nothing" else (1 - _UNCHANGED) / (len(tried) - 1)
         total = float(logs.logsumexp(0)) + math.log(prior / len(beliefs))
         likely = int(logs.argmax())
-        # The mount is anywhere then: only how probable a move is depends on its size.
-        free = {"mount": SIZES[-1]} if "mount" in parts else {}
+        # The mount is anywhere then: only how probable a move is depends on its size. Of what is
+        # known of a type nothing does.
+        loose = {"mount"} if of_type is None else {"mount", "camera"}
+        free = {one: SIZES[-1] for one in parts if one in loose}
         change = changes[likely] + _change(known, free)
         belief = _believed(known, change, of_type if "camera" in parts else None)
-        found.append(Explanation(name, total, change, replace(belief, variance=variance)))
+        found.append(Explanation(name, parts, total, change, replace(belief, variance=variance)))
     shares = torch.tensor([one.probability for one in found]).softmax(0).tolist()
     found = [replace(one, probability=p) for one, p in zip(found, shares, strict=True)]
     return sorted(found, key=lambda one: -one.probability)

@@ -59,17 +59,6 @@ class CameraType(Options):
     covariance: Float64
     units: tuple[str, ...] = Field(min_length=2)
 
-    def checked(self, options: TrainingOptions, path: Path) -> TrainingOptions:
-        """Return options with these terms in the place of the same ones.
-
-        Raises:
-            ConfigError: They have other terms.
-        """
-        if not self.error_model.same_coefficients(options.model):
-            kinds = ", ".join(term.kind for term in self.error_model.terms)
-            raise ConfigError(f"{path}: its model has other terms ({kinds}) than {options.name}.")
-        return options.model_copy(update={"model": self.error_model})
-
     def known(self, data: Dataset) -> Known:
         """Return what is known of the next unit.
 
@@ -169,11 +158,12 @@ def between_units(means: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
     return mean, between + of_mean
 
 
-def load_type(path: Path | str) -> CameraType:
-    """Read a file that `pool` wrote.
+def load_type(path: Path | str, options: TrainingOptions) -> CameraType:
+    """Read a file that `pool` wrote, for a training of the same terms.
 
     Raises:
         CalibrationDataError: There is no such file, it is damaged, or it is another one.
+        ConfigError: The training is of other terms.
     """
     path = Path(path)
     refuse_damaged(path, _WHAT)
@@ -181,4 +171,8 @@ def load_type(path: Path | str) -> CameraType:
     if values is None:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
     with refused_in_words(CameraType, str(path), CalibrationDataError):
-        return CameraType.model_validate(values)
+        found = CameraType.model_validate(values)
+    if not found.error_model.same_coefficients(options.model):
+        kinds = ", ".join(term.kind for term in found.error_model.terms)
+        raise ConfigError(f"{path}: its model has other terms ({kinds}) than {options.name}.")
+    return found

@@ -302,8 +302,8 @@ def train(
     """
     options, carry = resolve_options(TrainingOptions, config), None
     if prior is not None:
-        of_type = load_type(prior)
-        options = of_type.checked(options, Path(prior))
+        of_type = load_type(prior, options)
+        options = options.model_copy(update={"model": of_type.error_model})
         carry = partial(_of_type, of_type)
     return carried_training(recordings, options, carry, out=out, resume=resume, force=force)
 

@@ -79,9 +79,7 @@ def update(
     options = resolve_options(TrainingOptions, folder / "config.yaml")
     changes = {"planes": planes, "figures": figures, "model": state.error_model, "residual": None}
     options = options.model_copy(update=changes | {"split": SplitOptions(test_fraction=0.0)})
-    of_type = None if prior is None else load_type(prior)
-    if of_type is not None and prior is not None:
-        of_type.checked(options, Path(prior))
+    of_type = None if prior is None else load_type(prior, options)
     carry = partial(_carried, folder, state, of_type)
     return carried_training(recordings, options, carry, out=out, force=force)
 
@@ -157,7 +155,7 @@ def _moved(known: Known, best: Explanation, fit: Fit) -> dict[str, Any]:
             along = change[part] / change[part].norm().clamp(min=_TINY)
             error = (along @ covariance[part, part] @ along).sqrt()
             moved |= {f"{name.replace('_', '_se_')}": unit * float(error)}
-    if best.parts not in ((), ("mount",)):
+    if {"temperature", "camera"} & {*best.parts}:
         # Products of the functions, summed over all pixels: a ray has unit length.
         size, gram = len(fit.moments.symbols), fit.moments.gram.sum(dim=0)[3:-1, 3:-1]
         products = torch.einsum("iaja->ij", gram.view(size, 3, size, 3))
@@ -184,7 +182,7 @@ def _sentence(best: Explanation, moved: Mapping[str, float]) -> str:
     mount = reads = differs = ""
     if "mount" in best.parts:
         mount = f"{size('mount_mm', 'mm', 1)} and {size('mount_deg', 'degrees', 2)}"
-    if "temperature" in best.parts or "camera" in best.parts:
+    if "reads_farther_mm" in moved:
         way = "farther" if moved["reads_farther_mm"] > 0 else "nearer"
         reads = f"it reads {size('reads_farther_mm', 'mm', 1).lstrip('-')} {way}"
         differs = f"its correction differs by {size('correction_rms_mm', 'mm', 1)} RMS"
@@ -194,8 +192,7 @@ def _sentence(best: Explanation, moved: Mapping[str, float]) -> str:
         "temperature": f"Only the camera is warmer or colder: {reads}; the mount has not moved",
         "mount_and_temperature": f"The mount moved by {mount}, and the camera is warmer or colder: "
         f"{reads}",
-        "camera": f"The camera is another one of its type: {differs}",
+        "camera": f"The camera is another one of its type: {differs}"
+        f"{mount and f', and it is mounted {mount} away'}",
     }[best.name]
-    if best.name == "camera" and mount:
-        said += f", and it is mounted {mount} away"
     return f"{said} (probability {best.probability:.2g})."
