@@ -29,8 +29,10 @@ from tofcorr.plausibility.finding import Inspection as Inspection
 from tofcorr.sensor.degrade import degrade as degrade
 from tofcorr.sensor.model import SensorModel as SensorModel
 from tofcorr.simulation.simulator import simulate as simulate
+from tofcorr.training.pool import pool as pool
 from tofcorr.training.run import TrainingResult as TrainingResult
 from tofcorr.training.run import train as train
+from tofcorr.training.update import update as update
 from tofcorr.version import __version__ as __version__
 
 __all__: list[str]

@@ -132,3 +132,14 @@ def test_transforms_are_apart_by_their_distance_and_the_angle_between_them() -> 
         [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 3.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]]
     )
     assert se3.apart(first, second) == pytest.approx((5.0, math.pi / 2))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.01, 1.0])
+def test_the_slope_of_the_logarithm_is_its_derivative(size: float) -> None:
+    twist = size * torch.tensor([0.3, -0.5, 0.2, 0.4, 0.1, -0.6], dtype=torch.float64)
+
+    def moved(step: torch.Tensor) -> torch.Tensor:
+        return se3.log(se3.exp(twist) @ se3.exp(step))
+
+    derivative = torch.autograd.functional.jacobian(moved, torch.zeros(6).double())
+    torch.testing.assert_close(se3.log_slope(twist), derivative, rtol=0, atol=1e-12)

@@ -1,4 +1,4 @@
-"""The commands that calibrate a camera: inspect, train, compare, check."""
+"""The commands that calibrate a camera: inspect, train, update, pool, compare, check."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,8 @@ _EVALUATION = "comparison.options:EvaluationOptions"
 _SELECTION = "comparison.options:SelectionOptions"
 
 _PLANES = "known: the planes were measured; unknown: a start; auto: as recording.yaml says."
+_PRIOR = "What other cameras of the type have in common: a file that tofcorr pool wrote."
+_NO_FIGURES = "Write no page, and draw no figures for TensorBoard."
 _WALL = "What is known: nothing; all frames show one wall, and poses are right; or its plane."
 _DRIFTED = "Offset or departure from a plane above which the camera counts as drifted."
 
@@ -52,8 +54,9 @@ def inspect_command(recordings: tuple[Path, ...], out: Path | None, planes: Any)
 @recording_option("Folder of a recording; may be given several times.", many=True)
 @out_option("Folder of the run, made anew.")
 @option("--resume", "An interrupted run; the fit goes on where it stood.", type=FOLDER)
+@option("--prior", _PRIOR, type=FOLDER)
 @force_option
-@option("--no-figures", "Write no page, and draw no figures for TensorBoard.", is_flag=True)
+@option("--no-figures", _NO_FIGURES, is_flag=True)
 def train_command(
     options: "TrainingOptions",
     recordings: tuple[Path, ...],
@@ -72,6 +75,48 @@ def train_command(
     if no_figures:
         options = options.model_copy(update={"figures": False})
     show(train(recordings, options, **given), given["out"])
+
+
+@click.command()
+@run_option
+@recording_option("New frames, of any wall; may be given several times.", many=True)
+@out_option("Folder of the new run, made anew.")
+@option("--prior", _PRIOR, type=FOLDER)
+@option("--planes", _PLANES, default="auto", type=click.Choice(["auto", "known", "unknown"]))
+@force_option
+@option("--no-figures", _NO_FIGURES, is_flag=True)
+def update_command(
+    run: Path,
+    recordings: tuple[Path, ...],
+    *,
+    no_figures: bool,
+    **given: Any,  # noqa: ANN401
+) -> None:
+    """Carry a calibration on with a few new frames, and say which part of it has changed.
+
+    The old run is the prior. The frames tell which explanation is the most probable: nothing
+    changed; the mount was bumped; the camera is warmer or colder; both; or it is another camera of
+    the type. The result is a run as `tofcorr train` makes it, of all the new frames.
+    """
+    from tofcorr.training.update import update
+
+    show(update(run, recordings, figures=not no_figures, **given), given["out"])
+
+
+@click.command()
+@option(
+    "--run", "A run of each unit; may be given several times.", "runs", multiple=True, type=FOLDER
+)
+@option("--out", "File to write, for --prior.", required=True, type=REPLACED_FILE)
+def pool_command(runs: tuple[Path, ...], out: Path) -> None:
+    """Find what the runs of several cameras of one type have in common.
+
+    Mean and scatter of their coefficients, beyond what each run is uncertain by, are the prior of
+    the next camera: tofcorr train --prior then needs fewer poses.
+    """
+    from tofcorr.training.pool import pool
+
+    show(pool(runs, out=out), out)
 
 
 @click.command()

@@ -24,6 +24,8 @@ COMMANDS = {
     "import": ("record", "Turn recorded images into a recording."),
     "inspect": ("calibrate", "Say what is odd about a recording, before any fit."),
     "train": ("calibrate", "Calibrate a recording: distance, pixel, intensity error, hand-eye."),
+    "update": ("calibrate", "Carry a calibration on with a few frames, and say what has changed."),
+    "pool": ("calibrate", "Find what cameras of one type share, as the prior of the next one."),
     "evaluate": ("calibrate", "Compare models on held-out images, in the paper's two tables."),
     "select": ("calibrate", "Choose the model that predicts best what it has not seen."),
     "compare": ("calibrate", "Show several runs side by side: errors, hand-eye, options."),

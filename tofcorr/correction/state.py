@@ -97,15 +97,22 @@ class CalibrationExtras(Options):
             metres and the camera's units; None if unknown.
         frames: What the robot calls the coordinate frames.
         hand_eye_accuracy: Standard errors of the hand-eye transform; None if unknown.
+        joint_covariance: Of a step of the hand-eye transform (camera axes, if it was estimated) and
+            the coefficients together, shape (P, P), float64, square metres and radians; None if
+            unknown.
+        residual_variance: Effective variance of a residual, in the unit of the loss; None if
+            unknown.
     """
 
     covariance: Float64 | None = None
     noise: _Three | None = None
     frames: FrameNames = FrameNames()
     hand_eye_accuracy: HandEyeAccuracy | None = None
+    joint_covariance: Float64 | None = None
+    residual_variance: PositiveNumber | None = None
 
     def extras(self) -> "CalibrationExtras":
-        """Return these four alone."""
+        """Return these alone."""
         own = {name: getattr(self, name) for name in CalibrationExtras.model_fields}
         return CalibrationExtras(**own)
 
@@ -158,10 +165,12 @@ class CalibrationState(CalibrationExtras, Setting):
         model, residual = ErrorModel(self.error_model, self.domain), self.residual
         number = len(model.symbols())
         network = residual and ResidualNetwork(residual.options, self.domain)
+        joint, both = self.joint_covariance, number + 6 * self.hand_eye_estimated
         for name, values, shape in (
             ("coefficients", self.coefficients, (number,)),
             ("tool_from_camera", self.tool_from_camera, (4, 4)),
             ("covariance", self.covariance, self.covariance is not None and (number, number)),
+            ("joint_covariance", joint, joint is not None and (both, both)),
             ("fixed_pattern", self.fixed_pattern, model.fixed_pattern is not None and size),
             ("residual", residual and residual.weights, network and network.weight_vector().shape),
         ):

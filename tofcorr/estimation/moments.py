@@ -271,8 +271,8 @@ class Prior:
         by_twist = self.factor[:, : parameters.twist_size]
         if not bool(by_twist.any()):  # Linear in the coefficients.
             return self.factor
-        of_twist = se3.change_of_log(self.centre.step_to(parameters)[:6])
-        return torch.cat([by_twist @ of_twist, self.factor[:, 6:]], dim=1)
+        slope = se3.log_slope(self.centre.step_to(parameters)[: parameters.twist_size])
+        return torch.cat([by_twist @ slope, self.factor[:, parameters.twist_size :]], dim=1)
 
     def rescaled(self, variance: float) -> "Prior":
         """Return the same prior on the scale of another effective variance of a residual."""

@@ -52,6 +52,7 @@ from tofcorr.estimation.uncertainty import (
     observability,
     prior_on_undetermined,
 )
+from tofcorr.fit.known import Known
 from tofcorr.fit.problem import Core, Fit, FitOptions, Problem, Shift, build_model
 from tofcorr.fit.residual import fit_residual
 from tofcorr.fit.walls import recorded_walls
@@ -67,7 +68,7 @@ def fit(
     dataset: Dataset,
     frames: Frames,
     options: FitOptions,
-    domain: Domain,
+    domain: Domain | Known,
     watcher: Watcher | None = None,
     resumed: Parameters | None = None,
     moments: ImageMoments | None = None,
@@ -90,7 +91,8 @@ def fit(
         dataset: The recordings.
         frames: Global numbers of the frames to fit.
         options: Model, hand-eye, solver and device.
-        domain: The ranges that scale the model's variables.
+        domain: The ranges that scale the model's variables, or what earlier calibrations say for
+            such ranges.
         watcher: Called after each iteration of the solver.
         resumed: Where an interrupted fit stood; None starts anew.
         moments: Those of the frames with exactly the model's image columns, if they are known
@@ -104,7 +106,9 @@ def fit(
     with solvable(dataset.first.path, "fit"), thread_number(1):
         frames = np.asarray(frames)
         seen = lattice_of(dataset, frames) if lattice is None else lattice
-        problem = Problem(dataset, frames, options, domain, seen, watcher, resumed)
+        known = domain if isinstance(domain, Known) else None
+        ranges = domain if isinstance(domain, Domain) else domain.domain
+        problem = Problem(dataset, frames, options, ranges, seen, watcher, resumed, known=known)
         weights = None
         if moments is None:
             moments, weights = prepare(problem)
@@ -148,7 +152,7 @@ def estimate(problem: Problem, moments: ImageMoments) -> tuple[Problem, Core, Co
     Raises:
         CalibrationDataError: The frames do not determine the model, or are of fewer than 3 poses.
     """
-    problem, core = _on_walls(problem, moments)
+    problem, core = on_walls(problem, moments)
     refuse_diverged(core.solution.parameters)
     optimum, prior, poses = core.solution.parameters, core.total_prior, problem.poses()
     # At the least loss, where the gradients of the poses sum to zero.
@@ -189,7 +193,7 @@ def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
         # Distances to a plane that is a mere guess would make every pixel an outlier.
         quiet = replace(problem, watcher=None)
         moments = moments if walls is None else walls.seen_by(moments)
-        here, core = _on_walls(quiet, moments, held=False)
+        here, core = on_walls(quiet, moments, held=False)
         best, seen = core.solution.parameters, here.dataset
         now = torch.cat([best.tool_from_camera.flatten(), best.coefficients])
         # In metres, or without unit the entries of the rotation: far below any standard error.
@@ -200,6 +204,30 @@ def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
         weights = weights.updated(seen, frames, model)
         moments = image_moments(seen, design, frames, weights, options.device)
     return moments if walls is None else walls.seen_by(moments), weights
+
+
+def on_walls(problem: Problem, moments: ImageMoments, *, held: bool = True) -> tuple[Problem, Core]:
+    """Solve on walls that are estimated, or within what is not known of each image's.
+
+    What earlier calibrations say weighs against images as these scatter: no less than the images of
+    those calibrations did.
+
+    Args:
+        problem: What to fit.
+        moments: Of its frames, with exactly the model's image columns.
+        held: As for `solve`.
+
+    Returns:
+        The problem, on the walls found; and its solution.
+    """
+    found, core = _on_walls(problem, moments, held=held)
+    if problem.known is None:
+        return found, core
+    seen = effective_variance(core.moments, core.solution.parameters)
+    if seen <= problem.known.variance:
+        return found, core
+    known = replace(problem.known, variance=seen)
+    return _on_walls(replace(problem, known=known), moments, held=held)
 
 
 def _on_walls(
@@ -219,7 +247,8 @@ def _on_walls(
     if not problem.estimates_walls:
         return problem, core
     found, best = recorded_walls(problem.dataset, problem.frames), core.solution.parameters
-    prior = None if core.smoothness is None else core.smoothness.equations(best)
+    before = core.carried or core.smoothness
+    prior = None if before is None else before.equations(best)
     found = replace(found, walls=estimate_walls(core.moments, best, found.walls, prior)[1])
     problem = problem.on(found, resumed=best)
     return problem, solve(problem, found.walls.seen_by(moments), held=held)
@@ -248,6 +277,14 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
         functions = torch.cat([term.basis(conditions) for term in frame_terms])  # type: ignore[operator]
         symbols = [symbol for term in frame_terms for symbol in term.symbols]
         moments = moments.with_conditions(functions.T, symbols)
+    if problem.known is not None and problem.known.variance:
+        # Few frames may determine little: what they cannot tell starts where it is known.
+        carried = problem.known.prior(problem.start(moments.columns([])))
+        start = carried.centre if problem.resumed is None else problem.resumed
+        found = minimise(MomentObjective(moments, carried), start, solver, problem.watcher)
+        core = Core(options=options, moments=moments, start=start, smoothness=None, solution=found)
+        core = replace(core, carried=carried)
+        return _hold(problem, core) if held else core
     start, poses = _start(problem, moments, model), problem.poses()
     # Six folds choose the strength of a penalty; poses go to them in turn, with all their images.
     # Runs of poses would choose stiffer curves: 0.1 mm worse on held-out views of a Kinect v2.
@@ -280,7 +317,7 @@ def _hold(problem: Problem, core: Core) -> Core:
     moments, best, smooth = core.moments, core.solution.parameters, core.smoothness
     if smooth is not None:
         smooth = smooth.rescaled(effective_variance(moments, best))
-    found = observability(moments, best, smooth, problem.estimated)
+    found = observability(moments, best, core.carried or smooth, problem.estimated)
     prior = prior_on_undetermined(found, problem.guess(moments))
     core = replace(core, smoothness=smooth, observability=found, prior=prior)
     if prior is None:

@@ -31,7 +31,14 @@ from tofcorr.estimation.solvers import (
     initial_parameters,
     with_linear_part,
 )
-from tofcorr.estimation.uncertainty import Covariance, Direction, Observability, worst_axes
+from tofcorr.estimation.uncertainty import (
+    Covariance,
+    Direction,
+    Observability,
+    posterior_covariance,
+    worst_axes,
+)
+from tofcorr.fit.known import Known
 from tofcorr.fit.walls import FoundWalls
 from tofcorr.fit.weighting import PixelWeights
 from tofcorr.options import Options
@@ -174,6 +181,7 @@ class Problem:
         watcher: Called after each iteration of the solver.
         resumed: Where an earlier fit stood; None starts anew.
         walls: The estimated walls; None as long as the recorded ones are used.
+        known: What earlier calibrations say; None: nothing.
     """
 
     dataset: Dataset
@@ -184,6 +192,7 @@ class Problem:
     watcher: Watcher | None = None
     resumed: Parameters | None = None
     walls: FoundWalls | None = None
+    known: Known | None = None
 
     def poses(self) -> Tensor:
         """Return the pose of each frame, shape (N,), numbered from zero without gaps."""
@@ -208,6 +217,8 @@ class Problem:
     def guess(self, moments: ImageMoments) -> Parameters:
         """Return the recorded hand-eye transform and no error: the centre of the prior."""
         zero = torch.zeros(len(moments.symbols), dtype=torch.float64)
+        if self.known is not None and self.known.parameters.hand_eye_is_free:
+            return replace(self.known.parameters, coefficients=zero)
         free = hand_eye_is_free(self.dataset, self.options.hand_eye)
         return Parameters(recorded_hand_eye(self.dataset), zero, free)
 
@@ -290,7 +301,9 @@ class Core:
         moments: The moments of the images fitted, with the columns of the condition terms.
         start: Where the solver started.
         solution: The parameters found, and why the solver stopped.
-        smoothness: The smoothing penalties as a prior; None if no term is penalised.
+        smoothness: The smoothing penalties as a prior; None if no term is penalised, or if earlier
+            calibrations are carried in, which hold it already.
+        carried: What earlier calibrations say, as a prior; None: there is none.
         observability: How well the images determine each direction, without the prior; None as
             long as nobody asked.
         prior: On the directions that they do not determine; None if there is none.
@@ -301,15 +314,17 @@ class Core:
     start: Parameters
     solution: Solution
     smoothness: Prior | None
+    carried: Prior | None = None
     observability: Observability | None = None
     prior: Prior | None = None
 
     @property
     def total_prior(self) -> Prior | None:
-        """Every prior of the fit: that on undetermined directions, and the smoothness."""
-        if self.prior is None or self.smoothness is None:
-            return self.prior or self.smoothness
-        return self.prior.joined(self.smoothness)
+        """Every prior of the fit: on undetermined directions, and what was known before."""
+        before = self.carried or self.smoothness
+        if self.prior is None or before is None:
+            return self.prior or before
+        return self.prior.joined(before)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -399,6 +414,25 @@ class Fit(Core):
         for one in (self.noise_shift, self.misfit):
             matrix = matrix if one is None else matrix + torch.outer(one.left, one.left)
         return matrix
+
+    @property
+    def joint_covariance(self) -> Tensor:
+        """Covariance of a step of all unknowns, shape (P, P), for a later fit to start from.
+
+        The scatter between poses and the curvature, weighed by the number of poses and of unknowns:
+        of few poses the scatter alone says of some direction that it is known exactly.
+        """
+        matrix = self.covariance.matrix.clone()
+        if self.solution.parameters.hand_eye_is_free:
+            matrix[:6, :6] = self.hand_eye_covariance
+        poses, unknowns = len(self.covariance.jackknife), len(matrix)
+        curved = posterior_covariance(self.observability.precision)
+        return (poses * matrix + unknowns * curved) / (poses + unknowns)
+
+    @property
+    def residual_variance(self) -> float:
+        """The effective variance of a residual, by these images and by what was carried in."""
+        return self.observability.variance if self.carried is None else self.carried.variance
 
     @property
     def hand_eye_errors(self) -> tuple[float, float]:

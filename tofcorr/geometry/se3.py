@@ -93,21 +93,20 @@ def log(transform: Tensor) -> Tensor:
     return twist.reshape(*transform.shape[:-2], 6)
 
 
-def change_of_log(twist: Tensor) -> Tensor:
-    """Return the derivative (6, 6) of log(exp(twist) exp(step)) by the step, at no step.
+def log_slope(twist: Tensor) -> Tensor:
+    r"""Return the derivative of log(exp(twist) exp(step)) by the step at zero, shape (6, 6).
 
-    It is the inverse of the integral of exp(-s ad) over s from 0 to 1, with ad the matrix of the
-    Lie bracket with the twist (6,); Sola, Deray, Atchuthan (2018), "A micro Lie theory", section
-    II-G.
+    It is the inverse of :math:`\int_0^1 e^{-s\,\mathrm{ad}}\,ds`, ad being the twist's commutator
+    (Barfoot 2017, section 7.1.5).
+
+    Args:
+        twist: Translation and rotation, shape (6,).
     """
-    turn, shift = (
-        (part[:, None, None] * GENERATORS[3:, :3, :3].to(twist)).sum(0)
-        for part in (twist[3:], twist[:3])
-    )
-    bracket = torch.cat([torch.cat([turn, shift], 1), torch.cat([0 * turn, turn], 1)])
-    unit = torch.eye(6).to(twist)
-    flow = torch.cat([torch.cat([-bracket, unit], 1), torch.zeros(6, 12).to(twist)])
-    return torch.linalg.inv(torch.linalg.matrix_exp(flow)[:6, 6:])
+    axes = torch.eye(3).to(twist)
+    shift, turn = (torch.linalg.cross(part.expand(3, 3), axes).T for part in twist.split(3))
+    commutator = torch.cat([torch.cat([turn, shift], 1), torch.cat([0 * turn, turn], 1)])
+    corner = torch.cat([-commutator, torch.eye(6).to(twist)], dim=1)
+    return torch.linalg.inv(torch.matrix_exp(torch.nn.functional.pad(corner, (0, 0, 0, 6)))[:6, 6:])
 
 
 def inverse(transform: Tensor) -> Tensor:

@@ -541,7 +541,7 @@ class LiveCalibration:
         spread = 1e3 * found.covariance.matrix.diagonal().clamp(min=0).sqrt()[best.twist_size :]
         return replace(
             now,
-            odd=tuple(self._odd(found, moments, place, compared=math.isfinite(shift))),
+            odd=tuple(self._odd(found, moments, place)),
             translation_mm=shift,
             rotation_deg=turn,
             terms_mm=dict(zip(moments.symbols, spread.tolist(), strict=True)),
@@ -550,24 +550,26 @@ class LiveCalibration:
             enough=shift <= self.wanted_mm and turn <= self.wanted_deg,
         )
 
-    def _odd(self, found: Fit, moments: ImageMoments, place: int, *, compared: bool) -> list[str]:
-        """Return what is odd about an image, beside the others if compared, a sentence each."""
-        best, number = found.optimum, np.arange(len(moments.count))
-        # Of each image's plane nothing is known, but for one ray, which shows no tilt.
-        ridge = moments.count[:, None, None] * torch.eye(3).double() / 1e9
-
-        noise = np.array([self._frames[k].noise for k in self._order()])
-
-        def rms(own: ImageMoments) -> np.ndarray:
-            losses = MomentObjective(own).image_losses(best).clamp(min=0)
-            return (losses / own.count).sqrt().numpy()
+    def _odd(self, found: Fit, moments: ImageMoments, place: int) -> list[str]:
+        """Return what is odd about an image beside the others, a sentence each."""
+        before, number, said = self._known, np.arange(len(moments.count)), []
 
         def is_outlying(sizes: np.ndarray) -> bool:
             return any(one["frame"] == place for one in outlying_images(number, sizes))
 
-        said = []
-        if compared and len(number) >= _ENOUGH_TO_COMPARE:
-            within, whole = rms(within_prior(moments, best, ridge)), rms(moments)
+        # A wrong frame spoils the fit: it is judged by the one without it.
+        known = before is not None and math.isfinite(before.translation_mm)
+        if known and len(number) >= _ENOUGH_TO_COMPARE and before and before.fit:
+            change = columns_on(found.options, before.fit.domain, found.domain)
+            best = before.fit.optimum
+            best = replace(best, coefficients=change.T @ best.coefficients)
+            # Of each image's plane nothing is known, but for one ray, which shows no tilt.
+            ridge = moments.count[:, None, None] * torch.eye(3).double() / 1e9
+            within, whole = (
+                (MomentObjective(own).image_losses(best).clamp(min=0) / own.count).sqrt().numpy()
+                for own in (within_prior(moments, best, ridge), moments)
+            )
+            noise = np.array([self._frames[k].noise for k in self._order()])
             # Dark targets have more noise: within an image it is the unit.
             if is_outlying(within / noise):
                 said.append(f"shows no plane: {1e3 * within[place]:.1f} mm are left within it.")

@@ -14,6 +14,7 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.fit.fitting import calibrated, fit
+from tofcorr.fit.known import Known
 from tofcorr.fit.misfit import assumptions, find_misfit, misfit_pixels
 from tofcorr.fit.problem import FitOptions
 from tofcorr.fit.walls import with_every_wall
@@ -59,6 +60,7 @@ class Calibration:
         watcher: Called after each iteration of the solver; returning False ends it.
         resumed: Where an interrupted run stood; None starts anew.
         left_out: Global numbers of frames that are neither fitted nor held out.
+        known: What earlier calibrations say, for the ranges of the fit; None: nothing.
 
     Raises:
         CalibrationDataError: The recordings cannot support the model.
@@ -81,12 +83,12 @@ class Calibration:
         watcher: Watcher | None = None,
         resumed: Parameters | None = None,
         left_out: Collection[int] = (),
+        known: Known | None = None,
     ) -> None:
-        halves = split_frames(data, options.split)
-        self.train, self.test = (own[~np.isin(own, list(left_out))] for own in halves)
+        self.train, self.test = halves(data, options, left_out)
         lattice = lattice_of(data, self.train)
-        domain = covered_domain(data, self.train, lattice)
-        found = fit(data, self.train, options, domain, watcher, resumed, lattice=lattice)
+        domain = covered_domain(data, self.train, lattice) if known is None else known.domain
+        found = fit(data, self.train, options, known or domain, watcher, resumed, lattice=lattice)
         self.data = data = with_every_wall(data, found.walls, found.model)
         self.stages = {
             "before": without_correction(domain, recorded_hand_eye(data)),
@@ -108,6 +110,14 @@ class Calibration:
     def frames(self) -> np.ndarray:
         """Global numbers of all frames used, fitted or held out, increasing."""
         return np.sort(np.concatenate([self.train, self.test]))
+
+
+def halves(
+    data: Dataset, options: TrainingOptions, left_out: Collection[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the global numbers of the frames to fit, and of those held out."""
+    train, test = split_frames(data, options.split)
+    return train[~np.isin(train, list(left_out))], test[~np.isin(test, list(left_out))]
 
 
 def without_correction(domain: Domain, tool_from_camera: Tensor) -> CalibrationModel:

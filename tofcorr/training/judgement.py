@@ -270,6 +270,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     return "\n".join(
         [
             verdict_text(report),
+            *update_words(report)[:1],
             *_error_table(report, {"rms": "RMS"}),
             *_hand_eye_lines(report)[:1],
             *_advice_lines(report, 2),
@@ -284,7 +285,7 @@ def full_text(report: Mapping[str, Any]) -> str:
     Args:
         report: The content of report.json.
     """
-    lines = [verdict_text(report), report["message"]]
+    lines = [verdict_text(report), *update_words(report), report["message"]]
     lines += _error_table(report, {"mean_abs": "mean abs.", "rms": "RMS"})
     for half, own in report["views_mm"].items():
         if own["rms_z"] is not None:
@@ -298,6 +299,24 @@ def full_text(report: Mapping[str, Any]) -> str:
         lines += _advice_lines(report, len(report["advice"]["poses"]))
         lines.append(f"  In symbols it is {report['advice']['direction']}.")
     return "\n".join([*lines, *_warnings(report)])
+
+
+def update_words(report: Mapping[str, Any]) -> list[str]:
+    """Return what earlier calibrations say: what has changed since, and the other explanations.
+
+    Args:
+        report: The content of report.json.
+    """
+    units = report.get("prior", {"units": []})["units"]
+    own = [f"The prior is what {len(units)} units of its type have in common."] if units else []
+    if (update := report.get("update")) is None:
+        return own
+    others = [
+        f"{one['changed'].replace('_', ' ')} {one['probability']:.2g}"
+        for one in update["explanations"][1:]
+    ]
+    others = f"Other explanations: {', '.join(others)}."
+    return [update["sentence"], others, *own, *update["notes"]]
 
 
 def _error_table(report: Mapping[str, Any], kinds: Mapping[str, str]) -> list[str]:
@@ -353,7 +372,9 @@ def verdict_text(report: Mapping[str, Any]) -> str:
     Args:
         report: The content of report.json; older ones lack `expected`.
     """
-    said, expects = f"Verdict: {report['verdict']}. {report['reason']}", report.get("expected", "")
+    reason, expects = report["reason"], report.get("expected", "")
+    said = expects if expects.startswith(reason.rstrip(".")) else reason
+    said = f"Verdict: {report['verdict']}. {said}"
     return said if expects in said else f"{said} {expects}"
 
 

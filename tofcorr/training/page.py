@@ -26,7 +26,13 @@ from tofcorr.training.figures import (
     profile_figure,
     residual_figure,
 )
-from tofcorr.training.judgement import advice_words, left_out_words, outlying_words, stage_words
+from tofcorr.training.judgement import (
+    advice_words,
+    left_out_words,
+    outlying_words,
+    stage_words,
+    update_words,
+)
 
 if TYPE_CHECKING:  # Matplotlib takes longer to import than a short fit.
     from matplotlib.figure import Figure
@@ -93,6 +99,7 @@ def render(
         figures,
         {"mm": in_mm, "with_interval": with_interval, "stage": stage_words},
         report=report,
+        updated=update_words(report),
         advised=report["advice"] and advice_words(report["advice"]),
         names=[recording.path.name for recording in data.recordings],
         frame={"number": frame, "target": data.targets[frame], "tested": frame in calibration.test}

@@ -3,13 +3,15 @@
 import logging
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
@@ -23,16 +25,24 @@ from tofcorr.errors import ConfigError, ExportError
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Solution
 from tofcorr.files import refuse_existing, staged_folder, write_json, write_text
+from tofcorr.fit.known import Known
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import REFERENCE_FILE, estimate_reference, save_reference
 from tofcorr.options import dump_yaml, resolve_options
-from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
+from tofcorr.pixels.dataset import (
+    Dataset,
+    Recordings,
+    opened,
+    resolved_planes,
+    split_frames,
+)
+from tofcorr.pixels.lattice import covered_domain, lattice_of
 from tofcorr.pixels.passes import is_first, process_group
 from tofcorr.pixels.sample import PixelSample, usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import stages
-from tofcorr.training.calibration import Calibration, TrainingOptions
+from tofcorr.training.calibration import Calibration, TrainingOptions, halves
 from tofcorr.training.figures import frames_to_show, profile_figure, residual_figure
 from tofcorr.training.judgement import (
     DO_NOT_USE,
@@ -42,6 +52,7 @@ from tofcorr.training.judgement import (
     report_text,
 )
 from tofcorr.training.monitor import RunMonitor
+from tofcorr.training.pool import CameraType, load_type
 from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report
 
 if TYPE_CHECKING:
@@ -67,6 +78,8 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
         noise=None if fit.noise is None else fit.noise[:3],
         frames=recording.frame_names,
         hand_eye_accuracy=hand_eye_accuracy(fit),
+        joint_covariance=fit.joint_covariance,
+        residual_variance=fit.residual_variance,
     )
 
 
@@ -259,6 +272,7 @@ def train(
     *,
     out: Path | str | None = None,
     resume: Path | str | None = None,
+    prior: Path | str | None = None,
     force: bool = False,
 ) -> TrainingResult:
     """Fit an error model and the hand-eye transform to recordings of one camera.
@@ -273,17 +287,63 @@ def train(
             and files for TensorBoard follow once it is there. None writes nothing;
             `TrainingResult.save` does later.
         resume: Folder of an interrupted run of the same model; the fit goes on where it stood.
+        prior: File of `tofcorr.pool`: what other cameras of this type have in common. Fewer poses
+            are then enough.
         force: Fit whatever the recordings look like, and write a corrector whatever the verdict.
 
     Returns:
         The fitted model with its report; its `repr` is what the command prints.
 
     Raises:
-        ConfigError: The configuration is wrong, or `resume` is a run of another model.
+        ConfigError: The configuration is wrong, or `resume` or `prior` are of another model.
         CalibrationDataError: The recordings cannot support the model, or cannot be what they say
-            (see `tofcorr.inspect`); `out` exists, or `resume` holds no run.
+            (see `tofcorr.inspect`); `out` exists, `resume` holds no run, or `prior` is no file of
+            `tofcorr.pool` or is of a camera of another image size.
     """
-    options = resolve_options(TrainingOptions, config)
+    options, carry = resolve_options(TrainingOptions, config), None
+    if prior is not None:
+        of_type = load_type(prior, options)
+        options = options.model_copy(update={"model": of_type.error_model})
+        carry = partial(_of_type, of_type)
+    return carried_training(recordings, options, carry, out=out, resume=resume, force=force)
+
+
+class Carried(NamedTuple):
+    """What a training knows before its fit.
+
+    Attributes:
+        data: The recordings.
+        known: What earlier calibrations say, for the ranges of the fit.
+        said: Returns what the report says of it, by its key, from the fit.
+    """
+
+    data: Dataset
+    known: Known
+    said: Callable[[Fit], dict[str, Any]]
+
+
+Carry = Callable[[Dataset, TrainingOptions, np.ndarray], Carried]
+"""Returns what is known before a fit to some frames of recordings."""
+
+
+def _of_type(
+    of_type: CameraType, data: Dataset, options: TrainingOptions, frames: np.ndarray
+) -> Carried:
+    """Return what other cameras of the type say."""
+    known = of_type.known(data).towards(covered_domain(data, frames, lattice_of(data, frames)))
+    return Carried(data, known, lambda fit: {"prior": {"units": list(of_type.units)}})
+
+
+def carried_training(
+    recordings: Recordings,
+    options: TrainingOptions,
+    carry: Carry | None,
+    *,
+    out: Path | str | None,
+    resume: Path | str | None = None,
+    force: bool = False,
+) -> TrainingResult:
+    """Train as `train` does, with what is known before; None: nothing."""
     if out is not None:
         refuse_existing(Path(out))
     seconds: dict[str, float] = {}
@@ -317,9 +377,12 @@ def train(
 
                 local = options.model_copy(update={"device": device})
                 with stage("fit"):
-                    calibration = Calibration(data, local, watch, start, left_out)
+                    before = carry and carry(data, local, halves(data, local, left_out)[0])
+                    data, known = (data, None) if before is None else before[:2]
+                    calibration = Calibration(data, local, watch, start, left_out, known)
                 with stage("report"):
                     report = training_report(calibration, options, inspection)
+                    report |= {} if before is None else before.said(calibration.fit)
                 result = TrainingResult(
                     report=report | {"seconds": seconds},
                     calibration=calibration,
