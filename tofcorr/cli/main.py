@@ -24,6 +24,7 @@ COMMANDS = {
     "import": ("record", "Turn recorded images into a recording."),
     "inspect": ("calibrate", "Say what is odd about a recording, before any fit."),
     "train": ("calibrate", "Calibrate a recording: distance, pixel, intensity error, hand-eye."),
+    "rig": ("calibrate", "Calibrate several cameras of one robot together, and its joints."),
     "evaluate": ("calibrate", "Compare models on held-out images, in the paper's two tables."),
     "select": ("calibrate", "Choose the model that predicts best what it has not seen."),
     "compare": ("calibrate", "Show several runs side by side: errors, hand-eye, options."),

@@ -278,6 +278,11 @@ class Prior:
         assert isinstance(slope, Tensor)
         return self.factor @ slope
 
+    @property
+    def scores(self) -> Float[Tensor, "P F"]:
+        """How much each row's own error of one standard deviation changes the gradient."""
+        return self.variance * self.factor.T
+
     def rescaled(self, variance: float) -> "Prior":
         """Return the same prior on the scale of another effective variance of a residual."""
         grown = math.sqrt(self.variance / variance)

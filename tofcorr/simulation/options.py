@@ -9,6 +9,7 @@ from torch import Tensor
 from tofcorr.data.recording import CameraSection, DepthKind
 from tofcorr.data.table import COLUMN_OF
 from tofcorr.geometry import se3
+from tofcorr.geometry.camera import FrameNames
 from tofcorr.options import (
     Count,
     NonNegativeNumber,
@@ -185,6 +186,10 @@ class SimulatorOptions(Options):
         hand_eye: Where the camera is mounted on the robot's tool.
         conditions: Time, exposure, temperature, background light.
         effects: Effects beyond the plain sensor, each with its `name` and parameters.
+        frames: What the robot calls its coordinate frames; names the camera of several.
+        robot_of: Folder of a simulated recording whose robot carries this camera too: stops, their
+            errors, targets and conditions are that recording's; `shots`, `robot` and `conditions`
+            are not used. null: the camera has a robot of its own.
     """
 
     config_folder: ClassVar[str] = "simulate"
@@ -200,3 +205,5 @@ class SimulatorOptions(Options):
     hand_eye: CameraMountOptions = CameraMountOptions()
     conditions: ConditionOptions = ConditionOptions()
     effects: tuple[dict[str, Any], ...] = ()
+    frames: FrameNames = FrameNames()
+    robot_of: str | None = None

@@ -15,7 +15,7 @@ from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.fit.fitting import calibrated, fit
 from tofcorr.fit.misfit import assumptions, find_misfit, misfit_pixels
-from tofcorr.fit.problem import FitOptions
+from tofcorr.fit.problem import Fit, FitOptions
 from tofcorr.fit.walls import with_every_wall
 from tofcorr.pixels.dataset import (
     Dataset,
@@ -59,6 +59,8 @@ class Calibration:
         watcher: Called after each iteration of the solver; returning False ends it.
         resumed: Where an interrupted run stood; None starts anew.
         left_out: Global numbers of frames that are neither fitted nor held out.
+        found: The fit, where it was made together with other cameras; the recordings then have the
+            walls and poses that it found.
 
     Raises:
         CalibrationDataError: The recordings cannot support the model.
@@ -81,16 +83,17 @@ class Calibration:
         watcher: Watcher | None = None,
         resumed: Parameters | None = None,
         left_out: Collection[int] = (),
+        found: Fit | None = None,
     ) -> None:
-        halves = split_frames(data, options.split)
-        self.train, self.test = (own[~np.isin(own, list(left_out))] for own in halves)
-        lattice = lattice_of(data, self.train)
-        domain = covered_domain(data, self.train, lattice)
-        found = fit(data, self.train, options, domain, watcher, resumed, lattice=lattice)
+        self.train, self.test = halves(data, options.split, left_out)
+        if found is None:
+            lattice = lattice_of(data, self.train)
+            domain = covered_domain(data, self.train, lattice)
+            found = fit(data, self.train, options, domain, watcher, resumed, lattice=lattice)
         self.data = data = with_every_wall(data, found.walls, found.model)
         self.stages = {
-            "before": without_correction(domain, recorded_hand_eye(data)),
-            "hand_eye_only": without_correction(domain, found.hand_eye_only.tool_from_camera),
+            "before": without_correction(found.domain, recorded_hand_eye(data)),
+            "hand_eye_only": without_correction(found.domain, found.hand_eye_only.tool_from_camera),
             "after": found.model,
         }
         every = frame_errors(data, self.stages, options.device, found.observability.variance)
@@ -108,6 +111,15 @@ class Calibration:
     def frames(self) -> np.ndarray:
         """Global numbers of all frames used, fitted or held out, increasing."""
         return np.sort(np.concatenate([self.train, self.test]))
+
+
+def halves(
+    data: Dataset, split: SplitOptions, left_out: Collection[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames to fit and those held out, without those that are left out."""
+    both = split_frames(data, split)
+    fitted, held_out = (own[~np.isin(own, list(left_out))] for own in both)
+    return fitted, held_out
 
 
 def without_correction(domain: Domain, tool_from_camera: Tensor) -> CalibrationModel:
