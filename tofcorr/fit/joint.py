@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import STANDSTILL
-from tofcorr.errors import ConfigError
+from tofcorr.data.table import TABLE_FILE
+from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.joint import Together, View, estimate_together
 from tofcorr.estimation.linear import NormalEquations, solvable
 from tofcorr.estimation.moments import MomentObjective, Parameters
@@ -216,16 +217,18 @@ def posed_arm(arm: Arm, chosen: Sequence[int], data: Dataset, frames: Frames) ->
     """Return an arm at frames of a data set.
 
     Raises:
-        CalibrationDataError: The recordings lack joint angles.
-        ConfigError: The arm has other joints, or takes the tool elsewhere.
+        CalibrationDataError: The recordings lack joint angles, or have those of other joints.
+        ConfigError: The arm takes the tool elsewhere.
     """
     for recording in data.recordings:
-        recording.require("joint_angles", "a fit of the robot's joints")
+        if recording.frames.joint_angles is None:
+            said = f"{recording.path / TABLE_FILE}: columns 'joint_1', 'joint_2', ... are missing"
+            raise CalibrationDataError(f"{said}; a fit of the robot's joints needs them.")
+        if (number := recording.frames.joint_angles.shape[1]) != len(arm.names):
+            said = f"{recording.path / TABLE_FILE}: there are {number} joint angles, the URDF has"
+            raise CalibrationDataError(f"{said} {len(arm.names)}: {', '.join(arm.names)}.")
     at, path = torch.as_tensor(np.asarray(frames)), data.first.path
     angles, pose = (data.column(name)[at] for name in ("joint_angles", "world_from_tool"))
-    if angles.shape[1] != len(arm.names):
-        said = f"frames.csv has {angles.shape[1]} joint angles, the URDF's chain has"
-        raise ConfigError(f"{path}: {said} {len(arm.names)}: {', '.join(arm.names)}.")
     backwards = data.first.frame_names.eye_to_hand
     tool = se3.inverse(arm.poses(angles)) @ (se3.inverse(pose) if backwards else pose)
     off = float((tool - tool[:1]).abs().amax())
