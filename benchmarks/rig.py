@@ -1,12 +1,17 @@
 """Do the intervals of cameras calibrated together hold, and is that better than each alone?
 
-    python -m benchmarks.rig --seed S --count 100
+    python -m benchmarks.rig cameras --seed S --count 100
+    python -m benchmarks.rig joints  --seed S --count 100
 
 Each case has two cameras with errors of their own on one robot of 20 to 40 stops, before one wall
 whose place is unknown. Their hand-eye transforms differ at random. EA is fitted to both together,
 and to each alone. Compared is the transform from one camera to the other.
+
+`joints`: one camera on an arm of six axes whose joints have offsets of 0.2 degrees, half of the
+time before a wall that was measured. EA is fitted with the offsets, and without.
 """
 
+import math
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -28,10 +33,11 @@ from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.lattice import covered_domain, lattice_of
-from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.options import ArmOptions, SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 from tofcorr.training.calibration import TrainingOptions
 
+OFFSETS_DEG = 0.2  # standard deviation of the offsets of the joints
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")
 
 
@@ -115,15 +121,99 @@ def tables(rows: list[np.ndarray]) -> str:
     )
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("--seed", type=int, required=True)
-@click.option("--count", default=100, show_default=True)
-@click.option("--stops", type=int, help="Stops at which the second camera is used; all by default.")
-def main(seed: int, count: int, stops: int | None) -> None:
-    """Measure the coverage of intervals and the error between two cameras."""
+def one_arm(seed: int, number: int) -> dict[str, np.ndarray]:
+    """Draw and fit one camera on an arm.
+
+    Returns:
+        `joints`, (3, 6): error and half-width of each offset, NaN where it was named as not
+        determined, and the offset, degrees; `known`: whether the wall was measured; `mounts`,
+        (4, 6): error and half-width of the hand-eye with offsets and without, metres and radians.
+    """
+    generator = np.random.default_rng([seed, 41, number])
+    values, known = drawn_camera(generator), number % 2 == 0
+    offsets = generator.normal(0, OFFSETS_DEG, 6)
+    values["scene"] = {"plane": {"normal": [-1, 0, 0], "offset_m": 1.3}}
+    values["robot"] |= {"distance_m": [0.5, 1.1], "arm": {"offsets_deg": offsets.tolist()}}
+    with tempfile.TemporaryDirectory() as folder:
+        simulate(values, Path(folder) / "wall")
+        problem = problem_of(Path(folder) / "wall", "known" if known else "unknown")
+        both = fit_together([problem], ArmOptions().arm()), fit_together([problem])
+    place, mounts = both[0].together.places()[-1], list[Tensor]()
+    quantile = student_quantile(39 / 40, both[0].covariance.degrees_of_freedom)
+    spread = both[0].covariance.matrix.diagonal()[place].sqrt()
+    joints = np.full((3, 6), np.nan)
+    chosen = list(both[0].chosen)
+    joints[0, chosen] = np.rad2deg(both[0].together.offsets.numpy()) - offsets[chosen]
+    joints[1, chosen] = np.rad2deg(quantile * spread.numpy())
+    joints[2] = offsets
+    # The last joint's offset is in the hand-eye: that is what is said, and no error of it.
+    last = torch.tensor([0, 0, 0, 0, 0, math.radians(offsets[5])], dtype=torch.float64)
+    true = se3.exp(last) @ true_hand_eye(values)
+    for joint in both:
+        found = joint.fits[0]
+        off = se3.log(se3.inverse(true) @ found.solution.parameters.tool_from_camera)
+        mounts += [off, quantile * found.hand_eye_covariance.diagonal().sqrt()]
+    return {"joints": joints, "known": np.array(known), "mounts": torch.stack(mounts).numpy()}
+
+
+def arm_tables(rows: list[dict[str, np.ndarray]]) -> str:
+    """Return how often offsets are determined, their intervals and errors, and the hand-eye's."""
+    joints, mounts, known = (
+        np.stack([one[key] for one in rows]) for key in ("joints", "mounts", "known")
+    )
+    lines = []
+    for name, own in (("measured", joints[known]), ("unknown", joints[~known])):
+        found, half, _ = own.transpose(1, 0, 2)
+        for k, joint in enumerate(ArmOptions().arm().names):
+            seen = np.isfinite(found[:, k])
+            held = share(np.abs(found[seen, k]) <= half[seen, k])
+            off = f"{math.sqrt(np.mean(found[seen, k] ** 2)):.3f}" if seen.any() else ""
+            lines.append((name, joint, len(own), int(seen.sum()), held if seen.any() else "", off))
+    seen = np.isfinite(joints[:, 0])
+    held = share((np.abs(joints[:, 0]) <= joints[:, 1])[seen])
+    lines.append(("all", "all", len(rows), int(seen.sum()), held, ""))
+    sizes = []
+    for name, off, half in (
+        ("with", *mounts[:, :2].transpose(1, 0, 2)),
+        ("without", *mounts[:, 2:].transpose(1, 0, 2)),
+    ):
+        place, turn = (
+            np.linalg.norm(1e3 * off[:, part], axis=1) for part in (slice(3), slice(3, 6))
+        )
+        rms = (f"{math.sqrt(np.mean(one**2)):.2f} ({np.median(one):.2f})" for one in (place, turn))
+        sizes.append((name, len(rows), *rms, share((np.abs(off) <= half).ravel())))
+    heads = ("wall", "joint", "n", "determined", "95 % intervals hold", "RMS error, deg")
+    hand_eye = ("offsets", "n", "hand-eye RMS (median), mm", "mrad", "95 % intervals hold")
+    return f"{table(heads, lines)}\n\n{table(hand_eye, sizes)}"
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def main() -> None:
+    """Measure what a joint fit finds: of two cameras, or of a robot's joints."""
     torch.set_num_threads(1)
-    numbers = tqdm(range(count), leave=False)
+
+
+_SEED = click.option("--seed", type=int, required=True)
+_COUNT = click.option("--count", default=100, show_default=True)
+
+
+@main.command()
+@_SEED
+@_COUNT
+@click.option("--stops", type=int, help="Stops at which the second camera is used; all by default.")
+def cameras(seed: int, count: int, stops: int | None) -> None:
+    """Measure the coverage of intervals and the error between two cameras."""
+    numbers = tqdm(range(count), leave=False, disable=None)
     click.echo(tables([one_case(seed, number, stops) for number in numbers]))
+
+
+@main.command()
+@_SEED
+@_COUNT
+def joints(seed: int, count: int) -> None:
+    """Measure which offsets are determined, their intervals, and what they do to the hand-eye."""
+    numbers = tqdm(range(count), leave=False, disable=None)
+    click.echo(arm_tables([one_arm(seed, number) for number in numbers]))
 
 
 if __name__ == "__main__":

@@ -92,7 +92,8 @@ def rig_command(
 
     A recording belongs to the camera that its `frames` in recording.yaml name; without a name, to
     one called as its folder. OUT holds a run folder for each camera, as `tofcorr train` makes it,
-    and rig.yaml with the transforms between the cameras and the walls.
+    and rig.yaml with the transforms between the cameras and the walls. With --urdf the recordings
+    need joint angles; the offsets of the joints are estimated too, and robot.urdf has them.
     """
     from tofcorr.training.rig import rig
 

@@ -328,8 +328,9 @@ def _undetermined(
     # Half of the variance is then the prior's.
     while (here := share(nothing)).max() > 1 / 2:
         worst = int(here.argmax())
-        groups = {"a turn of the camera": torch.cat([p[:6] for p in places[:-2]])}
-        groups |= {"a turn of all walls": places[-2], "the offsets of other joints": joints}
+        groups = {"a turn of the camera about its axis": torch.cat([p[:6] for p in places[:-2]])}
+        groups |= {"a turn of all walls about its axis": places[-2]}
+        groups |= {"those of other joints together": joints}
         found[worst] = ""
         for words, group in groups.items():
             known = nothing.clone()

@@ -49,7 +49,7 @@ class Arm:
         Raises:
             ConfigError: The file is no URDF, the tip is not determined, or the chain cannot move.
         """
-        joints = {_link(one, "child", path): one for one in _tree(path).iter("joint") if len(one)}
+        joints = {_link(one, "child", path): one for one in _tree(path).findall("joint")}
         parents = {child: _link(joint, "parent", path) for child, joint in joints.items()}
         links = {*parents, *parents.values()}
         leaves = sorted(links - {*parents.values()})
@@ -65,7 +65,7 @@ class Arm:
             link = parents[link]
         fixed, twists, names = [torch.eye(4, dtype=torch.float64)], list[Tensor](), list[str]()
         for joint in chain:
-            fixed[-1] = fixed[-1] @ _origin(joint, path)
+            fixed[-1] = fixed[-1] @ origin_of(joint, path)
             kind = joint.get("type", "")
             if kind in _MOVING:
                 axis = _numbers(joint.find("axis"), "xyz", path, (1.0, 0.0, 0.0))
@@ -171,7 +171,7 @@ def _numbers(
     return found
 
 
-def _origin(joint: ET.Element, path: Path | str) -> Float[Tensor, "4 4"]:
+def origin_of(joint: ET.Element, path: Path | str) -> Float[Tensor, "4 4"]:
     """Return parent_from_joint of a joint at zero: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     element, zero = joint.find("origin"), (0.0, 0.0, 0.0)
     shift, angles = (_numbers(element, key, path, zero) for key in ("xyz", "rpy"))

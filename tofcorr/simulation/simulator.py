@@ -249,6 +249,7 @@ def append_frame(writer: RecordingWriter, state: FrameState, options: SimulatorO
         offset=float(facts.offset[-1]),
         target=state.target,
         pose_id=state.pose_id if "pose_id" in recorded else None,
+        joint_angles=None if facts.joint_angles is None else facts.joint_angles[-1].numpy(),
     )
     writer.append(
         depth.numpy(),
@@ -341,6 +342,7 @@ def facts_of(recording: Recording) -> FrameFacts:
         offset=torch.from_numpy(table.offset),
         tool_twist=tool_twists(conditions["timestamp"], poses) if recording.moves else None,
         approach=sides_of_approach(poses),
+        joint_angles=None if table.joint_angles is None else torch.from_numpy(table.joint_angles),
         **conditions,
     )
 

@@ -1,7 +1,7 @@
 """`tofcorr.rig`: calibrate several cameras of one robot together, and the robot's own errors."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tofcorr.correction.export.urdf import corrected_description
 from tofcorr.data.recording import Recording
 from tofcorr.digits import aligned, at_most
 from tofcorr.errors import CalibrationDataError, ConfigError
@@ -35,6 +36,8 @@ from tofcorr.training.report import training_report
 from tofcorr.training.run import Config, TrainingResult, inspected, timed_stages
 from tofcorr.version import __version__
 
+ROBOT_FILE = "robot.urdf"
+"""The robot's description with the offsets found, in the folder of a rig."""
 RIG_FILE = "rig.json"
 """What was found of several cameras together, in the folder that holds their runs."""
 
@@ -47,14 +50,16 @@ class RigResult:
         report: The content of rig.json.
         cameras: The training of each camera, by its name.
         fit: The joint fit.
+        robot: Description of the robot with the offsets of its joints; None: none was given.
     """
 
     report: Mapping[str, Any]
     cameras: Mapping[str, TrainingResult]
     fit: JointFit
+    robot: str | None = None
 
     def save(self, folder: Path | str) -> None:
-        """Write a run folder for each camera, rig.json and rig.yaml, whole or not at all.
+        """Write a run folder for each camera, rig.json, rig.yaml and robot.urdf.
 
         Raises:
             CalibrationDataError: Something is there already, or it cannot be written.
@@ -65,6 +70,8 @@ class RigResult:
                 result.write_into(staged / name)
             write_json(staged / RIG_FILE, self.report)
             found = {key: self.report[key] for key in ("transforms", "walls", "joints")}
+            if self.robot is not None:
+                (staged / ROBOT_FILE).write_text(self.robot, encoding="utf-8")
             (staged / "rig.yaml").write_text(dump_yaml(found), encoding="utf-8")
         for name, result in self.cameras.items():
             result.show_in(Path(folder) / name)
@@ -90,12 +97,11 @@ class RigResult:
             error, known = one["held_out_rms_mm"], (f"{x:.2f}" for x in one["hand_eye_ci95_mm_deg"])
             rows.append([name, one["verdict"], "-" if error is None else f"{error:.2f}", *known])
         transforms = [_transform_line(one) for one in report["transforms"]]
-        joints = [_joint_line(one) for one in report["joints"]]
         return [
             f"Verdict: {report['verdict']}. {report['reason']}",
             *at_most(cameras, aligned(rows)),
             *at_most(others, transforms),
-            *at_most(max(others, 3), joints),
+            *at_most(max(others, 3), _joint_lines(report["joints"])),
         ]
 
 
@@ -162,7 +168,13 @@ def rig(
                     monitor=monitors[name],
                     force=force,
                 )
-            result = RigResult(report=_report(joint, cameras), cameras=cameras, fit=joint)
+            robot = None
+            if urdf is not None and arm is not None:
+                names = [arm.names[k] for k in joint.chosen]
+                found = dict(zip(names, joint.together.offsets.tolist(), strict=True))
+                robot = corrected_description(urdf, arm, found)
+            report = _report(joint, cameras)
+            result = RigResult(report=report, cameras=cameras, fit=joint, robot=robot)
         if out is not None:
             with stage("write"):
                 result.save(out)
@@ -283,7 +295,20 @@ def _walls(joint: JointFit, names: list[str]) -> tuple[list[dict[str, Any]], lis
 
 
 def _joints(joint: JointFit, quantile: float) -> list[dict[str, Any]]:
-    return []
+    """Return the offset of each joint, with its interval, or what it cannot be told from."""
+    found, place = list[dict[str, Any]](), joint.together.places()[-1]
+    variances, offsets = joint.covariance.matrix.diagonal()[place], joint.together.offsets
+    for number, name in enumerate(() if joint.arm is None else joint.arm.names):
+        assert joint.arm is not None
+        unit, per_unit = ("deg", math.degrees(1)) if joint.arm.turns[number] else ("mm", 1e3)
+        one: dict[str, Any] = {"joint": name, "unit": unit, "offset": 0.0, "ci95": None}
+        one["same_as"] = joint.undetermined.get(number)
+        if number in joint.chosen:
+            k = joint.chosen.index(number)
+            half = quantile * math.sqrt(max(float(variances[k]), 0.0))
+            one |= {"offset": per_unit * float(offsets[k]), "ci95": per_unit * half}
+        found.append(one)
+    return found
 
 
 def _transform_line(one: Mapping[str, Any]) -> str:
@@ -293,5 +318,17 @@ def _transform_line(one: Mapping[str, Any]) -> str:
     return f"{one['child']} in {one['parent']}, mm: {place}; turn ± {turn:.3f} deg (95 %)"
 
 
-def _joint_line(one: Mapping[str, Any]) -> str:
-    return one["words"]
+def _joint_lines(joints: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the offsets that are determined in one line, and each other in a sentence."""
+    known = [
+        f"{one['joint']} {one['offset']:+.3f} ± {one['ci95']:.3f} {one['unit']}"
+        for one in joints
+        if one["ci95"] is not None
+    ]
+    lines = [f"joint offsets (95 %): {', '.join(known)}"] if known else []
+    for one in joints:
+        if one["ci95"] is None:
+            same = one["same_as"]
+            why = f"is the same as {same}" if same else "is not determined: the poses hardly use it"
+            lines.append(f"The offset of {one['joint']} {why}; 0 is used.")
+    return lines
