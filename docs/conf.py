@@ -43,8 +43,8 @@ html_copy_source = False
 html_theme_options = {"navigation_with_keys": True}
 
 ORDER = {
-    "How to": "install command-line robot-and-wall record choose pytorch deploy check diagnose "
-    "your-simulator sensor *",
+    "How to": "install command-line robot-and-wall two-cameras robot-errors record choose pytorch "
+    "deploy check diagnose your-simulator sensor *",
     "Concepts": "conventions error-model estimation walls observability diagnosis *",
     "Results": "/results models diagnosis gap drift walls robustness speed openings",
     "Reference": "/format /glossary /architecture /thresholds /changelog",

@@ -30,6 +30,8 @@ from tofcorr.sensor.degrade import degrade as degrade
 from tofcorr.sensor.model import SensorModel as SensorModel
 from tofcorr.simulation.simulator import simulate as simulate
 from tofcorr.training.pool import pool as pool
+from tofcorr.training.rig import RigResult as RigResult
+from tofcorr.training.rig import rig as rig
 from tofcorr.training.run import TrainingResult as TrainingResult
 from tofcorr.training.run import train as train
 from tofcorr.training.update import update as update

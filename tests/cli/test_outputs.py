@@ -51,6 +51,7 @@ def test_every_command_but_one_writes() -> None:
 
 _FUNCTIONS: dict[str, Callable[[Path], object]] = {
     "train": lambda out: tofcorr.train(_NOWHERE, out=out),
+    "rig": lambda out: tofcorr.rig(_NOWHERE, out=out),
     "evaluate": lambda out: tofcorr.evaluate(_NOWHERE, out=out),
     "select": lambda out: tofcorr.select(_NOWHERE, out=out),
     "diagnose": lambda out: tofcorr.diagnose(_NOWHERE, out=out),

@@ -1,6 +1,7 @@
 """The table of frames: any pose survives it, and other programs' tables are read alike."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -113,3 +114,18 @@ def test_covariances_of_planes_survive_the_table_and_others_are_refused(tmp_path
     path.write_text(text.replace(repr(float(known[1, 3, 3])), "-1.0"))
     with pytest.raises(CalibrationDataError, match="frame 1: nx_nx to d_d are no covariance"):
         read_table(path)
+
+
+def test_joint_angles_survive_the_table_and_gaps_are_refused(tmp_path: Path) -> None:
+    place = {"world_from_tool": np.eye(4), "normal_world": np.array([0.0, 0, 1]), "offset": 0.0}
+    angles, path = np.random.default_rng(1).normal(size=(3, 11)), tmp_path / "frames.csv"
+    rows = [FrameRow(timestamp=0.0, target="white", **place, joint_angles=one) for one in angles]
+    path.write_text(table_text(rows))
+    table = read_table(path)
+    np.testing.assert_array_equal(table.joint_angles, angles)
+    np.testing.assert_array_equal(table.row(1).joint_angles, angles[1])
+    path.write_text(path.read_text().replace("joint_3,", "elbow,"))
+    with pytest.raises(CalibrationDataError, match="column 'joint_3' is missing beside joint_1"):
+        read_table(path)
+    path.write_text(table_text([*rows, replace(rows[0], joint_angles=None)]))
+    assert read_table(path).joint_angles is None

@@ -8,9 +8,10 @@ from optional import present
 from simulation.small import expected_frames, planned, small
 from torch import Generator
 
+from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
-from tofcorr.simulation.options import CameraMountOptions, MountGuessOptions
+from tofcorr.simulation.options import ArmOptions, CameraMountOptions, MountGuessOptions
 from tofcorr.simulation.robot import hand_eye_guess, tool_twists
 
 
@@ -102,3 +103,18 @@ def test_speed_is_unknown_across_long_gaps() -> None:
     times = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1], dtype=torch.float64)
     known = ~tool_twists(times, poses).isnan().any(-1)
     assert known.tolist() == [True, True, True, False, False]
+
+
+def test_an_arm_reports_its_description_at_the_angles_and_reaches_them_with_offsets() -> None:
+    exact = {"repeatability_mm": 0, "repeatability_mrad": 0, "distance_m": [0.5, 1.1]}
+    offsets, shots = (0.2, -0.3, 0.1), [{"target": "white", "poses": 6}]
+    scene = {"plane": {"normal": [-1, 0, 0], "offset_m": 1.3}}
+    robot = exact | {"arm": {"offsets_deg": offsets}}
+    state = planned(small(shots=shots, robot=robot, scene=scene))[-1]
+    angles, arm = present(state.facts.joint_angles), ArmOptions().arm()
+    assert torch.allclose(arm.poses(angles), state.facts.world_from_tool, atol=1e-12)
+    true = angles[-1:] + torch.deg2rad(torch.tensor([*offsets, 0, 0, 0], dtype=torch.float64))
+    assert torch.allclose(arm.poses(true)[0], state.world_from_tool, atol=1e-12)
+    scene["plane"]["offset_m"] = 9.0
+    with pytest.raises(ConfigError, match="it does not reach the poses before the wall"):
+        planned(small(shots=shots, robot=robot, scene=scene))

@@ -1,4 +1,4 @@
-"""The commands that calibrate a camera: inspect, train, update, pool, compare, check."""
+"""The commands that calibrate cameras: inspect, train, update, pool, rig, compare, check."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,6 +117,34 @@ def pool_command(runs: tuple[Path, ...], out: Path) -> None:
     from tofcorr.training.pool import pool
 
     show(pool(runs, out=out), out)
+
+
+@click.command()
+@click.argument("recordings", nargs=-1, required=True, type=FOLDER)
+@config_options(_TRAINING, "train", "The model and the training", "planes=unknown", "ea")
+@option("--urdf", "The robot: estimate offsets of its joints too.", type=FOLDER)
+@out_option("Folder with a run for each camera, made anew.")
+@force_option
+@option("--no-figures", "Write no pages, and draw no figures for TensorBoard.", is_flag=True)
+def rig_command(
+    options: "TrainingOptions",
+    recordings: tuple[Path, ...],
+    *,
+    no_figures: bool,
+    **given: Any,  # noqa: ANN401
+) -> None:
+    """Fit several cameras of one robot together: their errors, poses, and walls that they share.
+
+    A recording belongs to the camera that its `frames` in recording.yaml name; without a name, to
+    one called as its folder. OUT holds a run folder for each camera, as `tofcorr train` makes it,
+    and rig.yaml with the transforms between the cameras and the walls. With --urdf the recordings
+    need joint angles; the offsets of the joints are estimated too, and robot.urdf has them.
+    """
+    from tofcorr.training.rig import rig
+
+    if no_figures:
+        options = options.model_copy(update={"figures": False})
+    show(rig(recordings, options, **given), given["out"])
 
 
 @click.command()

@@ -11,7 +11,7 @@ import click
 from tofcorr.cli.shared import FOLDER, option, out_option, recording_option, run_option
 from tofcorr.correction.export.registry import FORMATS, format_named
 from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
-from tofcorr.files import NewPath, file_in_new_folder, new_folders
+from tofcorr.files import NewPath, file_in_new_folder, new_folders, write_text
 
 if TYPE_CHECKING:
     from tofcorr.correction.metadata import CorrectorMetadata
@@ -119,18 +119,25 @@ def export_command(run: Path, name: str, out: Path, device: str) -> None:
     """Write the corrector of a run, once it agrees with the calibration, or the camera's pose.
 
     Nothing is written when it does not, nor of a run whose verdict is `do not use`, unless it was
-    trained with --force.
+    trained with --force. Of the folder of `tofcorr rig --urdf`, the format urdf writes the robot's
+    description with the offsets of its joints.
     """
     import torch
 
     from tofcorr.correction.corrector import DepthCorrector
     from tofcorr.correction.export import export
     from tofcorr.correction.state import STATE_FILE, load_calibration
+    from tofcorr.options import read_text
     from tofcorr.training.judgement import verdict_of_run
+    from tofcorr.training.rig import ROBOT_FILE
 
     if device != "cpu" and not (FORMATS[name].for_device and torch.cuda.is_available()):
         compiled = " and ".join(one.name for one in FORMATS.values() if one.for_device)
         raise ConfigError(f"--device {device}: only for {compiled}, on a machine that has it.")
+    if (robot := run / ROBOT_FILE).is_file() and name == "urdf":
+        write_text(out, read_text(robot))
+        click.echo(f"{out}: the robot of {run}, with the offsets of its joints.")
+        return
     verdict = verdict_of_run(run)
     state = load_calibration(run / STATE_FILE)
     with new_folders(out.parent):

@@ -26,6 +26,7 @@ COMMANDS = {
     "train": ("calibrate", "Calibrate a recording: distance, pixel, intensity error, hand-eye."),
     "update": ("calibrate", "Carry a calibration on with a few frames, and say what has changed."),
     "pool": ("calibrate", "Find what cameras of one type share, as the prior of the next one."),
+    "rig": ("calibrate", "Calibrate several cameras of one robot together, and its joints."),
     "evaluate": ("calibrate", "Compare models on held-out images, in the paper's two tables."),
     "select": ("calibrate", "Choose the model that predicts best what it has not seen."),
     "compare": ("calibrate", "Show several runs side by side: errors, hand-eye, options."),

@@ -19,8 +19,8 @@ from tofcorr.comparison.options import BEFORE, ComparedModel, ComparisonOptions,
 from tofcorr.comparison.statistics import Estimate
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.estimation.joint import estimate_walls
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.planes import estimate_walls
 from tofcorr.fit.fitting import fit, hand_eye_alone
 from tofcorr.fit.problem import FitOptions, Problem, build_model, refuse_missing_inputs
 from tofcorr.fit.walls import FoundWalls, recorded_walls, walls_alone, with_every_wall

@@ -32,6 +32,8 @@ COLUMN_OF = {"pose_id": "pose_id", **{each.name: each.column for each in OPTIONA
 """Columns that a recording may lack, by the attribute of `FrameTable` that holds them."""
 COVARIANCE = ["nx_nx", "nx_ny", "nx_nz", "nx_d", "ny_ny", "ny_nz", "ny_d", "nz_nz", "nz_d", "d_d"]
 """Columns of the covariance of (nx, ny, nz, d): all ten, or none."""
+JOINT = "joint_{}"
+"""Columns of the joint angles, counted from 1: of every joint, or of none."""
 _UPPER = np.triu_indices(4)
 
 
@@ -47,6 +49,8 @@ class FrameRow(Conditions[Value]):
         pose_id: Frames with the same id were taken without moving; None if unknown.
         plane_covariance: Of (nx, ny, nz, d), shape (4, 4), without unit and metres: what is not
             known of the plane, independent of that of other poses; None: unknown, taken as zero.
+        joint_angles: Of the robot's joints from its base on, shape (J,), radians or metres; None:
+            not recorded.
     """
 
     world_from_tool: np.ndarray
@@ -55,15 +59,16 @@ class FrameRow(Conditions[Value]):
     target: Any
     pose_id: Any = None
     plane_covariance: Any = None
+    joint_angles: Any = None
 
 
 class FrameTable(FrameRow[np.ndarray]):
     """The rows of `frames.csv` as arrays, one entry per frame; units as in `FrameRow`.
 
     A condition has shape (N,), and so have offsets, and targets and pose ids as text; poses and
-    covariances have shape (N, 4, 4), normals (N, 3), of exactly unit length. An optional column
-    that the file lacks is None. An empty cell in an optional column is NaN (the empty text in
-    `pose_id`): unknown, never zero.
+    covariances have shape (N, 4, 4), joint angles (N, J), normals (N, 3), of exactly unit length.
+    An optional column that the file lacks is None. An empty cell in an optional column is NaN (the
+    empty text in `pose_id`): unknown, never zero.
     """
 
     def __len__(self) -> int:
@@ -144,6 +149,7 @@ def read_table(path: Path) -> FrameTable:
         target=np.array(cells["target"]),
         pose_id=np.array(cells["pose_id"]) if "pose_id" in cells else None,
         plane_covariance=_plane_covariance(cells, path) if has_covariance else None,
+        joint_angles=_joint_angles(cells, path),
         **{
             each.name: each.si_per_unit * _numbers(cells, each.column, path, each)
             for each in OPTIONAL_CONDITIONS
@@ -163,6 +169,17 @@ def _plane_covariance(cells: dict[str, list[str]], path: Path) -> np.ndarray:
         said = "nx_nx to d_d are no covariance: a variance is negative"
         raise CalibrationDataError(f"{path}: frame {frame}: {said}.")
     return found
+
+
+def _joint_angles(cells: dict[str, list[str]], path: Path) -> np.ndarray | None:
+    """Return the angles of all joints, shape (N, J); None: the file has none."""
+    names = [name for name in cells if re.fullmatch(r"joint_\d+", name)]
+    wanted = [JOINT.format(k + 1) for k in range(len(names))]
+    for name in wanted:
+        if name not in names:
+            said = f"column '{name}' is missing beside {', '.join(names)}"
+            raise CalibrationDataError(f"{path}: {said}; joints are counted from 1.")
+    return np.stack([_numbers(cells, name, path) for name in wanted], axis=1) if wanted else None
 
 
 def rigid_transforms(
@@ -206,12 +223,16 @@ def table_text(rows: Iterable[FrameRow]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     # Of some planes alone nothing can be weighed.
     known = all(row.plane_covariance is not None for row in rows)
-    names = COVARIANCE if known else []
+    names = [*COVARIANCE] if known else []
+    angles = [np.atleast_1d(row.joint_angles) for row in rows if row.joint_angles is not None]
+    if len(angles) == len(rows) > 0:
+        names += [JOINT.format(k + 1) for k in range(len(angles[0]))]
     writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept), *names])
     for frame, row in enumerate(rows):
         # The csv module writes None as an empty cell: unknown.
         more = [cells[frame] for cells in kept.values()]
         more += row.plane_covariance[_UPPER].tolist() if known else []
+        more += angles[frame].tolist() if len(angles) == len(rows) else []
         writer.writerow([frame, *_required_cells(row), row.target, *more])
     return text.getvalue()
 

@@ -274,6 +274,11 @@ class Prior:
         slope = se3.log_slope(self.centre.step_to(parameters)[: parameters.twist_size])
         return torch.cat([by_twist @ slope, self.factor[:, parameters.twist_size :]], dim=1)
 
+    @property
+    def scores(self) -> Float[Tensor, "P F"]:
+        """How much each row's own error of one standard deviation changes the gradient."""
+        return self.variance * self.factor.T
+
     def rescaled(self, variance: float) -> "Prior":
         """Return the same prior on the scale of another effective variance of a residual."""
         grown = math.sqrt(self.variance / variance)

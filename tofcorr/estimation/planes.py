@@ -11,6 +11,7 @@ undetermined like any other.
 """
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -18,37 +19,47 @@ from torch import Tensor
 
 from tofcorr.estimation.linear import Curvature, NormalEquations
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
-from tofcorr.estimation.solvers import SolverOptions, minimise
 from tofcorr.geometry.rays import plane_in_frame, plane_moves, tangents
+
+PlanesT = TypeVar("PlanesT", bound="Planes")
 
 
 @dataclass(frozen=True)
-class Walls:
-    """Walls of the world, and which image shows which.
+class Planes:
+    """Planes of the world.
 
     Attributes:
         normal_world: Unit normals, shape (G, 3).
         offset: d of n . x + d = 0, shape (G,), metres.
-        index: The wall of each image, shape (N,).
-        world_from_tool: The pose of each image, shape (N, 4, 4).
     """
 
     normal_world: Float[Tensor, "G 3"]
     offset: Float[Tensor, "G"]
-    index: Int[Tensor, "N"]
-    world_from_tool: Float[Tensor, "N 4 4"]
 
     @property
     def size(self) -> int:
-        """How many unknowns the walls have: three each."""
+        """How many unknowns the planes have: three each."""
         return 3 * len(self.offset)
 
-    def moved(self, step: Float[Tensor, "{self.size}"]) -> "Walls":
-        """Return the walls after a step (3G,): two turns in radians and a shift in metres each."""
+    def moved(self: PlanesT, step: Float[Tensor, "{self.size}"]) -> PlanesT:
+        """Return the planes after a step (3G,): two turns in radians and a shift in metres each."""
         change = step.view(-1, 3)
         turned = self.normal_world + (change[:, :2, None] * tangents(self.normal_world)).sum(dim=1)
         normal = torch.nn.functional.normalize(turned, dim=1)
         return replace(self, normal_world=normal, offset=self.offset + change[:, 2])
+
+
+@dataclass(frozen=True)
+class Walls(Planes):
+    """Walls of the world, and which image shows which.
+
+    Attributes:
+        index: The wall of each image, shape (N,).
+        world_from_tool: The pose of each image, shape (N, 4, 4).
+    """
+
+    index: Int[Tensor, "N"]
+    world_from_tool: Float[Tensor, "N 4 4"]
 
     def seen_by(self, moments: ImageMoments) -> ImageMoments:
         """Return the moments with these walls in place of those recorded."""
@@ -102,82 +113,14 @@ def joint_image_equations(
 def marginal_hessian(
     moments: ImageMoments, parameters: Parameters, walls: Walls | None
 ) -> Float[Tensor, "P P"]:
-    """Return the curvature (P, P) of the loss minimised over the walls: a Schur complement."""
+    """Return the curvature (P, P) of the loss minimised over the walls."""
     hessian = joint_image_equations(moments, parameters, walls).hessian.sum(dim=0)
-    if walls is None:
-        return hessian
-    size = parameters.size
-    own, cross, other = hessian[:size, :size], hessian[:size, size:], hessian[size:, size:]
-    return own - cross @ Curvature(other).inverse @ cross.T
+    return hessian if walls is None else marginal(hessian, torch.arange(parameters.size))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _WithWalls(Parameters):
-    """The unknowns of a fit and, after them, those of the walls.
-
-    Attributes:
-        walls: The walls.
-        total: The sum of all steps from the start.
-    """
-
-    walls: Walls
-    total: Float[Tensor, "P"]
-
-    @property
-    def size(self) -> int:
-        """How many unknowns there are."""
-        return super().size + self.walls.size
-
-    def moved(self, step: Float[Tensor, "P"]) -> "_WithWalls":
-        """Return the unknowns and the walls after a step."""
-        own, of_walls = step.split([super().size, self.walls.size])
-        walls = self.walls.moved(of_walls)
-        moved = replace(super().moved(own), walls=walls, total=self.total + step)
-        assert isinstance(moved, _WithWalls)
-        return moved
-
-
-class _WallObjective(MomentObjective):
-    """The loss of the moments as a function of the unknowns and of the walls, with a prior."""
-
-    def __init__(self, moments: ImageMoments, size: int, prior: NormalEquations | None) -> None:
-        # Keeps undetermined directions where they started: a prior of 100 mm and 100 mrad, weighed
-        # against residuals of 1 mm, in square metres. That is too weak to move what the images do
-        # determine, however far off the walls were recorded.
-        ridge = torch.eye(size, dtype=torch.float64) / 100**2
-        held = NormalEquations(ridge.new_zeros(()), ridge.new_zeros(size), ridge)
-        super().__init__(moments)
-        self._held = held.plus(prior)
-
-    def normal_equations(self, parameters: Parameters) -> NormalEquations:
-        """Return loss, gradient and Gauss-Newton Hessian for a step."""
-        # Every point that the solver asks for is a step from the start: it has walls.
-        assert isinstance(parameters, _WithWalls)
-        walls = parameters.walls
-        images = joint_image_equations(walls.seen_by(self.moments), parameters, walls)
-        return images.total().plus(self._held.at(parameters.total))
-
-
-def estimate_walls(
-    moments: ImageMoments,
-    start: Parameters,
-    walls: Walls,
-    prior: NormalEquations | None = None,
-    most_steps: int = 100,
-) -> tuple[Parameters, Walls]:
-    """Minimise the loss over the unknowns and the walls together, by damped Gauss-Newton steps.
-
-    Args:
-        moments: Of the images.
-        start: The unknowns, fitted with the walls as recorded.
-        walls: The walls as recorded: where to start.
-        prior: A prior's normal equations at `start`; None: there is no prior.
-        most_steps: Steps after which it ends in any case.
-    """
-    zero = torch.zeros(start.size + walls.size, dtype=torch.float64)
-    together = _WithWalls(**vars(start), walls=walls, total=zero)
-    options = SolverOptions(max_iterations=most_steps)
-    end = minimise(_WallObjective(moments, len(zero), prior), together, options).parameters
-    assert isinstance(end, _WithWalls)
-    found = Parameters(end.tool_from_camera, end.coefficients, end.hand_eye_is_free)
-    return found, end.walls
+def marginal(hessian: Float[Tensor, "Q Q"], own: Int[Tensor, "P"]) -> Float[Tensor, "P P"]:
+    """Return the curvature of some unknowns of a loss minimised over the others: Schur's."""
+    others = torch.ones(len(hessian), dtype=torch.bool)
+    others[own] = False
+    cross = hessian[own][:, others]
+    return hessian[own][:, own] - cross @ Curvature(hessian[others][:, others]).inverse @ cross.T

@@ -9,6 +9,7 @@ deviation of the result along it. A wide Gaussian prior on every unknown keeps e
 direction on which the images carry less information than that prior is undetermined.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +18,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.linear import Curvature, left_out_steps, robust_covariance
+from tofcorr.estimation.linear import (
+    Curvature,
+    NormalEquations,
+    left_out_steps,
+    robust_covariance,
+)
 from tofcorr.estimation.moments import (
     HAND_EYE_SYMBOLS,
     LEAST_RESIDUAL,
@@ -54,6 +60,10 @@ class Covariance:
         """Degrees of freedom of Student's t for estimate / standard error: poses less one."""
         return len(self.jackknife) - 1
 
+    def of(self, unknowns: Int[Tensor, "K"]) -> "Covariance":
+        """Return the covariance of some of the unknowns."""
+        return Covariance(self.matrix[unknowns][:, unknowns], self.jackknife[:, unknowns])
+
 
 def jackknife_covariance(
     moments: ImageMoments,
@@ -76,15 +86,30 @@ def jackknife_covariance(
         CalibrationDataError: There are fewer than three poses.
     """
     each = joint_image_equations(moments, optimum, walls).by_pose(poses)
+    own = None if prior is None else prior.equations(optimum)
+    rows = [] if prior is None else [prior.scores]
+    return jackknife(each, each.total().plus(own).hessian, rows).of(torch.arange(optimum.size))
+
+
+def jackknife(
+    each: NormalEquations, hessian: Float[Tensor, "Q Q"], priors: Sequence[Float[Tensor, "Q1 F"]]
+) -> Covariance:
+    """Return the leave-one-pose-out covariance of all unknowns of normal equations.
+
+    Args:
+        each: Those of each pose, at the optimum.
+        hessian: The curvature of all poses and of the priors.
+        priors: Standard deviations of the scores of priors on the first unknowns, in the columns.
+
+    Raises:
+        CalibrationDataError: There are fewer than three poses.
+    """
     if len(each.gradient) < 3:
         raise CalibrationDataError(f"Deviations need at least 3 poses, got {len(each.gradient)}.")
-    size = optimum.size
-    own = None if prior is None else prior.equations(optimum)
-    shift, curvature = left_out_steps(each, each.total().plus(own).hessian)
-    shift = shift[:, :size]
+    shift, curvature = left_out_steps(each, hessian)
     matrix = robust_covariance(shift)
-    if prior is not None:
-        gain = curvature.inverse[:size, :size] @ (prior.variance * prior.factor.T)
+    for scores in priors:
+        gain = curvature.inverse[:, : len(scores)] @ scores
         matrix = matrix + gain @ gain.T
     return Covariance(matrix, shift)
 
@@ -169,7 +194,11 @@ class Observability(NamedTuple):
 
 
 def observability(
-    moments: ImageMoments, optimum: Parameters, prior: Prior | None, walls: Walls | None
+    moments: ImageMoments,
+    optimum: Parameters,
+    prior: Prior | None,
+    walls: Walls | None,
+    hessian: Float[Tensor, "P P"] | None = None,
 ) -> Observability:
     """Find undetermined directions, weak ones and strong correlations in the loss's curvature.
 
@@ -178,11 +207,15 @@ def observability(
         optimum: The parameters at the optimum.
         prior: The smoothing penalties, if they were part of the loss; they count as information.
         walls: Walls that were estimated as well.
+        hessian: Curvature of the images where more than walls was estimated as well; None: of the
+            moments, with the walls.
     """
     names = [*HAND_EYE_SYMBOLS[: optimum.twist_size], *moments.symbols]
     variance = effective_variance(moments, optimum)
     # Curvature that is only rounding is removed: a singular direction is then exactly singular.
-    root = Curvature(marginal_hessian(moments, optimum, walls)).root
+    if hessian is None:
+        hessian = marginal_hessian(moments, optimum, walls)
+    root = Curvature(hessian).root
     precision = root @ root.mT / variance
     if prior is not None:
         precision = precision + prior.equations(optimum).hessian / prior.variance

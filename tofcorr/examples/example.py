@@ -46,6 +46,10 @@ EXAMPLES = {
         "A recording, as every import writes one.",
         "tofcorr train --config ea --recording {out} --out run",
     ),
+    "arm": Example(
+        "A recording of an arm whose joints have offsets, and the arm's description.",
+        "tofcorr rig {out}/wall --urdf {out}/arm.urdf --out cell",
+    ),
     "simulator": Example(
         "A recording, and depth of an ideal camera at its poses, as a simulator of yours renders.",
         "tofcorr inspect {out}/recording",

@@ -52,6 +52,12 @@ _WALLS = {
     "north": "scene.plane={normal: [-1, 0, 0], offset_m: 1.2}",
     "east": "scene.plane={normal: [0, 1, 0], offset_m: 1.1}",
 }
+_ARM = (
+    "scene.plane={normal: [-1, 0, 0], offset_m: 1.3}",
+    "scene.subsamples=2",
+    "robot.distance_m=[0.5, 1.1]",
+    "robot.arm={offsets_deg: [0.15, -0.2, 0.3, -0.1, 0.25, 0.2]}",
+)
 _READINGS = 8
 _REPEATED = (
     "shots=[{target: white, poses: 20}]",
@@ -129,6 +135,16 @@ def recording(folder: Path, seed: int) -> None:
     for part in list(made.iterdir()):
         part.rename(folder / part.name)
     made.rmdir()
+
+
+def arm(folder: Path, seed: int) -> None:
+    """Write `wall`, a recording of an arm whose joints have offsets, and `arm.urdf`."""
+    options = _options("demo", _ARM, seed)
+    simulate(options, folder / "wall")
+    robot = options.robot.arm
+    assert robot is not None
+    (folder / "arm.urdf").write_text(robot.file.read_text(encoding="utf-8"), encoding="utf-8")
+    _write_truth(options, folder)
 
 
 def simulator(folder: Path, seed: int) -> None:
@@ -222,5 +238,7 @@ def _on_the_way(stops: Tensor, times: np.ndarray, dwell: float = 0.6) -> Tensor:
 
 
 def _write_truth(options: SimulatorOptions, folder: Path) -> None:
-    truth = {"tool_from_camera": options.hand_eye.tool_from_camera().tolist()}
+    truth: dict[str, object] = {"tool_from_camera": options.hand_eye.tool_from_camera().tolist()}
+    if options.robot.arm is not None:
+        truth["offsets_deg"] = list(options.robot.arm.offsets_deg)
     (folder / "truth.yaml").write_text(dump_yaml(truth), encoding="utf-8")

@@ -32,10 +32,11 @@ from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.base import Domain, Term
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.linear import Curvature, solvable
+from tofcorr.estimation.joint import estimate_walls
+from tofcorr.estimation.linear import Curvature, NormalEquations, solvable
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.planes import estimate_walls, joint_image_equations, within_prior
+from tofcorr.estimation.planes import joint_image_equations, within_prior
 from tofcorr.estimation.regularisation import (
     penalties_of,
     smoothness,
@@ -115,16 +116,16 @@ def fit(
         problem, core, covariance = estimate(problem, moments)
         optimum = core.solution.parameters
         hand_eye_only = hand_eye_alone(problem, core.moments)
-        noise = _noise(problem, weights)
+        noise = known_noise(problem, weights)
         outcome, with_network, best = None, None, optimum
         if options.residual is not None:
-            error = _with_pattern(problem, core).error
+            error = with_pattern(problem, core).error
             outcome, error.residual, best = fit_residual(problem, core, error, options.residual)
             with_network = None if error.residual is None else error
         kept = with_network is not None
         problem, core, shift = _without_noise_shift(problem, core, weights, noise, kept)
         if with_network is None:
-            model = _with_pattern(problem, core)
+            model = with_pattern(problem, core)
         else:
             core = replace(core, solution=replace(core.solution, parameters=best))
             model = calibrated(with_network, best)
@@ -284,7 +285,7 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
         found = minimise(MomentObjective(moments, carried), start, solver, problem.watcher)
         core = Core(options=options, moments=moments, start=start, smoothness=None, solution=found)
         core = replace(core, carried=carried)
-        return _hold(problem, core) if held else core
+        return hold(problem, core) if held else core
     start, poses = _start(problem, moments, model), problem.poses()
     # Six folds choose the strength of a penalty; poses go to them in turn, with all their images.
     # Runs of poses would choose stiffer curves: 0.1 mm worse on held-out views of a Kinect v2.
@@ -299,7 +300,7 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
         smoothness=(prior := smoothness(penalties, total_weight(moments), start)),
         solution=minimise(MomentObjective(moments, prior), start, solver, problem.watcher),
     )
-    return _hold(problem, core) if held else core
+    return hold(problem, core) if held else core
 
 
 def _start(problem: Problem, moments: ImageMoments, model: ErrorModel) -> Parameters:
@@ -312,8 +313,14 @@ def _start(problem: Problem, moments: ImageMoments, model: ErrorModel) -> Parame
     return replace(found, coefficients=coefficients)
 
 
-def _hold(problem: Problem, core: Core) -> Core:
-    """Look for undetermined directions, and put a prior on them or refuse them."""
+def hold(problem: Problem, core: Core, hessian: Tensor | None = None) -> Core:
+    """Look for undetermined directions, and put a prior on them or refuse them.
+
+    Args:
+        problem: What was fitted.
+        core: At the least loss.
+        hessian: See `observability`.
+    """
     moments, best, smooth = core.moments, core.solution.parameters, core.smoothness
     if smooth is not None:
         smooth = smooth.rescaled(effective_variance(moments, best))
@@ -352,7 +359,7 @@ def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
     return CalibrationModel(error, HandEye(parameters.tool_from_camera, fixed=fixed))
 
 
-def _noise(problem: Problem, weights: PixelWeights | None) -> DistanceNoise | None:
+def known_noise(problem: Problem, weights: PixelWeights | None) -> DistanceNoise | None:
     """Return the noise that weighs the pixels, or else the recording's; None: it is unknown."""
     if weights is not None and weights.noise is not None:
         return weights.noise
@@ -362,7 +369,7 @@ def _noise(problem: Problem, weights: PixelWeights | None) -> DistanceNoise | No
     return None
 
 
-def _with_pattern(problem: Problem, core: Core) -> CalibrationModel:
+def with_pattern(problem: Problem, core: Core) -> CalibrationModel:
     """Return the model of a core, with its fixed pattern (H, W), metres, if there is to be one.
 
     The standard deviation tau of the offsets is that of the options or, by empirical Bayes, the
@@ -417,18 +424,9 @@ def _without_noise_shift(
         return problem, core, None
     images = joint_image_equations(core.moments, optimum, walls).total()
     prior = None if core.total_prior is None else core.total_prior.equations(optimum)
-    expected = _expected_moments(problem, core, weights, noise)
+    expected = expected_moments(problem, core, weights, noise)
     excess = joint_image_equations(expected, optimum, walls).total()
-    # The noise is part of the loss: one that would make more was taken for too large. Of a camera
-    # that the fit took to the wall both are rounding, of either sign.
-    factor = (images.loss / excess.loss).nan_to_num().clamp(min=0, max=1)
-    # In these coordinates the curvature is 1 in every direction, of which the noise makes a share.
-    basis = Curvature(images.plus(prior).hessian).basis
-    share, turn = torch.linalg.eigh(basis.T @ (factor * excess.hessian) @ basis)
-    basis = basis @ turn
-    # No step is longer than ten times the first-order one. Chosen: a share of 0.7 (20 mm of noise,
-    # 12 poses) still gives the right step.
-    step = basis @ ((basis.T @ (factor * excess.gradient)) / (1 - share).clamp(min=1 / 10))
+    step = step_off_noise(images.plus(prior).hessian, within_loss(images, excess))
     own, of_walls = step[: optimum.size], step[optimum.size :]
     removed = problem.options.remove_noise_shift and core.solution.converged and not with_network
     shift = None
@@ -445,7 +443,33 @@ def _without_noise_shift(
     return problem, replace(core, moments=moments, solution=solution), shift
 
 
-def _expected_moments(
+def within_loss(images: NormalEquations, noise: NormalEquations) -> NormalEquations:
+    """Return the noise's equations, made smaller where the images have less loss.
+
+    The noise is part of the loss: one that would make more was taken for too large. Of a camera
+    that the fit took to the wall both are rounding, of either sign.
+    """
+    factor = (images.loss / noise.loss).nan_to_num().clamp(min=0, max=1)
+    return NormalEquations(*(factor * part for part in noise))
+
+
+def step_off_noise(hessian: Tensor, noise: NormalEquations) -> Tensor:
+    """Return the step from the least loss to where it were without the noise.
+
+    Args:
+        hessian: The curvature of images and priors, with the noise.
+        noise: What the noise adds to the equations.
+    """
+    # In these coordinates the curvature is 1 in every direction, of which the noise makes a share.
+    basis = Curvature(hessian).basis
+    share, turn = torch.linalg.eigh(basis.T @ noise.hessian @ basis)
+    basis = basis @ turn
+    # No step is longer than ten times the first-order one. Chosen: a share of 0.7 (20 mm of noise,
+    # 12 poses) still gives the right step.
+    return basis @ ((basis.T @ noise.gradient) / (1 - share).clamp(min=1 / 10))
+
+
+def expected_moments(
     problem: Problem, core: Core, weights: PixelWeights | None, noise: DistanceNoise
 ) -> ImageMoments:
     """Return what the noise adds to the moments, estimated from some pixels of every frame.

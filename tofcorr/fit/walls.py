@@ -1,6 +1,6 @@
 """Walls that nobody has measured: estimated with the calibration, or alone under a fitted model."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,13 +39,7 @@ class FoundWalls:
         for place, number in enumerate(self.numbers):
             normal[self.of_frame == number] = self.walls.normal_world[place].numpy()
             offset[self.of_frame == number] = float(self.walls.offset[place])
-        ends = np.cumsum([recording.num_frames for recording in dataset.recordings])[:-1]
-        parts = zip(dataset.recordings, np.split(normal, ends), np.split(offset, ends), strict=True)
-        recordings = [
-            replace(one, frames=replace(one.frames, normal_world=normals, offset=offsets))
-            for one, normals, offsets in parts
-        ]
-        return replace(dataset, recordings=tuple(recordings))
+        return dataset.with_columns(normal_world=normal, offset=offset)
 
     def summary(self) -> list[dict[str, Any]]:
         """Return the walls, for the report."""

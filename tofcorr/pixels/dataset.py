@@ -122,6 +122,16 @@ class Dataset:
         every = [getattr(recording.frames, name) for recording in self.recordings]
         return torch.from_numpy(np.concatenate(every))
 
+    def with_columns(self, **values: np.ndarray) -> "Dataset":
+        """Return the data set with other values in columns of its tables, of shape (N, ...)."""
+        ends = np.cumsum([recording.num_frames for recording in self.recordings])[:-1]
+        split = {name: np.split(column, ends) for name, column in values.items()}
+        recordings = tuple(
+            replace(one, frames=replace(one.frames, **{key: v[k] for key, v in split.items()}))
+            for k, one in enumerate(self.recordings)
+        )
+        return replace(self, recordings=recordings)
+
     def plane_covariance(self) -> Float[Tensor, "N 4 4"] | None:
         """Return the covariances of (n, d) in the tool frame; None unless all recordings have them.
 

@@ -47,6 +47,7 @@ class FrameFacts(Conditions[Tensor]):
         tool_twist: Velocity of the tool in its own frame, translation first, shape (F, 6), m/s and
             rad/s: world_from_tool(t + dt) = world_from_tool(t) exp(twist dt).
         approach: From which side the tool came: see `sides_of_approach`, shape (F, 3).
+        joint_angles: Of the robot's joints, shape (F, J), radians or metres.
     """
 
     world_from_tool: Tensor
@@ -54,6 +55,7 @@ class FrameFacts(Conditions[Tensor]):
     offset: Tensor
     tool_twist: Tensor | None = None
     approach: Tensor | None = None
+    joint_angles: Tensor | None = None
 
     def at(self, frames: slice | Sequence[int]) -> Self:
         """Return the facts of some of the frames."""

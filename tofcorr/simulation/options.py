@@ -1,5 +1,7 @@
 """All options of the simulator: what `configs/simulate/*.yaml` holds."""
 
+from importlib.resources import files
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import torch
@@ -9,6 +11,8 @@ from torch import Tensor
 from tofcorr.data.recording import CameraSection, DepthKind
 from tofcorr.data.table import COLUMN_OF
 from tofcorr.geometry import se3
+from tofcorr.geometry.arm import Arm
+from tofcorr.geometry.camera import FrameNames
 from tofcorr.options import (
     Count,
     NonNegativeNumber,
@@ -115,6 +119,39 @@ class ConditionOptions(Options):
     recorded: tuple[Annotated[str, among(COLUMN_OF, "optional column")], ...] = tuple(COLUMN_OF)
 
 
+class ArmOptions(Options):
+    """The robot's arm: its joint angles are recorded, and its joints may have offsets.
+
+    The world is the frame of its base. Recorded poses are those of its description at the recorded
+    angles; the true ones have the offsets.
+
+    Attributes:
+        urdf: File of its description; null: an arm of six axes with a reach of 0.85 m.
+        offsets_deg: What is added to each recorded angle, from the base on (of a sliding joint,
+            as many 17.5 mm); those that are not given are zero.
+        home_deg: Angles from which each pose is looked for; those that are not given are zero.
+    """
+
+    urdf: str | None = None
+    offsets_deg: tuple[Number, ...] = ()
+    home_deg: tuple[Number, ...] = (0.0, -40.0, 100.0, -60.0, 20.0, 0.0)
+
+    @property
+    def file(self) -> Path:
+        """The arm's description."""
+        shipped = files("tofcorr.simulation").joinpath("arm.urdf")
+        return Path(str(shipped) if self.urdf is None else self.urdf)
+
+    def arm(self) -> Arm:
+        """Return the chain of joints."""
+        return Arm.read(self.file)
+
+    def radians(self, degrees: tuple[float, ...], number: int) -> Tensor:
+        """Return angles of all joints, shape (J,), radians."""
+        given = torch.tensor([*degrees, *[0.0] * number][:number], dtype=torch.float64)
+        return torch.deg2rad(given)
+
+
 class RobotOptions(Options):
     """The poses of the camera.
 
@@ -136,6 +173,7 @@ class RobotOptions(Options):
         waypoint_every_frames: Frames between two random poses of that path.
         repeatability_mm: Standard deviation of the true from the reported position, on each axis.
         repeatability_mrad: The same for the orientation.
+        arm: The arm that carries the camera, for stop_and_go; null: poses alone are recorded.
     """
 
     distance_m: tuple[PositiveNumber, PositiveNumber] = (0.5, 1.8)
@@ -152,6 +190,7 @@ class RobotOptions(Options):
     waypoint_every_frames: Annotated[int, Field(ge=2)] = 6
     repeatability_mm: NonNegativeNumber = 0.3
     repeatability_mrad: NonNegativeNumber = 0.3
+    arm: ArmOptions | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -160,6 +199,8 @@ class RobotOptions(Options):
             raise ValueError(f"distance_m: the smallest, {low:g}, exceeds the largest, {high:g}")
         if self.motion == "continuous" and (self.repeat_poses or self.order != "random"):
             raise ValueError("continuous motion allows neither repeat_poses nor another order")
+        if self.motion == "continuous" and self.arm is not None:
+            raise ValueError("an arm moves in stop_and_go only")
         return self
 
 
@@ -185,6 +226,10 @@ class SimulatorOptions(Options):
         hand_eye: Where the camera is mounted on the robot's tool.
         conditions: Time, exposure, temperature, background light.
         effects: Effects beyond the plain sensor, each with its `name` and parameters.
+        frames: What the robot calls its coordinate frames; names the camera of several.
+        robot_of: Folder of a simulated recording whose robot carries this camera too: stops, their
+            errors, targets and conditions are that recording's; `shots`, `robot` and `conditions`
+            are not used. null: the camera has a robot of its own.
     """
 
     config_folder: ClassVar[str] = "simulate"
@@ -200,3 +245,5 @@ class SimulatorOptions(Options):
     hand_eye: CameraMountOptions = CameraMountOptions()
     conditions: ConditionOptions = ConditionOptions()
     effects: tuple[dict[str, Any], ...] = ()
+    frames: FrameNames = FrameNames()
+    robot_of: str | None = None

@@ -10,11 +10,13 @@ from torch import Tensor
 from tofcorr.conditions import condition
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
+from tofcorr.geometry.arm import Arm
 from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.geometry.se3 import world_from_plane
 from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
 from tofcorr.simulation.hooks import FrameFacts, FrameState
 from tofcorr.simulation.options import (
+    ArmOptions,
     CameraMountOptions,
     ConditionOptions,
     RobotOptions,
@@ -24,6 +26,9 @@ from tofcorr.simulation.options import (
 # Largest number of draws of a pose or a path before it is given up. Chosen by hand: all shipped
 # configurations need far fewer.
 _TRIES = 300
+# How often poses are drawn for an arm before it is given up: of those before a wall at a sensible
+# distance it reaches half at once.
+_DRAWS = 20
 FillsImage = Callable[[Tensor], bool]
 """From plane_from_camera (4, 4): whether every pixel sees the wall within the options' limits."""
 
@@ -55,6 +60,8 @@ def draw_plan(
         poses, twists = _draw_path(robot, timestamps, fills_image, generator)
     else:
         poses = _draw_poses(robot, len(targets), fills_image, generator)
+        if robot.arm is not None:
+            poses = _within_reach(options, poses, fills_image, generator)
         if robot.order == "by_distance":  # Along the optical axis; the wall is z = 0.
             poses.sort(key=lambda pose: float(-pose[2, 3] / pose[2, 2]))
         repeats = [robot.repeat_frames] * robot.repeat_poses + [1] * len(poses)
@@ -63,19 +70,26 @@ def draw_plan(
         twists = [torch.zeros(6, dtype=torch.float64)] * len(poses)
     conditions = _draw_conditions(times, timestamps, stops, generator)
     normal, offset = options.scene.plane.tensors()
-    world, mount = world_from_plane(normal, offset), options.hand_eye.tool_from_camera()
-    commanded = [world @ pose @ se3.inverse(mount) for pose in poses]
-    reached = [pose @ se3.exp(draw_slip(robot, generator)) for pose in commanded]
+    mount = options.hand_eye.tool_from_camera()
+    commanded = _tools(options, poses)
+    exact, angles = commanded, None
+    if robot.arm is not None:
+        arm = robot.arm.arm()
+        angles, _ = joint_angles(arm, commanded, robot.arm)
+        offsets = robot.arm.radians(robot.arm.offsets_deg, len(arm.names))
+        commanded, exact = arm.poses(angles), arm.poses(angles + offsets)
+    reached = [pose @ se3.exp(draw_slip(robot, generator)) for pose in exact]
     if num_frames is not None and num_frames > len(stops):
         said = f"{num_frames} frames are asked for, but the options plan {len(stops)}"
         raise ConfigError(f"{said}; raise 'poses' under 'shots'.")
-    recorded = torch.stack(commanded)[stops]
+    recorded = commanded[stops]
     facts = FrameFacts(
         world_from_tool=recorded,
         normal_world=normal.expand(len(stops), 3),
         offset=offset.expand(len(stops)),
         tool_twist=torch.stack([_of_tool(twist, mount) for twist in twists])[stops],
         approach=sides_of_approach(recorded),
+        joint_angles=None if angles is None else angles[stops],
         **conditions,
     )
     return [
@@ -89,6 +103,52 @@ def draw_plan(
         )
         for index, stop in enumerate(stops[:num_frames])
     ]
+
+
+def _tools(options: SimulatorOptions, poses: list[Tensor]) -> Tensor:
+    """Return world_from_tool (N, 4, 4) of camera poses before the wall, plane_from_camera."""
+    world = world_from_plane(*options.scene.plane.tensors())
+    return world @ torch.stack(poses) @ se3.inverse(options.hand_eye.tool_from_camera())
+
+
+def _within_reach(
+    options: SimulatorOptions,
+    poses: list[Tensor],
+    fills_image: FillsImage,
+    generator: torch.Generator,
+) -> list[Tensor]:
+    """Return as many poses, with those that the arm does not reach drawn anew."""
+    robot, kept = options.robot, list[Tensor]()
+    assert robot.arm is not None
+    arm, number = robot.arm.arm(), len(poses)
+    for _ in range(_DRAWS):
+        _, reached = joint_angles(arm, _tools(options, poses), robot.arm)
+        kept += [pose for pose, good in zip(poses, reached.tolist(), strict=True) if good]
+        if len(kept) >= number:
+            return kept[:number]
+        poses = _draw_poses(robot, number, fills_image, generator)
+    said = "robot.arm: it does not reach the poses before the wall"
+    raise ConfigError(f"{said}; set scene.plane nearer to its base, or change distance_m.")
+
+
+def joint_angles(arm: Arm, base_from_tip: Tensor, options: ArmOptions) -> tuple[Tensor, Tensor]:
+    """Return joint angles (N, J) that take the tip to poses (N, 4, 4), and which it reaches (N,).
+
+    Damped Gauss-Newton steps from the home position; limits of joints are not looked at.
+    """
+    angles = options.radians(options.home_deg, len(arm.names)).expand(len(base_from_tip), -1)
+    damping = torch.eye(len(arm.names), dtype=torch.float64) / 1000
+    for _ in range(60):  # Poses within reach take 10 to 40.
+        off = se3.log(se3.inverse(arm.poses(angles)) @ base_from_tip)
+        moves = arm.motions(angles)
+        turns = torch.stack([moves[..., 2, 1], moves[..., 0, 2], moves[..., 1, 0]], dim=-2)
+        slope = torch.cat([moves[..., :3, 3].mT, turns], dim=-2)
+        normal = slope.mT @ slope + damping * off.square().sum(1)[:, None, None].clamp(max=1)
+        step = torch.linalg.lstsq(normal, slope.mT @ off[..., None]).solution[..., 0]
+        angles = angles + step.clamp(-0.5, 0.5)
+    off = se3.log(se3.inverse(arm.poses(angles)) @ base_from_tip)
+    angles = torch.remainder(angles + math.pi, 2 * math.pi) - math.pi
+    return angles, off.abs().amax(dim=1) < 1e-9
 
 
 def hand_eye_guess(mount: CameraMountOptions, generator: torch.Generator) -> Tensor:

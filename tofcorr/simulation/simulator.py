@@ -13,6 +13,7 @@ from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import Recording, pose_numbers
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
+from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import (
@@ -188,7 +189,10 @@ def simulate(
     options = resolve_options(SimulatorOptions, config)
     generator = generator or torch.Generator().manual_seed(options.seed)
     seed, mount = generator.initial_seed(), options.hand_eye
-    plan = draw_plan(options, generator, num_frames=num_frames)
+    if options.robot_of is None:
+        plan = draw_plan(options, generator, num_frames=num_frames)
+    else:
+        plan = plan_beside(options, Recording.open(options.robot_of))[:num_frames]
     guess = hand_eye_guess(mount, generator)
     writer = RecordingWriter(
         out,
@@ -196,6 +200,7 @@ def simulate(
         depth_kind=options.depth_kind,
         modulation_frequency=options.sensor.modulation_frequency_hz,
         tool_from_camera=guess.numpy(),
+        frame_names=options.frames,
     )
     with writer, bar(len(plan), "simulating") as advance:
         for state in take_frames(options, plan, generator if noise else None):
@@ -244,6 +249,7 @@ def append_frame(writer: RecordingWriter, state: FrameState, options: SimulatorO
         offset=float(facts.offset[-1]),
         target=state.target,
         pose_id=state.pose_id if "pose_id" in recorded else None,
+        joint_angles=None if facts.joint_angles is None else facts.joint_angles[-1].numpy(),
     )
     writer.append(
         depth.numpy(),
@@ -336,8 +342,37 @@ def facts_of(recording: Recording) -> FrameFacts:
         offset=torch.from_numpy(table.offset),
         tool_twist=tool_twists(conditions["timestamp"], poses) if recording.moves else None,
         approach=sides_of_approach(poses),
+        joint_angles=None if table.joint_angles is None else torch.from_numpy(table.joint_angles),
         **conditions,
     )
+
+
+def plan_beside(options: SimulatorOptions, recording: Recording) -> list[FrameState]:
+    """Return the frames of another camera that a simulated recording's robot carries.
+
+    Args:
+        options: Of the other camera: its hand-eye transform.
+        recording: The simulated recording.
+
+    Raises:
+        ConfigError: It holds no true poses.
+    """
+    file = recording.path / "truth" / "world_from_tool.npy"
+    if not file.is_file():
+        raise ConfigError(f"robot_of: expected a simulated recording, with {file}.")
+    facts, reached = facts_of(recording), torch.from_numpy(np.load(file))
+    stops = pose_numbers(recording).tolist()
+    return [
+        FrameState(
+            index=index,
+            facts=facts.at(slice(index + 1)),
+            target=str(recording.frames.target[index]),
+            world_from_tool=reached[index],
+            tool_from_camera=options.hand_eye.tool_from_camera(),
+            pose_id=stop,
+        )
+        for index, stop in enumerate(stops)
+    ]
 
 
 def default_hand_eye(options: SimulatorOptions, recording: Recording) -> Tensor:

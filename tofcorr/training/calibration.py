@@ -16,7 +16,7 @@ from tofcorr.estimation.solvers import Watcher
 from tofcorr.fit.fitting import calibrated, fit
 from tofcorr.fit.known import Known
 from tofcorr.fit.misfit import assumptions, find_misfit, misfit_pixels
-from tofcorr.fit.problem import FitOptions
+from tofcorr.fit.problem import Fit, FitOptions
 from tofcorr.fit.walls import with_every_wall
 from tofcorr.pixels.dataset import (
     Dataset,
@@ -61,6 +61,8 @@ class Calibration:
         resumed: Where an interrupted run stood; None starts anew.
         left_out: Global numbers of frames that are neither fitted nor held out.
         known: What earlier calibrations say, for the ranges of the fit; None: nothing.
+        found: The fit, where it was made together with other cameras; the recordings then have the
+            walls and poses that it found.
 
     Raises:
         CalibrationDataError: The recordings cannot support the model.
@@ -84,15 +86,19 @@ class Calibration:
         resumed: Parameters | None = None,
         left_out: Collection[int] = (),
         known: Known | None = None,
+        found: Fit | None = None,
     ) -> None:
         self.train, self.test = halves(data, options, left_out)
-        lattice = lattice_of(data, self.train)
-        domain = covered_domain(data, self.train, lattice) if known is None else known.domain
-        found = fit(data, self.train, options, known or domain, watcher, resumed, lattice=lattice)
+        if found is None:
+            lattice = lattice_of(data, self.train)
+            domain = covered_domain(data, self.train, lattice) if known is None else known.domain
+            found = fit(
+                data, self.train, options, known or domain, watcher, resumed, lattice=lattice
+            )
         self.data = data = with_every_wall(data, found.walls, found.model)
         self.stages = {
-            "before": without_correction(domain, recorded_hand_eye(data)),
-            "hand_eye_only": without_correction(domain, found.hand_eye_only.tool_from_camera),
+            "before": without_correction(found.domain, recorded_hand_eye(data)),
+            "hand_eye_only": without_correction(found.domain, found.hand_eye_only.tool_from_camera),
             "after": found.model,
         }
         every = frame_errors(data, self.stages, options.device, found.observability.variance)

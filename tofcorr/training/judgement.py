@@ -23,7 +23,7 @@ from tofcorr.training.support import Support, shortcomings
 Training = TypeVar("Training", bound=TrainingOptions)
 Verdict = Literal["good", "usable", "do not use"]
 DO_NOT_USE: Verdict = "do not use"
-_VERDICTS: tuple[Verdict, ...] = (DO_NOT_USE, "usable", "good")
+VERDICTS: tuple[Verdict, ...] = (DO_NOT_USE, "usable", "good")
 
 # What a verdict and the warnings compare with; errors are root mean squares.
 #
@@ -125,7 +125,7 @@ def judge(
         odd.append(("usable", inspection.headline))
     first = dict(reversed([*odd, *said]))
     first["good"] = expected(fit, errors, inspection)
-    verdict: Verdict = min(first, key=_VERDICTS.index)
+    verdict: Verdict = min(first, key=VERDICTS.index)
     return verdict, first[verdict], [sentence for _, sentence in said]
 
 

@@ -4,7 +4,7 @@ import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -240,6 +240,36 @@ def interruptible() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
+@contextmanager
+def timed_stages(
+    what: str, *, written: bool
+) -> Iterator[tuple[Callable[[str], AbstractContextManager[None]], dict[str, float]]]:
+    """Show which stage work is in, and measure each.
+
+    Args:
+        what: What is done.
+        written: Whether files are written.
+
+    Yields:
+        What announces a stage and times a block; and the seconds of each stage so far.
+    """
+    seconds: dict[str, float] = {}
+    # The bar counts read, inspect, fit and report; then write and figures.
+    with stages(what, 6 if written else 4) as begin:
+
+        @contextmanager
+        def stage(name: str) -> Iterator[None]:
+            """Announce a stage, and add up the seconds of the block, whatever ends it."""
+            begin(name)
+            start = perf_counter()
+            try:
+                yield
+            finally:
+                seconds[name] = round(seconds.get(name, 0.0) + perf_counter() - start, 3)
+
+        yield stage, seconds
+
+
 def inspected(
     data: Dataset, options: TrainingOptions, *, force: bool
 ) -> tuple[Dataset, TrainingOptions, Inspection, tuple[int, ...]]:
@@ -346,20 +376,7 @@ def carried_training(
     """Train as `train` does, with what is known before; None: nothing."""
     if out is not None:
         refuse_existing(Path(out))
-    seconds: dict[str, float] = {}
-    # The bar counts read, inspect, fit and report; then write and figures.
-    with stages("training", 4 if out is None else 6) as begin:
-
-        @contextmanager
-        def stage(name: str) -> Iterator[None]:
-            """Announce a stage, and add up the seconds of the block, whatever ends it."""
-            begin(name)
-            start = perf_counter()
-            try:
-                yield
-            finally:
-                seconds[name] = round(seconds.get(name, 0.0) + perf_counter() - start, 3)
-
+    with timed_stages("training", written=out is not None) as (stage, seconds):
         with stage("read"):
             data = Dataset(opened(recordings))
             start = None if resume is None else resumed_parameters(resume, options)

@@ -1,6 +1,8 @@
-"""The camera's pose as a fixed joint of a robot description (URDF, xacro)."""
+"""Robot descriptions (URDF, xacro): the camera's pose as a fixed joint, and a corrected robot."""
 
 import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 
@@ -11,6 +13,9 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.pose import Mount, decimals
 from tofcorr.correction.state import CalibrationState
 from tofcorr.files import write_text
+from tofcorr.geometry import se3
+from tofcorr.geometry.arm import Arm, origin_of
+from tofcorr.options import read_text
 
 
 def export_urdf(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -45,6 +50,32 @@ def export_urdf(corrector: DepthCorrector, path: Path | str, reference: Calibrat
         rpy=" ".join(decimals(roll_pitch_yaw(mount.transform[:3, :3]))),
     )
     write_text(path, text)
+
+
+def corrected_description(urdf: Path | str, arm: Arm, offsets: Mapping[str, float]) -> str:
+    """Return a robot's description with offsets of joints in their origins.
+
+    Angles as the controller reports them then give the true poses: origin exp(axis (q + offset)) is
+    a new origin, times exp(axis q).
+
+    Args:
+        urdf: The description.
+        arm: The chain that it holds.
+        offsets: By joint, radians or metres.
+    """
+    parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
+    root = ET.fromstring(read_text(Path(urdf)), parser)
+    for joint in root.findall("joint"):
+        name = joint.get("name", "")
+        if name not in offsets:
+            continue
+        turned = se3.exp(offsets[name] * arm.twists[arm.names.index(name)])
+        origin = joint.find("origin")
+        pose = (origin_of(joint, urdf) @ turned).numpy()
+        origin = ET.SubElement(joint, "origin") if origin is None else origin
+        origin.set("xyz", " ".join(decimals(pose[:3, 3])))
+        origin.set("rpy", " ".join(decimals(roll_pitch_yaw(pose[:3, :3]))))
+    return f'<?xml version="1.0"?>\n{ET.tostring(root, encoding="unicode")}\n'
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:

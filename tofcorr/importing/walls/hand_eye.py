@@ -22,9 +22,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from tofcorr.estimation.joint import estimate_walls
 from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments, Parameters
-from tofcorr.estimation.planes import Walls, estimate_walls
+from tofcorr.estimation.planes import Walls
 from tofcorr.estimation.robust import robust_weights, sigma_from_mad
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.geometry import se3
