@@ -218,3 +218,55 @@ def check_command(run: Path, recordings: tuple[Path, ...], **given: Any) -> None
     from tofcorr.drift.check import check
 
     show(check(run, recordings, **given), given["out"], given["page"])
+
+
+_TRANSLATION = "Half the 95 % interval of the hand-eye translation that is enough, mm."
+_ROTATION = "The same of its rotation, degrees."
+
+
+@click.command()
+@click.argument("source", type=FOLDER)
+@config_options(_TRAINING, "train", "The model that is fitted", "solver.max_iterations=30", "ea")
+@option("--port", "Of the page on this machine; 0: any free one.", default=0)
+@option("--wanted-mm", _TRANSLATION, default=0.5)
+@option("--wanted-deg", _ROTATION, default=0.05)
+@option("--live", "New folder that keeps each frame's sums.", "folder", type=NewPath())
+@option("--run", "New folder for the calibration, written at the end.", type=NewPath())
+@option("--once", "Add the frames that are there, say what is known, and end.", is_flag=True)
+@option("--no-browser", "Print the address and open no browser.", is_flag=True)
+def watch_command(
+    options: "TrainingOptions",
+    source: Path,
+    *,
+    port: int,
+    run: Path | None,
+    once: bool,
+    no_browser: bool,
+    **more: Any,  # noqa: ANN401
+) -> None:
+    """Calibrate while a recording grows, and show in the browser what is known.
+
+    SOURCE is a recording whose files grow frame by frame, or the folder of a LiveCalibration that
+    another program adds to; that one has its own configuration and limits. Ctrl-C ends it, and
+    writes the calibration to --run.
+    """
+    from tofcorr.live.watch import Watched, serve, watch
+
+    watched = Watched(source, options, **more)
+    if once:
+        watched.poll()
+    else:
+        server = serve(watched, port)
+        address = f"http://127.0.0.1:{server.server_port}/"
+        click.echo(f"{address} shows {source}; Ctrl-C ends it.")
+        if not no_browser:
+            click.launch(address)
+        try:
+            watch(watched)
+        except KeyboardInterrupt:
+            server.shutdown()
+            server.server_close()
+    click.echo("\n".join([watched.state["verdict"], *watched.damaged]))
+    if run is not None:
+        watched.live.save(run)
+        click.echo(f"Written to {run}")

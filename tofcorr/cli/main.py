@@ -23,6 +23,7 @@ COMMANDS = {
     "simulate": ("simulate", "Draw a recording from the sensor simulator."),
     "import": ("record", "Turn recorded images into a recording."),
     "inspect": ("calibrate", "Say what is odd about a recording, before any fit."),
+    "watch": ("calibrate", "Show in the browser what a recording tells while it grows."),
     "train": ("calibrate", "Calibrate a recording: distance, pixel, intensity error, hand-eye."),
     "update": ("calibrate", "Carry a calibration on with a few frames, and say what has changed."),
     "pool": ("calibrate", "Find what cameras of one type share, as the prior of the next one."),

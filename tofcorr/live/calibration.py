@@ -73,7 +73,8 @@ from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import Config, calibration_state
 
 _START = "tofcorr-live"
-_START_FILE = "live.pt"
+START_FILE = "live.pt"
+"""What a folder of a live calibration begins with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +185,7 @@ class LiveCalibration:
         if self._folder is not None:
             refuse_existing(self._folder)
             with staged_folder(self._folder) as staged:
-                save_values(staged / _START_FILE, _START, self._start(), CalibrationDataError)
+                save_values(staged / START_FILE, _START, self._start(), CalibrationDataError)
 
     @classmethod
     def resume(cls, folder: Path | str) -> "LiveCalibration":
@@ -193,23 +194,70 @@ class LiveCalibration:
         Raises:
             CalibrationDataError: The folder holds none, or a frame of it is damaged.
         """
-        folder = Path(folder)
-        start = read_values(folder / _START_FILE, _START)
-        if start is None:
-            raise CalibrationDataError(f"{folder}: holds no live calibration ({_START_FILE}).")
-        camera, config = CameraIntrinsics(**start.pop("camera")), start.pop("config")
-        guess = start.pop("tool_from_camera").numpy()
-        live = cls(camera, config, tool_from_camera=guess, **start)
+        live, folder = cls.started(folder), Path(folder)
         live._folder = folder
         for file in sorted(folder.glob("frame-*.pt")):
-            values = read_values(file, FRAME_FORM)
-            if values is None:
-                raise CalibrationDataError(f"{file}: is damaged; remove it to go on without it.")
-            live._like = replace(live._like, **values.pop("like"))
-            live._take(int(file.stem.removeprefix("frame-")), frame_of(values))
+            live._read(file)
         if live._frames:
             live._known = live._learn(max(live._frames))
         return live
+
+    @classmethod
+    def started(cls, folder: Path | str) -> "LiveCalibration":
+        """Return the calibration that a folder holds without its frames, which `take` adds.
+
+        Raises:
+            CalibrationDataError: The folder holds none.
+        """
+        folder = Path(folder)
+        start = read_values(folder / START_FILE, _START)
+        if start is None:
+            raise CalibrationDataError(f"{folder}: holds no live calibration ({START_FILE}).")
+        camera, config = CameraIntrinsics(**start.pop("camera")), start.pop("config")
+        guess = start.pop("tool_from_camera").numpy()
+        return cls(camera, config, tool_from_camera=guess, **start)
+
+    def take(self, file: Path) -> Known:
+        """Take a frame that another process wrote, `frame-*.pt`, and say what is known with it.
+
+        Raises:
+            CalibrationDataError: The file is damaged.
+        """
+        with thread_number(1):
+            self._known = self._learn(self._read(file))
+        return self._known
+
+    def _read(self, file: Path) -> int:
+        """Add the frame of a file to those that are fitted, and return its number."""
+        values = read_values(file, FRAME_FORM)
+        if values is None:
+            raise CalibrationDataError(f"{file}: is damaged; remove it to go on without it.")
+        self._like = replace(self._like, **values.pop("like"))
+        number = int(file.stem.removeprefix("frame-"))
+        self._take(number, frame_of(values))
+        return number
+
+    @property
+    def camera(self) -> CameraIntrinsics:
+        """The intrinsics."""
+        return self._like.camera
+
+    @property
+    def frames(self) -> list[KeptFrame]:
+        """What is kept of the frames, in the order of their time stamps."""
+        return [self._frames[k] for k in self._order()]
+
+    @property
+    def tool_from_camera(self) -> np.ndarray:
+        """The hand-eye transform as far as it is known, shape (4, 4)."""
+        fitted = None if self._known is None else self._known.fit
+        guess = self._like.tool_from_camera
+        return guess if fitted is None else fitted.optimum.tool_from_camera.numpy()
+
+    @property
+    def recorded_planes(self) -> bool:
+        """Whether each frame's plane was measured by other means."""
+        return self._like.planes == "recorded"
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -269,7 +317,9 @@ class LiveCalibration:
         )
         if plane is not None:
             size = float(np.linalg.norm(plane[:3]))
-            row = replace(row, normal_world=np.asarray(plane[:3]) / size, offset=plane[3] / size)
+            row = replace(
+                row, normal_world=np.asarray(plane[:3]) / size, offset=float(plane[3]) / size
+            )
         planes = "estimated" if plane is None else "recorded"
         with thread_number(1):  # Threads would wait longer than they compute.
             return self._added(number, self._summed(row, images, planes))

@@ -1,9 +1,11 @@
 """What a live calibration keeps of a frame, in memory and on disk, and on which ranges."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from pydantic import TypeAdapter
 from torch import Tensor
@@ -15,6 +17,7 @@ from tofcorr.error_terms.model import ErrorModelOptions, columns_on
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.robust import robust_scale
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.pixels.lattice import Lattice, joined
 from tofcorr.training.calibration import TrainingOptions
 
@@ -47,6 +50,49 @@ def brightness_of(frames: list[KeptFrame]) -> dict[str, Tensor]:
         ends = torch.tensor([1 / 10, 9 / 10]).double()
         found[name] = light.quantile(ends).log() if len(light) else torch.zeros_like(ends)
     return found
+
+
+def seen_from(
+    world_from_tool: np.ndarray, row: FrameRow, tool_from_camera: np.ndarray
+) -> tuple[float, float, float]:
+    """Return how a pose (4, 4) sees the wall of a frame.
+
+    Returns:
+        Distance along the optical axis, metres; tilt of that axis against the wall's normal,
+        degrees; roll about it from the frame's pose, degrees.
+    """
+    camera, before = world_from_tool @ tool_from_camera, row.world_from_tool @ tool_from_camera
+    facing = float(row.normal_world @ camera[:3, 2])
+    distance = -float(row.normal_world @ camera[:3, 3] + row.offset) / facing
+    turn = before[:3, :3].T @ camera[:3, :3]
+    roll = math.degrees(math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+    return distance, math.degrees(math.acos(min(1.0, abs(facing)))), roll
+
+
+def coverage(
+    frames: list[KeptFrame], camera: CameraIntrinsics, tool_from_camera: np.ndarray
+) -> dict[str, list[float]]:
+    """Return what frames cover, by what it is of.
+
+    Returns:
+        Of each frame `distance` (m), `tilt` (degrees) and `brightness` (the amplitude), medians
+        over it; `image`: the share of usable pixels of each of nine parts, row by row.
+    """
+    light = [float(one.lattice.amplitude.nanmedian()) for one in frames]
+    seen = torch.zeros(3, 3).double()
+    for one in frames:
+        place = one.lattice.place
+        part = 3 * place // (camera.width * camera.height), 3 * (place % camera.width)
+        part = part[0], part[1] // camera.width
+        usable = one.lattice.radial_distance[0].isfinite().double()
+        every = torch.zeros(3, 3).double().index_put(part, torch.ones(1).double(), accumulate=True)
+        seen += torch.zeros(3, 3).double().index_put(part, usable, accumulate=True) / every
+    return {
+        "distance": [float(one.lattice.radial_distance.nanmedian()) for one in frames],
+        "tilt": [seen_from(x.row.world_from_tool, x.row, tool_from_camera)[1] for x in frames],
+        "brightness": [one for one in light if math.isfinite(one)],
+        "image": (seen / max(1, len(frames))).flatten().tolist(),
+    }
 
 
 def suitable(options: TrainingOptions) -> TrainingOptions:
