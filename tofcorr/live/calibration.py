@@ -9,6 +9,8 @@ What `add` returns is a fit of the moments alone, on ranges that are a little wi
 so that they seldom change, and without what the noise moves (`fit.fitting`).
 """
 
+# Long: one class, told in order from a frame to what is known with it.
+
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -36,6 +38,7 @@ from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, columns_on
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
+from tofcorr.estimation.linear import solvable
 from tofcorr.estimation.moments import (
     HAND_EYE_SYMBOLS,
     ImageMoments,
@@ -555,7 +558,8 @@ class LiveCalibration:
         options = self.options.model_copy(update={"solver": few})
         problem = Problem(dataset, frames, options, here, resumed=self._last)
         try:
-            problem, core, covariance = estimate(problem, moments)
+            with solvable(self._like.path, "fit"):
+                problem, core, covariance = estimate(problem, moments)
         except CalibrationDataError:  # So few frames do not determine it.
             return Known(number, poses)
         assert core.observability is not None
