@@ -593,6 +593,8 @@ class LiveCalibration:
         free = {name for one in found.observability.undetermined for name in one.shares}
         if free & {*HAND_EYE_SYMBOLS}:
             shift = turn = math.inf
+            # A fit that starts from anywhere may stay there, whatever further frames say.
+            self._last = None
         shift, turn, gained = 1e3 * shift, math.degrees(turn), 0.0
         if before is not None and math.isfinite(shift):
             gained = 1 - max(shift / before.translation_mm, turn / before.rotation_deg)
