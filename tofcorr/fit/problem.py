@@ -359,11 +359,11 @@ class Fit(Core):
     optimum: Parameters
     hand_eye_only: Parameters
     covariance: Covariance
-    residual: str | None
-    weights: PixelWeights | None
-    walls: FoundWalls | None
-    noise: DistanceNoise | None
-    noise_shift: Shift | None
+    residual: str | None = None
+    weights: PixelWeights | None = None
+    walls: FoundWalls | None = None
+    noise: DistanceNoise | None = None
+    noise_shift: Shift | None = None
     misfit: Shift | None = None
     assumptions: tuple[Shift, ...] = ()
 

@@ -54,7 +54,7 @@ from tofcorr.fit.fitting import calibrated, estimate, fit
 from tofcorr.fit.problem import Fit, Problem
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind, FrameNames
-from tofcorr.geometry.rays import plane_in_frame, planes_through, ray_directions
+from tofcorr.geometry.rays import plane_in_frame, planes_through
 from tofcorr.live.frames import (
     FRAME_FORM,
     KeptFrame,
@@ -71,7 +71,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, thread_number
 from tofcorr.pixels.lattice import covered_domain, joined, lattice_in
 from tofcorr.pixels.sample import usable_pixels
-from tofcorr.training.advice import PosePool, draw_pool
+from tofcorr.training.advice import PosePool, draw_pool, predicted_moments
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import Config, calibration_state
 
@@ -91,7 +91,7 @@ class Known:
         translation_mm: Half the 95 % interval of the hand-eye transform along its worst axis, mm;
             infinite while it is not determined.
         rotation_deg: The same of the rotation, degrees.
-        terms_mm: Standard error of each coefficient, mm: of its term's largest error in range.
+        terms_mm: Standard error of each coefficient of the scaled variables, mm.
         weakest: The direction known least, in words.
         gained: By how much the newest frame has shrunk the wider of both intervals, a share of it.
         enough: Whether both intervals are as narrow as wanted.
@@ -380,20 +380,16 @@ class LiveCalibration:
             pool = pool.only(np.flatnonzero(reached)) if any(reached) else None
         if pool is None:
             return None
-        expected = self._expected(pool, fitted)
+        expected = self._expected(pool, fitted, dataset)
         wanted = torch.tensor([self.wanted_mm / 1e3] * 3 + [math.radians(self.wanted_deg)] * 3)
         size = expected.diagonal(dim1=1, dim2=2)[:, :6] / wanted.double().square()
         return pool.world_from_tool[int(size.sum(dim=1).argmin())].numpy()
 
-    def _expected(self, pool: PosePool, found: Fit) -> Tensor:
+    def _expected(self, pool: PosePool, found: Fit, dataset: Dataset) -> Tensor:
         """Return the covariance of all unknowns, and of the walls, after each pose of a pool."""
         best, walls = found.optimum, None if found.walls is None else found.walls.walls
-        design = Design(found.model.error, found.domain, ray_directions(self._like.camera))
-        share = float(found.moments.count.mean()) / (found.domain.height * found.domain.width)
         # Views are smooth: so many pixels tell what all would.
-        moments = pool.moments(design, best.tool_from_camera, share, enough=500)
-        further = [name for name in found.moments.symbols if name not in moments.symbols]
-        moments = moments.with_conditions(torch.zeros(len(moments.gram), len(further)), further)
+        moments = predicted_moments(pool, found, dataset, enough=500)
         theirs = walls
         if walls is not None:
             apart = (pool.normal_world[:, None] - walls.normal_world).square().sum(dim=2)
@@ -572,11 +568,7 @@ class LiveCalibration:
             optimum=best,
             hand_eye_only=best,
             covariance=covariance,
-            residual=None,
-            weights=None,
             walls=problem.walls,
-            noise=None,
-            noise_shift=None,
         )
         return self._judged(Known(number, poses, fit=found), core.moments, order.index(number))
 
@@ -629,7 +621,7 @@ class LiveCalibration:
                 (MomentObjective(own).image_losses(best).clamp(min=0) / own.count).sqrt().numpy()
                 for own in (within_prior(moments, best, ridge), moments)
             )
-            noise = np.array([self._frames[k].noise for k in self._order()])
+            noise = np.array([one.noise for one in self.frames])
             # Dark targets have more noise: within an image it is the unit.
             if is_outlying(within / noise):
                 said.append(f"shows no plane: {1e3 * within[place]:.1f} mm are left within it.")
@@ -639,7 +631,7 @@ class LiveCalibration:
             own, usual = float(moments.count[place]), float(moments.count.median())
             if 2 * own < usual:
                 said.append(f"has {own:.0f} usable pixels, where {usual:.0f} are usual.")
-        rows = [self._frames[k].row for k in self._order()][max(place - 1, 0) : place + 1]
+        rows = [one.row for one in self.frames][max(place - 1, 0) : place + 1]
         if len(rows) > 1 and rows[1].timestamp - rows[0].timestamp <= _STREAM_S:
             moved = np.abs(rows[1].world_from_tool - rows[0].world_from_tool).max()
             if moved > STANDSTILL:

@@ -345,13 +345,7 @@ def advise(
         can show, and each pose with the standard deviation of the worst one (mm or mrad) to expect
         once it is added.
     """
-    best = fit.solution.parameters
-    design = Design(fit.model.error, fit.domain, dataset.ray_directions())
-    share = float(fit.moments.count.mean()) / (fit.domain.height * fit.domain.width)
-    moments = pool.moments(design, best.tool_from_camera, share, enough)
-    # Poses carry no information about condition terms.
-    beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
-    moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
+    best, moments = fit.solution.parameters, predicted_moments(pool, fit, dataset, enough)
     added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
     # What no pose shows is not what further poses are for.
     shown = [k for k, one in enumerate(fit.observability.directions) if not fit.is_unseen(one)]
@@ -376,6 +370,23 @@ def advise(
         "sigma_mm_or_mrad": 1e3 * weakest.sigma,
     }
     return order, {**now, "worst_sigma_mm_or_mrad": worst[0], "poses": poses}
+
+
+def predicted_moments(pool: PosePool, fit: Fit, dataset: Dataset, enough: int) -> ImageMoments:
+    """Return the moments that views from a pool would have, with every column of a fit.
+
+    Args:
+        pool: The poses.
+        fit: The calibration so far.
+        dataset: Gives the camera.
+        enough: Pixels of an image that its moments are predicted from.
+    """
+    design = Design(fit.model.error, fit.domain, dataset.ray_directions())
+    share = float(fit.moments.count.mean()) / (fit.domain.height * fit.domain.width)
+    moments = pool.moments(design, fit.solution.parameters.tool_from_camera, share, enough)
+    # Poses carry no information about condition terms.
+    beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
+    return moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
 
 
 def _kinds(weakest: Direction, model: ErrorModel) -> list[str]:
