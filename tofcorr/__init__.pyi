@@ -2,6 +2,7 @@
 
 from tofcorr.comparison.evaluate import EvaluationResult as EvaluationResult
 from tofcorr.comparison.evaluate import evaluate as evaluate
+from tofcorr.comparison.named import train_with as train_with
 from tofcorr.comparison.runs import RunComparison as RunComparison
 from tofcorr.comparison.runs import compare as compare
 from tofcorr.comparison.select import SelectionResult as SelectionResult

@@ -11,8 +11,9 @@ from torch import Generator
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.geometry.se3 import tool_twists
 from tofcorr.simulation.options import ArmOptions, CameraMountOptions, MountGuessOptions
-from tofcorr.simulation.robot import hand_eye_guess, tool_twists
+from tofcorr.simulation.robot import hand_eye_guess
 
 
 def test_wall_fills_every_frame_within_the_limits() -> None:

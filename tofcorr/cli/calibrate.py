@@ -27,6 +27,7 @@ _SELECTION = "comparison.options:SelectionOptions"
 
 _PLANES = "known: the planes were measured; unknown: a start; auto: as recording.yaml says."
 _PRIOR = "What other cameras of the type have in common: a file that tofcorr pool wrote."
+_NAMED = "A diagnosis: what it names is corrected too, where held-out images are better with it."
 _NO_FIGURES = "Write no page, and draw no figures for TensorBoard."
 _WALL = "What is known: nothing; all frames show one wall, and poses are right; or its plane."
 _DRIFTED = "Offset or departure from a plane above which the camera counts as drifted."
@@ -55,12 +56,14 @@ def inspect_command(recordings: tuple[Path, ...], out: Path | None, planes: Any)
 @out_option("Folder of the run, made anew.")
 @option("--resume", "An interrupted run; the fit goes on where it stood.", type=FOLDER)
 @option("--prior", _PRIOR, type=FOLDER)
+@option("--with", _NAMED, "diagnosis", type=FOLDER)
 @force_option
 @option("--no-figures", _NO_FIGURES, is_flag=True)
 def train_command(
     options: "TrainingOptions",
     recordings: tuple[Path, ...],
     *,
+    diagnosis: Path | None,
     no_figures: bool,
     **given: Any,  # noqa: ANN401
 ) -> None:
@@ -74,7 +77,15 @@ def train_command(
 
     if no_figures:
         options = options.model_copy(update={"figures": False})
-    show(train(recordings, options, **given), given["out"])
+    if diagnosis is None:
+        found = train(recordings, options, **given)
+    elif given["resume"] or given["prior"]:
+        raise click.UsageError("--with begins anew and without a prior: leave out the other one.")
+    else:
+        from tofcorr.comparison.named import train_with
+
+        found = train_with(diagnosis, recordings, options, out=given["out"], force=given["force"])
+    show(found, given["out"])
 
 
 @click.command()

@@ -249,7 +249,9 @@ def select(
         complexity = {k.name: _complexity(k, found.fitter.domain, dataset) for k in trainings}
         rankings = {}
         for by, groups in found.errors.items():
-            errors = {k: _by_pose(dataset, found.held_out(by, k), options) for k in complexity}
+            errors = {
+                k: errors_by_pose(dataset, found.held_out(by, k), options) for k in complexity
+            }
             rankings[by] = Ranking(errors, complexity, len(groups))
         # What the page says of the models is what was asked for.
         result = SelectionResult(rankings, found, options, inspection.headline)
@@ -260,7 +262,9 @@ def select(
     return result
 
 
-def _by_pose(dataset: Dataset, held_out: FrameErrors, options: SelectionOptions) -> np.ndarray:
+def errors_by_pose(
+    dataset: Dataset, held_out: FrameErrors, options: SelectionOptions
+) -> np.ndarray:
     """Return a model's held-out error of each pose with a usable pixel, in the poses' order, mm."""
     absolute = options.metric == "mean_abs"
     poses = dataset.pose_groups()[held_out.frames]

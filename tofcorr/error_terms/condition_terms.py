@@ -30,14 +30,23 @@ class RoomTemperatureOptions(BaseTermOptions):
     letter: ClassVar[str] = "h"
 
 
+class AmbientLightOptions(BaseTermOptions):
+    """Options of a `ConditionPolynomial` in the background light."""
+
+    kind: Literal["ambient_light"] = "ambient_light"
+    degree: PositiveInt = Field(default=1, le=5)
+    needs: ClassVar[tuple[str, ...]] = ("ambient",)
+    letter: ClassVar[str] = "b"
+
+
 class ConditionPolynomial(ConditionTerm):
     r"""Polynomial in one condition of a frame.
 
     .. math:: E(u) = \sum_{k=1}^{K} h_k u^k, \quad u = (x - \bar x) / w
 
-    with x the integration time or the room's temperature, clamped to its calibrated range.
-    Kahlmann, Remondino and Ingensand (2006) measured both: the error changes with the integration
-    time, and by about 8 mm a degree Celsius.
+    with x the integration time, the room's temperature or the background light, clamped to its
+    calibrated range. Kahlmann, Remondino and Ingensand (2006) measured all three: the error changes
+    with the integration time, and by about 8 mm a degree Celsius.
 
     Args:
         options: The degree.
@@ -54,7 +63,9 @@ class ConditionPolynomial(ConditionTerm):
     half_width: Tensor
 
     def __init__(
-        self, options: IntegrationTimeOptions | RoomTemperatureOptions, domain: Domain
+        self,
+        options: IntegrationTimeOptions | RoomTemperatureOptions | AmbientLightOptions,
+        domain: Domain,
     ) -> None:
         names = [f"{options.letter}{k}" for k in range(1, options.degree + 1)]
         super().__init__(options, names, options.needs[0], domain)

@@ -22,6 +22,7 @@ _KINDS = (
     ("pixel_terms", "FixedPatternOptions", "FixedPattern"),
     ("condition_terms", "IntegrationTimeOptions", "ConditionPolynomial"),
     ("condition_terms", "RoomTemperatureOptions", "ConditionPolynomial"),
+    ("condition_terms", "AmbientLightOptions", "ConditionPolynomial"),
     ("condition_terms", "WarmUpOptions", "WarmUp"),
 )
 

@@ -232,3 +232,31 @@ def projected(vectors: Tensor, directions: Tensor) -> Tensor:
     for axis in range(1, 3):
         total = total + vectors[..., axis] * directions[:, axis].reshape(shape)
     return total
+
+
+def tool_twists(timestamp: Tensor, world_from_tool: Tensor) -> Tensor:
+    """Return the tool's velocity in every frame, from a parabola through it and two near it.
+
+    At the ends of a stroke both neighbours lie on one side.
+
+    Args:
+        timestamp: Of the frames, shape (F,), seconds.
+        world_from_tool: Poses of the tool, shape (F, 4, 4).
+
+    Returns:
+        Twists in the tool's own frame, translation first, shape (F, 6), m/s and rad/s; NaN where a
+        frame has no two others within reach, and everywhere if time does not increase.
+    """
+    count, gaps = len(timestamp), timestamp.diff()
+    twists = timestamp.new_full((count, 6), torch.nan)
+    # A robot starts and stops within a second (chosen): poses farther apart say nothing.
+    stroke = torch.cat([gaps.new_zeros(1), (gaps > 1.0).cumsum(0)])
+    for frame in range(count) if bool((gaps > 0).all()) else ():
+        around = (frame - 1, frame + 1, frame - 2, frame + 2)
+        near = [k for k in around if 0 <= k < count and stroke[k] == stroke[frame]][:2]
+        if len(near) == 2:
+            first, second = (timestamp[near] - timestamp[frame]).tolist()
+            moved = log(inverse(world_from_tool[frame]) @ world_from_tool[near])
+            twist = second / first * moved[0] - first / second * moved[1]
+            twists[frame] = twist / (second - first)
+    return twists

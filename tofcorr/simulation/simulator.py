@@ -23,14 +23,14 @@ from tofcorr.geometry.rays import (
     ray_plane_distance,
     z_depth_from_radial_distance,
 )
-from tofcorr.geometry.se3 import world_from_plane
+from tofcorr.geometry.se3 import tool_twists, world_from_plane
 from tofcorr.options import resolve_options
 from tofcorr.progress import bar
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.effects.robot_kinematics import sides_of_approach
 from tofcorr.simulation.hooks import STAGES, Effect, FrameFacts, FrameState
 from tofcorr.simulation.options import SensorOptions, SimulatorOptions
-from tofcorr.simulation.robot import draw_plan, draw_slip, hand_eye_guess, tool_twists
+from tofcorr.simulation.robot import draw_plan, draw_slip, hand_eye_guess
 from tofcorr.simulation.scene import SceneOptions, seen_reflectivity, target_named
 from tofcorr.simulation.signal import (
     amplitude_per_reflectivity,

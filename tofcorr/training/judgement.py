@@ -302,13 +302,14 @@ def full_text(report: Mapping[str, Any]) -> str:
 
 
 def update_words(report: Mapping[str, Any]) -> list[str]:
-    """Return what earlier calibrations say: what has changed since, and the other explanations.
+    """Return what was known before: what has changed since, or what a diagnosis had named.
 
     Args:
         report: The content of report.json.
     """
     units = report.get("prior", {"units": []})["units"]
     own = [f"The prior is what {len(units)} units of its type have in common."] if units else []
+    own = report.get("named", {"sentences": own})["sentences"]
     if (update := report.get("update")) is None:
         return own
     others = [

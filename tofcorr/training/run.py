@@ -343,12 +343,12 @@ class Carried(NamedTuple):
 
     Attributes:
         data: The recordings.
-        known: What earlier calibrations say, for the ranges of the fit.
+        known: What earlier calibrations say, for the ranges of the fit; None: nothing.
         said: Returns what the report says of it, by its key, from the fit.
     """
 
     data: Dataset
-    known: Known
+    known: Known | None
     said: Callable[[Fit], dict[str, Any]]
 
 
