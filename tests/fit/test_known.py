@@ -12,7 +12,7 @@ from tofcorr.error_terms.base import Interval
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.estimation.moments import MomentObjective
 from tofcorr.fit.fitting import prepare, solve
-from tofcorr.fit.known import Known
+from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.problem import Problem
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
@@ -32,7 +32,7 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return simulated_wall(folder, sensor=SENSOR | QUIET, robot=robot)
 
 
-def solved(wall: Dataset, frames: np.ndarray, known: Known | None) -> Known:
+def solved(wall: Dataset, frames: np.ndarray, known: PriorKnowledge | None) -> PriorKnowledge:
     """Fit some frames, and return what is known then, by the curvature of the loss."""
     every, seen = np.arange(wall.num_frames), lattice_of(wall, frames)
     domain = covered_domain(wall, every, lattice_of(wall, every))
@@ -41,12 +41,12 @@ def solved(wall: Dataset, frames: np.ndarray, known: Known | None) -> Known:
     best = core.solution.parameters
     curvature = MomentObjective(core.moments, core.carried).normal_equations(best).hessian
     covariance = torch.linalg.inv(curvature / VARIANCE)
-    return Known(
+    return PriorKnowledge(
         options=EA, domain=domain, parameters=best, covariance=covariance, variance=VARIANCE
     )
 
 
-def in_standard_errors(one: Known, other: Known) -> float:
+def in_standard_errors(one: PriorKnowledge, other: PriorKnowledge) -> float:
     step = one.parameters.step_to(other.parameters)
     return float(step @ torch.linalg.solve(one.covariance, step)) ** 0.5
 

@@ -1,10 +1,10 @@
 """One recording folder: header, images opened memory-mapped and checked, frames in batches."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -39,6 +39,22 @@ class Header(OpenOptions):
     planes: PlaneOrigin = "recorded"
     frames: FrameNames = FrameNames()
     corrected_by: str | None = None
+
+    def recording(self, path: Path, **content: Any) -> "Recording":  # noqa: ANN401
+        """Return the recording with this header; `content` is its frames and images, if any."""
+        mount = np.eye(4) if self.tool_from_camera is None else self.tool_from_camera
+        return Recording(
+            path=path,
+            camera=self.camera.intrinsics(),
+            depth_kind=self.depth_kind,
+            modulation_frequency=self.modulation_frequency_hz,
+            saturation_amplitude=self.saturation_amplitude,
+            tool_from_camera=se3.nearest_rigid(np.array(mount, dtype=np.float64)),
+            planes=self.planes,
+            frame_names=self.frames,
+            corrected_by=self.corrected_by,
+            **content,
+        )
 
 
 def read_header(path: Path) -> Header:
@@ -91,21 +107,21 @@ class Recording:
     path: Path
     camera: CameraIntrinsics
     depth_kind: DepthKind
-    modulation_frequency: float | None
-    saturation_amplitude: float | None
-    tool_from_camera: np.ndarray
-    frames: FrameTable
-    depth: np.ndarray
-    amplitude: np.ndarray | None
-    mask: np.ndarray | None
-    raw: np.ndarray | None
-    planes: PlaneOrigin
-    frame_names: FrameNames
+    modulation_frequency: float | None = None
+    saturation_amplitude: float | None = None
+    tool_from_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
+    frames: FrameTable = None  # type: ignore[assignment] - a header alone has none
+    depth: np.ndarray = None  # type: ignore[assignment]
+    amplitude: np.ndarray | None = None
+    mask: np.ndarray | None = None
+    raw: np.ndarray | None = None
+    planes: PlaneOrigin = "recorded"
+    frame_names: FrameNames = field(default_factory=FrameNames)
     true_depth: np.ndarray | None = None
     corrected_by: str | None = None
 
-    @classmethod
-    def open(cls, path: Path | str, *, check_contents: bool = True) -> Self:
+    @staticmethod
+    def open(path: Path | str, *, check_contents: bool = True) -> "Recording":
         """Open a recording and refuse it if it breaks the format.
 
         Args:
@@ -124,22 +140,31 @@ class Recording:
         head = read_header(path / HEADER_FILE)
         frames = read_table(path / TABLE_FILE)
         size = (head.camera.height, head.camera.width)
-        mount = np.eye(4) if head.tool_from_camera is None else head.tool_from_camera
-        recording = cls(
-            path=path,
-            camera=head.camera.intrinsics(),
-            depth_kind=head.depth_kind,
-            modulation_frequency=head.modulation_frequency_hz,
-            saturation_amplitude=head.saturation_amplitude,
-            tool_from_camera=se3.nearest_rigid(np.array(mount, dtype=np.float64)),
-            frames=frames,
-            **{name: _opened(image, path, *size) for name, image in IMAGE_ARRAYS.items()},
-            planes=head.planes,
-            frame_names=head.frames,
-            corrected_by=head.corrected_by,
-        )
+        images = {name: _opened(image, path, *size) for name, image in IMAGE_ARRAYS.items()}
+        recording = head.recording(path, frames=frames, **images)
         recording._check_images(contents=check_contents)
         return recording
+
+    @property
+    def header(self) -> Header:
+        """What `recording.yaml` says of it.
+
+        Raises:
+            CalibrationDataError: A value is not allowed.
+        """
+        values = {
+            "format": "tofcorr-recording",
+            "version": 1,
+            "camera": self.camera.section(),
+            "depth_kind": self.depth_kind,
+            "modulation_frequency_hz": self.modulation_frequency,
+            "saturation_amplitude": self.saturation_amplitude,
+            "tool_from_camera": self.tool_from_camera.tolist(),
+            "planes": self.planes,
+            "frames": self.frame_names,
+            "corrected_by": self.corrected_by,
+        }
+        return Header.from_mapping(values, HEADER_FILE, CalibrationDataError)
 
     def __repr__(self) -> str:
         """Say in one line what the recording holds."""

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -65,18 +66,16 @@ class RecordingWriter:
         frame_names: FrameNames | None = None,
     ) -> None:
         mount = np.eye(4) if tool_from_camera is None else np.asarray(tool_from_camera)
-        values = {
-            "format": "tofcorr-recording",
-            "version": 1,
-            "camera": camera.section(),
-            "depth_kind": depth_kind,
-            "modulation_frequency_hz": modulation_frequency,
-            "saturation_amplitude": saturation_amplitude,
-            "tool_from_camera": mount.tolist(),
-            "planes": planes,
-            "frames": frame_names or FrameNames(),
-        }
-        self._header = Header.from_mapping(values, HEADER_FILE, CalibrationDataError)
+        self._header = Recording(
+            path=Path(path),
+            camera=camera,
+            depth_kind=depth_kind,
+            modulation_frequency=modulation_frequency,
+            saturation_amplitude=saturation_amplitude,
+            tool_from_camera=mount,
+            planes=planes,
+            frame_names=frame_names or FrameNames(),
+        ).header
         self._rows: list[FrameRow] = []
         self._rows_from: Path | None = None
         self._num_frames = 0
@@ -103,11 +102,9 @@ class RecordingWriter:
             rows: Whether `frames.csv` is copied unchanged, with the columns of other tools.
                 `append` then takes no row, and as many frames must be appended as `recording` has.
         """
-        names = ("camera", "depth_kind", "modulation_frequency", "saturation_amplitude")
-        names += ("tool_from_camera", "planes", "frame_names")
-        writer = cls(path, **{name: getattr(recording, name) for name in names})
-        changed = {"corrected_by": corrected_by or recording.corrected_by}
-        writer._header = writer._header.model_copy(update=changed)
+        writer = cls(path, camera=recording.camera, depth_kind=recording.depth_kind)
+        corrected_by = corrected_by or recording.corrected_by
+        writer._header = replace(recording, corrected_by=corrected_by).header
         writer._rows_from = recording.path / TABLE_FILE if rows else None
         return writer
 

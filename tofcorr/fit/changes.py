@@ -27,7 +27,7 @@ from tofcorr.estimation.moments import MomentObjective
 from tofcorr.estimation.planes import marginal_hessian
 from tofcorr.estimation.uncertainty import effective_variance
 from tofcorr.fit.fitting import on_walls, prepare
-from tofcorr.fit.known import Known
+from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.problem import FitOptions, Problem
 from tofcorr.pixels.dataset import Dataset, Frames
 from tofcorr.pixels.lattice import lattice_of
@@ -66,15 +66,15 @@ class Explanation:
     parts: tuple[str, ...]
     probability: float
     change: Tensor
-    known: Known
+    known: PriorKnowledge
 
 
 def explain(
     dataset: Dataset,
     frames: Frames,
     options: FitOptions,
-    known: Known,
-    of_type: Known | None = None,
+    known: PriorKnowledge,
+    of_type: PriorKnowledge | None = None,
 ) -> list[Explanation]:
     """Return the explanations of new frames, the most probable first.
 
@@ -125,7 +125,7 @@ def explain(
     return sorted(found, key=lambda one: -one.probability)
 
 
-def _change(known: Known, sizes: Mapping[str, float]) -> Tensor:
+def _change(known: PriorKnowledge, sizes: Mapping[str, float]) -> Tensor:
     """Return the covariance of a change of some parts, each of a size in metres and radians."""
     twist, variances = known.parameters.twist_size, torch.zeros(known.parameters.size).double()
     for part, size in sizes.items():
@@ -137,7 +137,9 @@ def _change(known: Known, sizes: Mapping[str, float]) -> Tensor:
     return variances.diag()
 
 
-def _believed(known: Known, change: Tensor, of_type: Known | None) -> Known:
+def _believed(
+    known: PriorKnowledge, change: Tensor, of_type: PriorKnowledge | None
+) -> PriorKnowledge:
     """Return what is believed after a change; of another camera of a type, what is known of it."""
     changed = replace(known, covariance=known.covariance + change)
     if of_type is None:

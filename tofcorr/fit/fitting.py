@@ -53,7 +53,7 @@ from tofcorr.estimation.uncertainty import (
     observability,
     prior_on_undetermined,
 )
-from tofcorr.fit.known import Known
+from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.problem import Core, Fit, FitOptions, Problem, Shift, build_model
 from tofcorr.fit.residual import fit_residual
 from tofcorr.fit.walls import recorded_walls
@@ -69,7 +69,7 @@ def fit(
     dataset: Dataset,
     frames: Frames,
     options: FitOptions,
-    domain: Domain | Known,
+    domain: Domain | PriorKnowledge,
     watcher: Watcher | None = None,
     resumed: Parameters | None = None,
     moments: ImageMoments | None = None,
@@ -107,7 +107,7 @@ def fit(
     with solvable(dataset.first.path, "fit"), thread_number(1):
         frames = np.asarray(frames)
         seen = lattice_of(dataset, frames) if lattice is None else lattice
-        known = domain if isinstance(domain, Known) else None
+        known = domain if isinstance(domain, PriorKnowledge) else None
         ranges = domain if isinstance(domain, Domain) else domain.domain
         problem = Problem(dataset, frames, options, ranges, seen, watcher, resumed, known=known)
         weights = None

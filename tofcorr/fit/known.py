@@ -22,7 +22,7 @@ from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 
 
 @dataclass(frozen=True, kw_only=True)
-class Known:
+class PriorKnowledge:
     """A Gaussian belief about the unknowns of a model.
 
     Attributes:
@@ -39,7 +39,7 @@ class Known:
     covariance: Tensor
     variance: float = 0.0
 
-    def on(self, domain: Domain) -> "Known":
+    def on(self, domain: Domain) -> "PriorKnowledge":
         """Return the same for other ranges.
 
         Raises:
@@ -52,14 +52,14 @@ class Known:
         covariance = whole @ self.covariance @ whole.T
         return replace(self, domain=domain, parameters=parameters, covariance=covariance)
 
-    def towards(self, domain: Domain) -> "Known":
+    def towards(self, domain: Domain) -> "PriorKnowledge":
         """Return the same for ranges that hold others as well, where its terms can be widened."""
         wider = self.domain.joined(domain)
         with suppress(CalibrationDataError):  # Splines keep their knots, and end where they did.
             return self.on(wider)
         return self
 
-    def of_coefficients(self) -> "Known":
+    def of_coefficients(self) -> "PriorKnowledge":
         """Return what it says of the coefficients alone."""
         twist = self.parameters.twist_size
         parameters = replace(self.parameters, hand_eye_is_free=False)
@@ -79,7 +79,9 @@ class Known:
         return Prior(centre, factor, self.variance, ["earlier calibration"] * len(root))
 
 
-def known_of(state: CalibrationState, path: Path, *, moves: bool) -> tuple[Known, str | None]:
+def known_of(
+    state: CalibrationState, path: Path, *, moves: bool
+) -> tuple[PriorKnowledge, str | None]:
     """Return what a calibration knows.
 
     Args:
@@ -116,7 +118,7 @@ def known_of(state: CalibrationState, path: Path, *, moves: bool) -> tuple[Known
             own = turn.T @ errors.flatten().square().diag() @ turn
             joint = torch.block_diag(own, coefficients)
     own = Parameters(state.tool_from_camera, state.coefficients, state.hand_eye_estimated)
-    known = Known(
+    known = PriorKnowledge(
         options=state.error_model,
         domain=state.domain,
         parameters=own,

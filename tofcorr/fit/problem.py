@@ -38,7 +38,7 @@ from tofcorr.estimation.uncertainty import (
     posterior_covariance,
     worst_axes,
 )
-from tofcorr.fit.known import Known
+from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.walls import FoundWalls
 from tofcorr.fit.weighting import PixelWeights
 from tofcorr.options import Options
@@ -192,7 +192,7 @@ class Problem:
     watcher: Watcher | None = None
     resumed: Parameters | None = None
     walls: FoundWalls | None = None
-    known: Known | None = None
+    known: PriorKnowledge | None = None
 
     def poses(self) -> Tensor:
         """Return the pose of each frame, shape (N,), numbered from zero without gaps."""

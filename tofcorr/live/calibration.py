@@ -13,7 +13,7 @@ so that they seldom change, and without what the noise moves (`fit.fitting`).
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,7 +32,7 @@ from tofcorr.correction.state import (
     save_values,
 )
 from tofcorr.data.arrays import IMAGE_ARRAYS
-from tofcorr.data.recording import STANDSTILL, Recording
+from tofcorr.data.recording import STANDSTILL, Header, Recording
 from tofcorr.data.table import FrameRow, FrameTable
 from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, columns_on
@@ -53,7 +53,7 @@ from tofcorr.files import refuse_existing, staged_folder
 from tofcorr.fit.fitting import calibrated, estimate, fit
 from tofcorr.fit.problem import Fit, Problem
 from tofcorr.geometry import se3
-from tofcorr.geometry.camera import CameraIntrinsics, DepthKind, FrameNames
+from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.geometry.rays import plane_in_frame, planes_through
 from tofcorr.live.frames import (
     FRAME_FORM,
@@ -69,7 +69,7 @@ from tofcorr.live.frames import (
 )
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, thread_number
-from tofcorr.pixels.lattice import covered_domain, joined, lattice_in
+from tofcorr.pixels.lattice import condition_ranges, covered_domain, joined, lattice_in
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.training.advice import PosePool, draw_pool, predicted_moments
 from tofcorr.training.calibration import TrainingOptions
@@ -173,9 +173,6 @@ class LiveCalibration:
                 modulation_frequency=modulation_frequency,
                 saturation_amplitude=saturation_amplitude,
                 tool_from_camera=se3.nearest_rigid(guess),
-                **dict.fromkeys(("frames", "depth", "amplitude", "mask", "raw")),  # type: ignore[arg-type]
-                planes="estimated",
-                frame_names=FrameNames(),
             )
         self._frames: dict[int, KeptFrame] = {}
         self._accumulator: MomentAccumulator | None = None
@@ -187,8 +184,10 @@ class LiveCalibration:
         self._seen: Dataset | None = None
         if self._folder is not None:
             refuse_existing(self._folder)
+            start = {"header": self._like.header.to_mapping(), "config": self.options.to_mapping()}
+            start |= {"wanted_mm": wanted_mm, "wanted_deg": wanted_deg}
             with staged_folder(self._folder) as staged:
-                save_values(staged / START_FILE, _START, self._start(), CalibrationDataError)
+                save_values(staged / START_FILE, _START, start, CalibrationDataError)
 
     @classmethod
     def resume(cls, folder: Path | str) -> "LiveCalibration":
@@ -216,9 +215,9 @@ class LiveCalibration:
         start = read_values(folder / START_FILE, _START)
         if start is None:
             raise CalibrationDataError(f"{folder}: holds no live calibration ({START_FILE}).")
-        camera, config = CameraIntrinsics(**start.pop("camera")), start.pop("config")
-        guess = start.pop("tool_from_camera").numpy()
-        return cls(camera, config, tool_from_camera=guess, **start)
+        where = str(folder / START_FILE)
+        header = Header.from_mapping(start.pop("header"), where, CalibrationDataError)
+        return cls(header.recording(folder), **start)
 
     def take(self, file: Path) -> Known:
         """Take a frame that another process wrote, `frame-*.pt`, and say what is known with it.
@@ -256,11 +255,6 @@ class LiveCalibration:
         fitted = None if self._known is None else self._known.fit
         guess = self._like.tool_from_camera
         return guess if fitted is None else fitted.optimum.tool_from_camera.numpy()
-
-    @property
-    def recorded_planes(self) -> bool:
-        """Whether each frame's plane was measured by other means."""
-        return self._like.planes == "recorded"
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -302,30 +296,54 @@ class LiveCalibration:
             CalibrationDataError: Shape or values are not allowed, no pixel is usable, or earlier
                 frames had amplitudes, planes or conditions and this has not, or the reverse.
         """
-        number = max(self._frames, default=-1) + 1
-        images = self._images(number, depth=depth, amplitude=amplitude, mask=mask)
-        si = {name: conditions.pop(condition(name).column, None) for name in CONDITIONS[1:]}
-        if conditions:
-            known = ", ".join(condition(name).column for name in CONDITIONS[1:])
-            raise CalibrationDataError(f"{', '.join(conditions)}: no condition. Known: {known}.")
-        factor = {name: condition(name).si_per_unit for name in CONDITIONS}
+        columns = {condition(name).column: condition(name) for name in CONDITIONS[1:]}
+        if unknown := conditions.keys() - columns.keys():
+            said = f"{', '.join(sorted(unknown))}: no condition. Known: {', '.join(columns)}."
+            raise CalibrationDataError(said)
+        at = np.array([0.0, 0.0, -1.0, 0.0] if plane is None else plane, dtype=np.float64)
+        at /= np.linalg.norm(at[:3])
         row = FrameRow(
-            timestamp=float(number if timestamp is None else timestamp),
+            timestamp=float(self._next if timestamp is None else timestamp),
             world_from_tool=se3.nearest_rigid(np.asarray(world_from_tool, dtype=np.float64)),
-            normal_world=np.array([0.0, 0.0, -1.0]),
-            offset=0.0,
+            normal_world=at[:3],
+            offset=float(at[3]),
             target=target,
             pose_id=pose_id,
-            **{name: None if x is None else x * factor[name] for name, x in si.items()},
+            **{columns[k].name: x * columns[k].si_per_unit for k, x in conditions.items()},
         )
-        if plane is not None:
-            size = float(np.linalg.norm(plane[:3]))
-            row = replace(
-                row, normal_world=np.asarray(plane[:3]) / size, offset=float(plane[3]) / size
-            )
-        planes = "estimated" if plane is None else "recorded"
+        return self.add_frame(row, depth, amplitude, mask, plane_is_known=plane is not None)
+
+    def add_frame(
+        self,
+        row: FrameRow,
+        depth: np.ndarray | Tensor,
+        amplitude: np.ndarray | Tensor | None = None,
+        mask: np.ndarray | Tensor | None = None,
+        *,
+        plane_is_known: bool,
+    ) -> Known:
+        """Take a frame with its row of `frames.csv`, as `add` does.
+
+        Args:
+            row: What is known of it besides its images.
+            depth: As of `add`.
+            amplitude: As of `add`.
+            mask: As of `add`.
+            plane_is_known: Whether the plane of the row was measured; else it is estimated.
+
+        Raises:
+            CalibrationDataError: As of `add`.
+        """
+        number = self._next
+        images = self._images(number, depth=depth, amplitude=amplitude, mask=mask)
         with thread_number(1):  # Threads would wait longer than they compute.
-            return self._added(number, self._summed(row, images, planes))
+            frame = self._summed(row, images, "recorded" if plane_is_known else "estimated")
+            return self._added(number, frame)
+
+    @property
+    def _next(self) -> int:
+        """Number of the next frame."""
+        return max(self._frames, default=-1) + 1
 
     def _added(self, number: int, frame: KeptFrame) -> Known:
         """Keep a frame, on disk first, and say what is known with it."""
@@ -432,18 +450,6 @@ class LiveCalibration:
             save_calibration(staged / STATE_FILE, state)
             export_torchscript(DepthCorrector.from_state(state), staged / "corrector.ts", state)
 
-    def _start(self) -> dict[str, Any]:
-        """Return what `resume` starts from."""
-        like = self._like
-        names = "depth_kind", "modulation_frequency", "saturation_amplitude"
-        return {
-            "camera": asdict(like.camera),
-            "config": self.options.to_mapping(),
-            "tool_from_camera": torch.from_numpy(like.tool_from_camera),
-            **{name: getattr(like, name) for name in names},
-            **{name: getattr(self, name) for name in ("wanted_mm", "wanted_deg")},
-        }
-
     def _images(self, number: int, **given: Any) -> dict[str, np.ndarray | None]:  # noqa: ANN401
         """Return the images of one frame (1, H, W) as the recording format has them."""
         size, images = (self._like.camera.height, self._like.camera.width), {}
@@ -547,8 +553,8 @@ class LiveCalibration:
         moments = concatenate([self._frames[k].moments for k in order])
         moments = replace(moments, gram=torch.cat([self._sums[k] for k in order]))
         if any(is_of_frames(term) for term in self.options.model.terms):
-            every = covered_domain(dataset, frames, self._frames[number].lattice)
-            here, self._last = replace(here, conditions=every.conditions), None
+            here = replace(here, conditions=condition_ranges(dataset.conditions()))
+            self._last = None
         # Where few frames do not determine it, further steps of the solver tell no more.
         few = self.options.solver.model_copy(update={"max_iterations": _MOST_STEPS})
         options = self.options.model_copy(update={"solver": few})

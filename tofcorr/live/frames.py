@@ -156,20 +156,22 @@ def mapped(gram: Tensor, functions: Tensor) -> Tensor:
     return entries @ gram @ entries.T
 
 
-_ROW_ARRAYS = ("world_from_tool", "normal_world")
 _DOMAIN = TypeAdapter(Domain)
 
 
 def values_of_frame(frame: KeptFrame) -> dict[str, Any]:
     """Return a frame as plain values and tensors."""
-    row = {name: value for name, value in vars(frame.row).items() if value is not None}
-    row |= {name: torch.from_numpy(row[name]) for name in _ROW_ARRAYS}
+    row = {
+        name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+        for name, value in vars(frame.row).items()
+        if value is not None
+    }
     sums = {"moments": vars(frame.moments), "lattice": vars(frame.lattice)}
     return {"row": row, "domain": _DOMAIN.dump_python(frame.domain, mode="json"), **sums}
 
 
 def frame_of(values: dict[str, Any]) -> KeptFrame:
     """Return the frame that `values_of_frame` wrote."""
-    row = values["row"] | {name: values["row"][name].numpy() for name in _ROW_ARRAYS}
+    row = {k: v.numpy() if isinstance(v, Tensor) else v for k, v in values["row"].items()}
     moments, lattice = ImageMoments(**values["moments"]), Lattice(**values["lattice"])
     return KeptFrame(FrameRow(**row), _DOMAIN.validate_python(values["domain"]), moments, lattice)

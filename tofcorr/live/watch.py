@@ -22,14 +22,11 @@ import numpy as np
 import torch
 from matplotlib.image import imsave
 
-from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray
-from tofcorr.data.recording import HEADER_FILE, Recording, read_header
+from tofcorr.data.recording import HEADER_FILE, read_header
 from tofcorr.data.table import TABLE_FILE, FrameRow, read_table
 from tofcorr.errors import CalibrationDataError, TofcorrError
 from tofcorr.files import reading, scratch_folder
-from tofcorr.geometry import se3
-from tofcorr.geometry.camera import FrameNames
 from tofcorr.live.calibration import START_FILE, Known, LiveCalibration
 from tofcorr.live.frames import coverage, seen_from
 from tofcorr.pages.page import page_text
@@ -65,7 +62,9 @@ class Watched:
             self.live = LiveCalibration.started(source)
             self._new = self._new_sums
         elif (source / HEADER_FILE).exists():
-            self.live = LiveCalibration(_without_frames(source), config, **more)
+            header = read_header(source / HEADER_FILE)
+            self._planes_are_known = header.planes == "recorded"
+            self.live = LiveCalibration(header.recording(source), config, **more)
             self._new = self._new_frames
         else:
             said = f"expected a recording ({HEADER_FILE}) or a live calibration ({START_FILE})"
@@ -120,23 +119,7 @@ class Watched:
     def _add(self, head: str, row: str, images: dict[str, np.ndarray]) -> Known:
         cells = _row_of(head, row)
         self._depth = images["depth"]
-        plane = None
-        if self.live.recorded_planes:
-            plane = np.append(cells.normal_world, cells.offset)
-        known = {}
-        for name in CONDITIONS[1:]:
-            value = getattr(cells, name)
-            if value is not None:
-                known[condition(name).column] = value / condition(name).si_per_unit
-        return self.live.add(
-            **{"amplitude": None, **images},
-            world_from_tool=cells.world_from_tool,
-            plane=plane,
-            target=cells.target,
-            timestamp=cells.timestamp,
-            pose_id=cells.pose_id,
-            **known,
-        )
+        return self.live.add_frame(cells, **images, plane_is_known=self._planes_are_known)
 
     def _publish(self, known: Known | None) -> None:
         """Compute the state of the page, once for each frame."""
@@ -227,23 +210,6 @@ def watch(watched: Watched, *, ends: Callable[[], bool] = lambda: False) -> None
     while not ends():
         if not watched.poll():
             time.sleep(_POLL_S)
-
-
-def _without_frames(folder: Path) -> Recording:
-    """Return a recording of which the header is all that is there."""
-    head = read_header(folder / HEADER_FILE)
-    mount = np.eye(4) if head.tool_from_camera is None else np.array(head.tool_from_camera, float)
-    return Recording(
-        path=folder,
-        camera=head.camera.intrinsics(),
-        depth_kind=head.depth_kind,
-        modulation_frequency=head.modulation_frequency_hz,
-        saturation_amplitude=head.saturation_amplitude,
-        tool_from_camera=se3.nearest_rigid(mount),
-        **dict.fromkeys(("frames", "depth", "amplitude", "mask", "raw")),  # type: ignore[arg-type]
-        planes=head.planes,
-        frame_names=FrameNames(),
-    )
 
 
 def _frame_of(

@@ -202,7 +202,6 @@ def domain_from(
         for values in (radial_distance, amplitude, normalised)
     )
     assert near_and_far is not None
-    known = zip(CONDITIONS, conditions.unbind(1), strict=True)
     return Domain(
         height=camera.height,
         width=camera.width,
@@ -210,10 +209,14 @@ def domain_from(
         amplitude=others[0],
         normalised_amplitude=others[1],
         modulation_frequency=modulation_frequency,
-        # Of those that are known of all frames.
-        conditions={
-            name: (float(column.min()), float(column.max()), float(column.mean()))
-            for name, column in known
-            if bool(column.isfinite().all())
-        },
+        conditions=condition_ranges(conditions),
     )
+
+
+def condition_ranges(conditions: Float[Tensor, "N C"]) -> dict[str, tuple[float, float, float]]:
+    """Return least, largest and mean value of each condition that is known of all frames (N, C)."""
+    return {
+        name: (float(column.min()), float(column.max()), float(column.mean()))
+        for name, column in zip(CONDITIONS, conditions.unbind(1), strict=True)
+        if bool(column.isfinite().all())
+    }

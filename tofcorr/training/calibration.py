@@ -14,7 +14,7 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.fit.fitting import calibrated, fit
-from tofcorr.fit.known import Known
+from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.misfit import assumptions, find_misfit, misfit_pixels
 from tofcorr.fit.problem import Fit, FitOptions
 from tofcorr.fit.walls import with_every_wall
@@ -85,7 +85,7 @@ class Calibration:
         watcher: Watcher | None = None,
         resumed: Parameters | None = None,
         left_out: Collection[int] = (),
-        known: Known | None = None,
+        known: PriorKnowledge | None = None,
         found: Fit | None = None,
     ) -> None:
         self.train, self.test = halves(data, options, left_out)

@@ -31,7 +31,7 @@ from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import inverse
 from tofcorr.estimation.moments import Parameters
 from tofcorr.files import refuse_damaged
-from tofcorr.fit.known import Known, known_of
+from tofcorr.fit.known import PriorKnowledge, known_of
 from tofcorr.options import Options, refused_in_words
 from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
 from tofcorr.training.calibration import TrainingOptions
@@ -59,7 +59,7 @@ class CameraType(Options):
     covariance: Float64
     units: tuple[str, ...] = Field(min_length=2)
 
-    def known(self, data: Dataset) -> Known:
+    def known(self, data: Dataset) -> PriorKnowledge:
         """Return what is known of the next unit.
 
         Args:
@@ -67,7 +67,9 @@ class CameraType(Options):
         """
         own = Parameters(recorded_hand_eye(data), self.mean, hand_eye_is_free=False)
         terms, domain = self.error_model, self.domain
-        return Known(options=terms, domain=domain, parameters=own, covariance=self.covariance)
+        return PriorKnowledge(
+            options=terms, domain=domain, parameters=own, covariance=self.covariance
+        )
 
     def __repr__(self) -> str:
         """Return how many units there are, and how far they scatter."""

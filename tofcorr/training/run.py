@@ -25,7 +25,7 @@ from tofcorr.errors import ConfigError, ExportError
 from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Solution
 from tofcorr.files import refuse_existing, staged_folder, write_json, write_text
-from tofcorr.fit.known import Known
+from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.reference import REFERENCE_FILE, estimate_reference, save_reference
 from tofcorr.options import dump_yaml, resolve_options
@@ -348,7 +348,7 @@ class Carried(NamedTuple):
     """
 
     data: Dataset
-    known: Known | None
+    known: PriorKnowledge | None
     said: Callable[[Fit], dict[str, Any]]
 
 

@@ -15,7 +15,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import solvable
 from tofcorr.fit.changes import Explanation, explain
 from tofcorr.fit.fitting import calibrated
-from tofcorr.fit.known import Known, known_of
+from tofcorr.fit.known import PriorKnowledge, known_of
 from tofcorr.fit.problem import Fit
 from tofcorr.fit.walls import walls_alone
 from tofcorr.options import resolve_options
@@ -117,7 +117,7 @@ def _carried(
 
 
 def update_report(
-    run: Path, known: Known, found: Sequence[Explanation], older: str | None, fit: Fit
+    run: Path, known: PriorKnowledge, found: Sequence[Explanation], older: str | None, fit: Fit
 ) -> dict[str, Any]:
     """Return what the report says of an update, plain values.
 
@@ -138,7 +138,7 @@ def update_report(
     }
 
 
-def _moved(known: Known, best: Explanation, fit: Fit) -> dict[str, Any]:
+def _moved(known: PriorKnowledge, best: Explanation, fit: Fit) -> dict[str, Any]:
     """Return how far each part has moved, with one standard error.
 
     Of the step from the old estimate to the new one, that share is the change which its covariance
