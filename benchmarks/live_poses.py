@@ -3,11 +3,13 @@
     python -m benchmarks.live_poses --seed 1 --count 20
 
 Cells of one wall that nobody measured, a robot of 0.05 mm and 0.05 mrad, a camera of 64 x 50 pixels
-with 3 mm of noise and an error of distance and place in the image. All ways start with the same
-four poses and end when `Known.enough` says so, or after 60 poses. The truth never enters.
+with 3 mm of noise and an error of distance and place in the image. All ways have the same limits of
+distance, tilt and roll, start with the same four poses and end when `Known.enough` says so, or
+after 60 poses. The truth never enters.
 """
 
 import itertools
+import math
 
 import click
 import numpy as np
@@ -63,6 +65,12 @@ class Cell:
         noise = random.normal(0, 3e-3, distance.shape)
         return live.add((distance + error + noise).astype(np.float32), None, pose)
 
+    def is_reachable(self, pose: np.ndarray) -> bool:
+        """Whether the camera is rolled from the start by no more than the random poses are."""
+        turn = (torch.from_numpy(pose) @ self.hand_eye)[:2, :2]
+        roll = torch.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        return abs(math.degrees(roll)) <= SPACE.roll_deg
+
     def poses_needed(self, way: str) -> tuple[int, float, float]:
         """Return how many poses are enough, and how far off the hand-eye then is, mm, degrees."""
         random = np.random.default_rng(self.random.bit_generator.seed_seq.entropy)  # type: ignore[attr-defined]
@@ -72,7 +80,9 @@ class Cell:
             order = np.concatenate([order[:4], self.grid()])
         known, taken = None, 0
         while taken < MOST and not (known is not None and known.enough):
-            pose = live.next_pose(seed=taken) if way == "advice" and taken >= 4 else None
+            pose = None
+            if way == "advice" and taken >= 4:
+                pose = live.next_pose(self.is_reachable, SPACE, seed=taken)
             if pose is None:
                 pose = self.pool.world_from_tool[order[taken % len(order)]].numpy()
             known, taken = self.add(live, pose, random), taken + 1

@@ -46,7 +46,7 @@ from tofcorr.estimation.moments import (
     Parameters,
     concatenate,
 )
-from tofcorr.estimation.planes import joint_image_equations, within_prior
+from tofcorr.estimation.planes import within_prior
 from tofcorr.estimation.robust import outlying_images, student_quantile
 from tofcorr.estimation.uncertainty import posterior_covariance, worst_axes
 from tofcorr.files import refuse_existing, staged_folder
@@ -58,7 +58,6 @@ from tofcorr.geometry.rays import plane_in_frame, planes_through
 from tofcorr.live.frames import (
     FRAME_FORM,
     KeptFrame,
-    brightness_of,
     frame_of,
     is_of_frames,
     mapped,
@@ -71,7 +70,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, thread_number
 from tofcorr.pixels.lattice import condition_ranges, covered_domain, joined, lattice_in
 from tofcorr.pixels.sample import usable_pixels
-from tofcorr.training.advice import PosePool, draw_pool, predicted_moments
+from tofcorr.training.advice import Workspace, choose_views, draw_pool, predicted_precision
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import Config, calibration_state
 
@@ -374,51 +373,44 @@ class LiveCalibration:
     def next_pose(
         self,
         reachable: Callable[[np.ndarray], bool] | None = None,
+        space: Workspace | None = None,
         *,
-        candidates: int = 60,
+        candidates: int = 300,
         seed: int = 0,
     ) -> np.ndarray | None:
         """Return the pose world_from_tool (4, 4) that would help most; None if none was found.
 
         Args:
-            reachable: Whether the robot reaches a pose (4, 4); None: it reaches those that turn,
-                roll and move the camera as far as it was before.
+            reachable: Whether the robot reaches a pose (4, 4); None: it reaches every one.
+            space: Where the camera may go; None: to the distances and tilts of the frames so far,
+                which takes about twice as many poses in the end.
             candidates: How many poses are compared.
             seed: Of the candidates.
         """
-        dataset, frames = self._seen, np.arange(len(self))
+        dataset = self._seen
         if self._known is None or self._known.fit is None or dataset is None:
             return None
-        fitted, random = self._known.fit, np.random.default_rng([seed, len(self)])
+        found, random = self._known.fit, np.random.default_rng([seed, len(self)])
         pool = draw_pool(
-            dataset, frames, fitted, random, candidates, brightness_of([*self._frames.values()])
+            dataset,
+            np.arange(len(self)),
+            found,
+            random,
+            candidates,
+            space,
+            joined([one.lattice for one in self.frames]),
+            checkerboard=False,
         )
         if pool is not None and reachable is not None:
             reached = [reachable(pose) for pose in pool.world_from_tool.numpy()]
             pool = pool.only(np.flatnonzero(reached)) if any(reached) else None
         if pool is None:
             return None
-        expected = self._expected(pool, fitted, dataset)
-        wanted = torch.tensor([self.wanted_mm / 1e3] * 3 + [math.radians(self.wanted_deg)] * 3)
-        size = expected.diagonal(dim1=1, dim2=2)[:, :6] / wanted.double().square()
-        return pool.world_from_tool[int(size.sum(dim=1).argmin())].numpy()
-
-    def _expected(self, pool: PosePool, found: Fit, dataset: Dataset) -> Tensor:
-        """Return the covariance of all unknowns, and of the walls, after each pose of a pool."""
-        best, walls = found.optimum, None if found.walls is None else found.walls.walls
+        wanted = [self.wanted_mm / 1e3] * 3 + [math.radians(self.wanted_deg)] * 3
         # Views are smooth: so many pixels tell what all would.
-        moments = predicted_moments(pool, found, dataset, enough=500)
-        theirs = walls
-        if walls is not None:
-            apart = (pool.normal_world[:, None] - walls.normal_world).square().sum(dim=2)
-            apart = apart + (pool.offset[:, None] - walls.offset).square()
-            theirs = replace(walls, index=apart.argmin(dim=1), world_from_tool=pool.world_from_tool)
-        now = joint_image_equations(found.moments, best, walls).total()
-        prior = None if found.total_prior is None else found.total_prior.equations(best)
-        added = joint_image_equations(moments, best, theirs).hessian
-        return posterior_covariance(
-            (now.plus(prior).hessian + added) / found.observability.variance
-        )
+        precision, added = predicted_precision(pool, found, dataset, enough=500)
+        (best,), _ = choose_views(precision, added, 1, torch.tensor(wanted).double())
+        return pool.world_from_tool[best].numpy()
 
     def result(self) -> Fit:
         """Return the calibration of all frames, as `tofcorr.train` finds it.

@@ -18,7 +18,7 @@ from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.robust import robust_scale
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.pixels.lattice import Lattice, joined
+from tofcorr.pixels.lattice import Lattice
 from tofcorr.training.calibration import TrainingOptions
 
 FRAME_FORM = "tofcorr-live-frame"
@@ -38,18 +38,6 @@ class KeptFrame:
         """Typical standard deviation of a distance, metres, from neighbours; 1 if unknown."""
         between = self.lattice.difference[self.lattice.difference.isfinite()]
         return robust_scale(between) if len(between) else 1.0
-
-
-def brightness_of(frames: list[KeptFrame]) -> dict[str, Tensor]:
-    """Return dark and bright log normalised amplitude of each target, as far as it is known."""
-    found = {}
-    for name in {frame.row.target for frame in frames}:
-        seen = joined([one.lattice for one in frames if one.row.target == name])
-        light = seen.amplitude * seen.radial_distance.square()
-        light = light[light > 0].double()  # Not where it is unknown.
-        ends = torch.tensor([1 / 10, 9 / 10]).double()
-        found[name] = light.quantile(ends).log() if len(light) else torch.zeros_like(ends)
-    return found
 
 
 def seen_from(

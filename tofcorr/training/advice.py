@@ -7,7 +7,7 @@ one: each the one that most shrinks the variances that remain.
 import math
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.accumulator import Design, MomentAccumulator
-from tofcorr.estimation.moments import HAND_EYE_SYMBOLS, ImageMoments, MomentObjective, Parameters
+from tofcorr.estimation.moments import HAND_EYE_SYMBOLS, ImageMoments, Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.uncertainty import (
     PRIOR_SIGMA,
@@ -36,10 +36,8 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.support import (
-    ENOUGH_REFLECTIVITY,
-    sample_reflectivity,
-)
+from tofcorr.pixels.lattice import Lattice
+from tofcorr.training.support import ENOUGH_REFLECTIVITY, sample_reflectivity
 
 # Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
 # Set by hand for printed boards in the near infrared.
@@ -181,30 +179,23 @@ def draw_views(
         The poses; None if none can be used.
     """
     normal, offset = plane
-    distance = along_axis(cameras, plane)
-    found = []
-    for _ in range(20 * size):
-        k = int(generator.integers(len(distance)))
-        tilt = space.tilt_deg * generator.uniform()
-        roll = space.roll_deg * generator.uniform(-1, 1)
-        away = generator.uniform(space.nearest, space.farthest)
-        azimuth = generator.uniform(0, 2 * math.pi)
-        pose = _moved_camera(cameras[k], normal[k], distance[k], (tilt, azimuth, roll, away))
-        if _sees_wall(pose, normal[k], offset[k], rays, space):
-            found.append((pose, k, (away, tilt, roll)))
-        if len(found) == size:
-            break
-    if not found:
+    count, distance = 20 * size, along_axis(cameras, plane)
+    k = torch.from_numpy(generator.integers(len(distance), size=count))
+    low = 0.0, 0.0, -space.roll_deg, space.nearest
+    high = space.tilt_deg, 2 * math.pi, space.roll_deg, space.farthest
+    wanted = torch.from_numpy(generator.uniform(low, high, (count, 4)))
+    poses = _moved_cameras(cameras[k], normal[k], distance[k], wanted)
+    used = _sees_wall(poses, normal[k], offset[k], rays, space).nonzero()[:size, 0]
+    if not len(used):
         return None
-    poses, chosen, described = map(list, zip(*found, strict=True))
-    target = [list(brightness)[k % len(brightness)] for k in range(len(poses))]
+    target = [list(brightness)[one % len(brightness)] for one in range(len(used))]
     return PosePool(
-        world_from_tool=torch.stack(poses) @ se3.inverse(tool_from_camera),
-        normal_world=normal[chosen],
-        offset=offset[chosen],
+        world_from_tool=poses[used] @ se3.inverse(tool_from_camera),
+        normal_world=normal[k[used]],
+        offset=offset[k[used]],
         target=target,
         brightness=torch.stack([brightness[name] for name in target]),
-        described=torch.tensor(described, dtype=torch.float64),
+        described=wanted[used][:, [3, 0, 2]],
     )
 
 
@@ -215,42 +206,42 @@ def along_axis(cameras: Tensor, plane: tuple[Tensor, Tensor]) -> Tensor:
     return -height / (normal * cameras[:, :3, 2]).sum(-1)
 
 
-def _moved_camera(
-    camera: Tensor, normal: Tensor, distance: Tensor, wanted: tuple[float, float, float, float]
-) -> Tensor:
-    """Turn, roll and move a camera that keeps looking at the same point of the wall.
+def _moved_cameras(camera: Tensor, normal: Tensor, distance: Tensor, wanted: Tensor) -> Tensor:
+    """Turn, roll and move cameras that keep looking at the same points of the wall.
 
     Args:
-        camera: world_from_camera, shape (4, 4).
-        normal: The wall's normal, towards the camera, shape (3,).
-        distance: From the camera to the wall along its axis.
-        wanted: Tilt (degrees) and its azimuth (radians), roll (degrees), distance (metres).
+        camera: world_from_camera, shape (M, 4, 4).
+        normal: The wall's normals, towards the camera, shape (M, 3).
+        distance: From the camera to the wall along its axis, shape (M,).
+        wanted: Tilt (degrees) and its azimuth (radians), roll (degrees), distance (metres), shape
+            (M, 4).
     """
-    tilt, azimuth, roll, away = wanted
-    point = camera[:3, 3] + distance * camera[:3, 2]
-    across = normalize(torch.linalg.cross(normal, camera[:3, 0]), dim=0)
-    along = torch.linalg.cross(across, normal)
-    aside = math.cos(azimuth) * along + math.sin(azimuth) * across
-    axis = -math.cos(math.radians(tilt)) * normal + math.sin(math.radians(tilt)) * aside
-    x = normalize(camera[:3, 0] - axis * (camera[:3, 0] @ axis), dim=0)
-    turned = torch.stack([x, torch.linalg.cross(axis, x), axis], dim=1)
-    spin = se3.exp(torch.tensor([0.0] * 5 + [math.radians(roll)], dtype=torch.float64))
-    return se3.assemble(turned @ spin[:3, :3], point - away * axis)
+    tilt, azimuth, roll, away = wanted.mT[..., None]
+    tilt, roll = torch.deg2rad(tilt), torch.deg2rad(roll)
+    point = camera[:, :3, 3] + distance[:, None] * camera[:, :3, 2]
+    across = normalize(torch.linalg.cross(normal, camera[:, :3, 0]), dim=1)
+    aside = azimuth.cos() * torch.linalg.cross(across, normal) + azimuth.sin() * across
+    axis = tilt.sin() * aside - tilt.cos() * normal
+    x = camera[:, :3, 0]
+    x = normalize(x - axis * (axis * x).sum(dim=1, keepdim=True), dim=1)
+    y = torch.linalg.cross(axis, x)
+    turned = x * roll.cos() + y * roll.sin(), y * roll.cos() - x * roll.sin(), axis
+    return se3.assemble(torch.stack(turned, dim=2), point - away * axis)
 
 
 def _sees_wall(
     camera: Tensor, normal: Tensor, offset: Tensor, rays: Tensor, space: Workspace
-) -> bool:
-    """Whether all corners of the image look at the wall, not too grazing, too far or beside it."""
+) -> Tensor:
+    """Whether all corners of each image look at the wall, not too grazing, too far or beside it."""
     normal_camera, offset_camera = plane_in_frame(normal, offset, camera)
-    corners = rays[[0, 0, -1, -1], [0, -1, 0, -1]]
-    distance = ray_plane_distance(corners[None], normal_camera, offset_camera)[0]
+    corners = rays[[[0, 0, -1, -1]], [[0, -1, 0, -1]]]
+    distance = ray_plane_distance(corners, normal_camera, offset_camera)[:, 0]
     steepest = math.cos(math.radians(_STEEPEST_INCIDENCE_DEG))
-    seen = (distance <= space.longest_ray) & (-(corners @ normal_camera) >= steepest)
+    seen = (distance <= space.longest_ray) & (-(normal_camera @ corners[0].T) >= steepest)
     if space.wall_size is not None:
-        points = (corners * distance[:, None]) @ camera[:3, :3].T + camera[:3, 3]
-        seen &= (points[:, :2].abs() <= torch.tensor(space.wall_size).double() / 2).all(dim=1)
-    return bool(seen.all())
+        points = (corners[0] * distance[..., None]) @ camera[:, :3, :3].mT + camera[:, None, :3, 3]
+        seen &= (points[..., :2].abs() <= torch.tensor(space.wall_size).double() / 2).all(dim=2)
+    return seen.all(dim=1)
 
 
 def draw_pool(
@@ -259,13 +250,15 @@ def draw_pool(
     fit: Fit,
     generator: np.random.Generator,
     size: int = 300,
-    brightness: Mapping[str, Tensor] | None = None,
+    space: Workspace | None = None,
+    lattice: Lattice | None = None,
+    *,
+    checkerboard: bool = True,
 ) -> PosePool | None:
     """Draw poses that look at the same wall, tilted, rolled and at other distances.
 
     Each is a recorded pose whose camera is turned about the point it looks at, rolled, and moved
-    along its axis. The wall fills the image, nowhere too grazing, and nowhere a twentieth farther
-    than any calibrated distance.
+    along its axis. The wall fills the image, nowhere too grazing.
 
     Args:
         dataset: The recordings.
@@ -273,7 +266,11 @@ def draw_pool(
         fit: The calibration so far.
         generator: Source of randomness.
         size: How many.
-        brightness: Of the targets, as `target_brightness` returns it; None: it is read.
+        space: Where the camera may go, turned by `roll_deg` from recorded poses; None: at recorded
+            distances, and nowhere a twentieth farther than any calibrated distance.
+        lattice: That of the frames; None: it is read.
+        checkerboard: Whether poses before a checkerboard are among them where every target has one
+            reflectivity.
 
     Returns:
         The poses; None if none was found where the wall fills the image, and for a fit that takes
@@ -292,40 +289,41 @@ def draw_pool(
     facing = -(normal * camera[:, :3, 2]).sum(-1)
     recorded = float(torch.rad2deg(torch.arccos(facing.clamp(-1, 1))).max())
     # Up to the largest tilt recorded, within what a robot arm reaches in front of a wall.
-    space = Workspace(
+    space = space or Workspace(
         nearest=float(distance.min()),
         farthest=float(distance.max()),
         tilt_deg=min(max(recorded, 30), 40),
         longest_ray=ranges.high * (1 + 1 / 20),
     )
     wall, rays = (normal, offset), dataset.ray_directions()
-    if brightness is None:
-        brightness = target_brightness(dataset, frames, hand_eye)
+    brightness = target_brightness(dataset, frames, hand_eye, lattice)
+    contrasts = [float(high - low) for low, high in brightness.values()]
+    if checkerboard and dataset.has_amplitude and max(contrasts) < math.log(ENOUGH_REFLECTIVITY):
+        bright = max(float(high) for _, high in brightness.values())
+        brightness["checkerboard"] = torch.tensor([bright + math.log(_DARK), bright]).double()
     return draw_views(camera, wall, hand_eye, space, brightness, rays, generator, size)
 
 
-def target_brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[str, Tensor]:
-    """Return dark and bright log normalised amplitude of each target, with a checkerboard.
+def target_brightness(
+    dataset: Dataset, frames: np.ndarray, hand_eye: Tensor, lattice: Lattice | None = None
+) -> dict[str, Tensor]:
+    """Return dark and bright log normalised amplitude of each target.
 
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames.
         hand_eye: tool_from_camera, shape (4, 4).
+        lattice: That of the frames; None: it is read.
     """
-    names, rays, found = dataset.targets[frames], dataset.ray_directions(), {}
-    # A tenth of the pixels is darker than what stands for dark, a tenth brighter than bright.
-    quantiles = torch.tensor([1 / 10, 9 / 10], dtype=torch.float64)
-    for name in np.unique(names) if dataset.has_amplitude else ():
-        batches = dataset.batches(frames[names == name])
-        logs = torch.cat([sample_reflectivity(one, rays, hand_eye, 500)[1] for one in batches])
-        if logs.numel():  # A target may have no pixel with light that is not too grazing.
-            found[str(name)] = logs.quantile(quantiles)
-    if not found:
-        return {str(name): torch.zeros(2, dtype=torch.float64) for name in np.unique(names)}
-    if all(float(high - low) < math.log(ENOUGH_REFLECTIVITY) for low, high in found.values()):
-        bright = max(float(high) for _, high in found.values())
-        found["checkerboard"] = torch.tensor([bright + math.log(_DARK), bright]).double()
-    return found
+    names, found = dataset.targets[frames], {}
+    if dataset.has_amplitude:
+        frame, _, light = sample_reflectivity(dataset, frames, hand_eye, lattice)
+        # A tenth of the pixels is darker than what stands for dark, a tenth brighter than bright.
+        quantiles = torch.tensor([1 / 10, 9 / 10], dtype=torch.float64)
+        for name in np.unique(names[frame]):
+            found[str(name)] = light[torch.from_numpy(names[frame] == name)].quantile(quantiles)
+    # A target may have no pixel with light that is not too grazing.
+    return found or {str(name): torch.zeros(2, dtype=torch.float64) for name in np.unique(names)}
 
 
 def advise(
@@ -345,13 +343,15 @@ def advise(
         can show, and each pose with the standard deviation of the worst one (mm or mrad) to expect
         once it is added.
     """
-    best, moments = fit.solution.parameters, predicted_moments(pool, fit, dataset, enough)
-    added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
+    precision, added = predicted_precision(pool, fit, dataset, enough)
     # What no pose shows is not what further poses are for.
     shown = [k for k, one in enumerate(fit.observability.directions) if not fit.is_unseen(one)]
-    basis = fit.observability.vectors[:, shown]
-    precision, added = (basis.T @ each @ basis for each in (fit.observability.precision, added))
-    order, covariances = choose_views(precision, added, number)
+    walls = torch.eye(len(precision) - len(fit.observability.vectors)).double()
+    basis = torch.block_diag(fit.observability.vectors[:, shown], walls)
+    precision, added = (basis.T @ each @ basis for each in (precision, added))
+    sizes = torch.ones(len(shown)).double()
+    order, covariances = choose_views(precision, added, number, sizes)
+    covariances = covariances[:, : len(shown), : len(shown)]
     worst = [1e3 * worst_sigma(covariance) for covariance in covariances]
     names = "distance_m", "tilt_deg", "roll_by_deg"
     poses = [
@@ -372,21 +372,38 @@ def advise(
     return order, {**now, "worst_sigma_mm_or_mrad": worst[0], "poses": poses}
 
 
-def predicted_moments(pool: PosePool, fit: Fit, dataset: Dataset, enough: int) -> ImageMoments:
-    """Return the moments that views from a pool would have, with every column of a fit.
+def predicted_precision(
+    pool: PosePool, fit: Fit, dataset: Dataset, enough: int
+) -> tuple[Tensor, Tensor]:
+    """Return the precision of all unknowns of a fit now, and what each pose of a pool would add.
+
+    Walls that were estimated are unknowns too, after the others; a pose sees the nearest of them.
 
     Args:
-        pool: The poses.
+        pool: The poses, M of them.
         fit: The calibration so far.
         dataset: Gives the camera.
         enough: Pixels of an image that its moments are predicted from.
+
+    Returns:
+        Shapes (P, P) and (M, P, P).
     """
-    design = Design(fit.model.error, fit.domain, dataset.ray_directions())
+    best, design = fit.optimum, Design(fit.model.error, fit.domain, dataset.ray_directions())
     share = float(fit.moments.count.mean()) / (fit.domain.height * fit.domain.width)
-    moments = pool.moments(design, fit.solution.parameters.tool_from_camera, share, enough)
+    moments = pool.moments(design, best.tool_from_camera, share, enough)
     # Poses carry no information about condition terms.
     beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
-    return moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
+    moments = moments.with_conditions(torch.zeros(len(moments.gram), len(beyond)), beyond)
+    walls = theirs = None if fit.walls is None else fit.walls.walls
+    if walls is not None:
+        apart = (pool.normal_world[:, None] - walls.normal_world).square().sum(dim=2)
+        apart = apart + (pool.offset[:, None] - walls.offset).square()
+        theirs = replace(walls, index=apart.argmin(dim=1), world_from_tool=pool.world_from_tool)
+    before = fit.carried or fit.smoothness
+    now = joint_image_equations(fit.moments, best, walls).total()
+    now = now.plus(None if before is None else before.equations(best)).hessian
+    added = joint_image_equations(moments, best, theirs).hessian
+    return now / fit.residual_variance, added / fit.residual_variance
 
 
 def _kinds(weakest: Direction, model: ErrorModel) -> list[str]:
@@ -397,7 +414,9 @@ def _kinds(weakest: Direction, model: ErrorModel) -> list[str]:
     return list(dict.fromkeys(kinds.get(symbol, "distance term") for symbol in weakest.shares))
 
 
-def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[list[int], Tensor]:
+def choose_views(
+    precision: Tensor, candidates: Tensor, number: int, sizes: Tensor | None = None
+) -> tuple[list[int], Tensor]:
     """Choose views greedily, each the one that most shrinks the weak directions' variances.
 
     It has the smallest mean of the fourth powers of the directions' variances: between
@@ -407,17 +426,21 @@ def choose_views(precision: Tensor, candidates: Tensor, number: int) -> tuple[li
         precision: Of the unknowns, from the recording, shape (P, P).
         candidates: The precision that each view would add, shape (M, P, P).
         number: How many to choose; each view can be chosen once.
+        sizes: In which unit the standard deviation of each of the first unknowns counts, shape
+            (K,); the others do not count. None: every one counts, in metres and radians.
 
     Returns:
         Their indices, and the covariances of the unknowns before, and after each view, shape
         (1 + chosen, P, P).
     """
-    order: list[int] = []
+    sizes = torch.ones(len(precision)).double() if sizes is None else sizes
+    count, order = len(sizes), list[int]()
     covariances = [posterior_covariance(precision)]
     for _ in range(min(number, len(candidates))):
         after = posterior_covariance(precision + candidates)
+        counted = after[:, :count, :count] / (sizes[:, None] * sizes)
         # The trace of a power is the sum of that power of the directions' variances.
-        badness = torch.linalg.matrix_power(after, 4).diagonal(dim1=-2, dim2=-1).sum(-1)
+        badness = torch.linalg.matrix_power(counted, 4).diagonal(dim1=-2, dim2=-1).sum(-1)
         badness[order] = torch.inf
         best = int(badness.argmin())
         order.append(best)

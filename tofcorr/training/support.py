@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.recording import FrameBatch
 from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset, Frames
+from tofcorr.pixels.lattice import Lattice, lattice_of, spread_pixels
 
 # Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a
 # function of distance and place. Set by hand.
@@ -119,12 +119,9 @@ def _tilt(normals: Tensor) -> tuple[float, float]:
 def _reflectivity_ratio(dataset: Dataset, frames: Frames, tool_from_camera: Tensor) -> float | None:
     """Return the ratio of the target's brightest to its darkest reflectivity.
 
-    It is measured on about 200 000 pixels, at least 100 a frame; None with fewer than 100 in all.
+    It is measured on about 200 000 pixels; None with fewer than 100.
     """
-    rays, per_frame = dataset.ray_directions(), max(200_000 // max(len(frames), 1), 100)
-    batches = dataset.batches(frames)
-    samples = [sample_reflectivity(one, rays, tool_from_camera, per_frame) for one in batches]
-    place, logarithm = (torch.cat(parts) for parts in zip(*samples, strict=True))
+    _, place, logarithm = sample_reflectivity(dataset, frames, tool_from_camera)
     if len(logarithm) < 100:
         return None
     smooth = torch.linalg.lstsq(place, logarithm[:, None], driver="gelsd").solution
@@ -133,35 +130,31 @@ def _reflectivity_ratio(dataset: Dataset, frames: Frames, tool_from_camera: Tens
 
 
 def sample_reflectivity(
-    batch: FrameBatch, rays: Tensor, tool_from_camera: Tensor, per_frame: int
-) -> tuple[Tensor, Tensor]:
+    dataset: Dataset, frames: Frames, tool_from_camera: Tensor, lattice: Lattice | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the reflectivity of some pixels up to a factor: A D^2 over the cosine of incidence.
 
     On a Lambertian wall this is its reflectivity times the vignetting at the pixel.
 
     Args:
-        batch: Frames with amplitudes.
-        rays: Unit rays, shape (H, W, 3).
+        dataset: Recordings with amplitudes.
+        frames: Global numbers of the frames.
         tool_from_camera: The hand-eye transform, shape (4, 4).
-        per_frame: About how many pixels of each frame are looked at.
+        lattice: That of the frames; None: it is read.
 
     Returns:
-        The six terms of a quadratic of the pixel's place, which can describe the vignetting,
-        shape (S, 6), and the logarithm of the normalised amplitude, shape (S,).
+        Which of the frames each of about 200 000 pixels is of, shape (S,); the six terms of a
+        quadratic of the pixel's place, which can describe the vignetting, shape (S, 6); and the
+        logarithm of the normalised amplitude, shape (S,).
     """
-    assert batch.amplitude is not None
-    step = max(rays[..., 0].numel() // per_frame, 1)
-    while step > 1 and math.gcd(step, rays.shape[1]) > 1:
-        step -= 1
-    cosine = -torch.einsum("hwa,ba->bhw", rays, batch.normal_tool @ tool_from_camera[:3, :3])
-    usable = batch.valid & (batch.amplitude > 0) & (cosine > 1 / 10)  # Up to 84 degrees.
-    chosen = usable.flatten(1)[:, ::step]
-    place = rays.flatten(0, 1)[::step]
-    x, y, one = *(place[:, :2] / place[:, 2:]).unbind(1), torch.ones(len(place)).to(place)
-    quadratic = torch.stack([one, x, y, x * x, x * y, y * y], dim=-1)
-    amplitude, distance, frontal = (
-        values.flatten(1)[:, ::step][chosen]
-        for values in (batch.amplitude, batch.radial_distance, cosine)
+    lattice = lattice_of(dataset, frames) if lattice is None else lattice
+    found = spread_pixels(dataset, frames, lattice, 200_000)
+    # Up to 84 degrees.
+    found = found.of((found.pixels.amplitude > 0) & (-found.cosine(tool_from_camera) > 1 / 10))
+    x, y, one = (
+        *(found.ray[:, :2] / found.ray[:, 2:]).unbind(1),
+        torch.ones(len(found.ray)).double(),
     )
-    logarithm = (amplitude * distance.square() / frontal).log()
-    return quadratic.expand(len(chosen), -1, 6)[chosen], logarithm
+    light = found.pixels.amplitude * found.pixels.radial_distance.square()
+    logarithm = (light / -found.cosine(tool_from_camera)).log()
+    return found.frame, torch.stack([one, x, y, x * x, x * y, y * y], dim=1), logarithm
