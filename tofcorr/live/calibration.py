@@ -391,25 +391,20 @@ class LiveCalibration:
         if self._known is None or self._known.fit is None or dataset is None:
             return None
         found, random = self._known.fit, np.random.default_rng([seed, len(self)])
-        pool = draw_pool(
-            dataset,
-            np.arange(len(self)),
-            found,
-            random,
-            candidates,
-            space,
-            joined([one.lattice for one in self.frames]),
-            checkerboard=False,
-        )
-        if pool is not None and reachable is not None:
-            reached = [reachable(pose) for pose in pool.world_from_tool.numpy()]
-            pool = pool.only(np.flatnonzero(reached)) if any(reached) else None
-        if pool is None:
-            return None
+        lattice, frames = joined([one.lattice for one in self.frames]), np.arange(len(self))
         wanted = [self.wanted_mm / 1e3] * 3 + [math.radians(self.wanted_deg)] * 3
-        # Views are smooth: so many pixels tell what all would.
-        precision, added = predicted_precision(pool, found, dataset, enough=500)
-        (best,), _ = choose_views(precision, added, 1, torch.tensor(wanted).double())
+        with thread_number(1):
+            pool = draw_pool(
+                dataset, frames, found, random, candidates, space, lattice, checkerboard=False
+            )
+            if pool is not None and reachable is not None:
+                reached = [reachable(pose) for pose in pool.world_from_tool.numpy()]
+                pool = pool.only(np.flatnonzero(reached)) if any(reached) else None
+            if pool is None:
+                return None
+            # Views are smooth: so many pixels tell what all would.
+            precision, added = predicted_precision(pool, found, dataset, enough=500)
+            (best,), _ = choose_views(precision, added, 1, torch.tensor(wanted).double())
         return pool.world_from_tool[best].numpy()
 
     def result(self) -> Fit:
