@@ -35,7 +35,8 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.lattice import covered_domain, lattice_of
 from tofcorr.simulation.options import ArmOptions, SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.calibration import TrainingOptions, halves
+from tofcorr.training.run import inspected
 
 OFFSETS_DEG = 0.2  # standard deviation of the offsets of the joints
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")
@@ -55,10 +56,11 @@ def drawn_camera(generator: np.random.Generator) -> dict[str, Any]:
 
 
 def problem_of(folder: Path, planes: str = "unknown") -> Problem:
-    """Return the fit of EA to all frames of a recording."""
-    data = Dataset((Recording.open(folder),))
-    frames = np.arange(data.num_frames)
-    options = resolve_options(TrainingOptions, "ea").model_copy(update={"planes": planes})
+    """Return the fit of EA to a recording, of the frames and pixels that `tofcorr rig` uses."""
+    changes = ("split.test_fraction=0", f"planes={planes}")
+    options = resolve_options(TrainingOptions, "ea", changes)
+    data, options, _, left_out = inspected(Dataset((Recording.open(folder),)), options, force=True)
+    frames, _ = halves(data, options, left_out)
     lattice = lattice_of(data, frames)
     return Problem(data, frames, options, covered_domain(data, frames, lattice), lattice)
 

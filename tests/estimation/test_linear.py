@@ -6,7 +6,12 @@ from optional import present
 from scipy.stats import t
 from torch import Generator
 
-from tofcorr.estimation.linear import AddedColumns, NormalEquations
+from tofcorr.estimation.linear import (
+    AddedColumns,
+    Curvature,
+    NormalEquations,
+    unbiased_covariance,
+)
 
 POSES, PIXELS, OWN, FURTHER = 24, 30, 4, 3
 
@@ -100,3 +105,15 @@ def test_a_direction_without_information_stays_where_it_is(generator: Generator)
     torch.testing.assert_close(moved.shift[0], moved.shift[1])
     alone = torch.cat([known[..., 1:], further[..., :1]], dim=2)
     torch.testing.assert_close(moved.values, _least_squares(alone, residual)[-1:])
+
+
+def test_the_unbiased_covariance_is_right_on_average_with_more_unknowns_than_poses() -> None:
+    """A sum over unit errors is the mean over white ones: the covariance is a square of them."""
+    rows = torch.randn(8, 3, 10, dtype=torch.float64)  # Poses, observations of each, unknowns.
+    hessian, found = rows.mT @ rows, torch.zeros(10, 10, dtype=torch.float64)
+    whole = Curvature(hessian.sum(dim=0))
+    for error in torch.eye(24, dtype=torch.float64).view(24, 8, 3, 1):
+        off = whole.inverse @ (rows.mT @ error).sum(dim=0)
+        gradient = (rows.mT @ (rows @ off - error))[..., 0]
+        found += unbiased_covariance(NormalEquations(gradient[:, 0], gradient, hessian), whole)
+    assert torch.allclose(found, whole.inverse, rtol=1e-6, atol=1e-9)

@@ -6,7 +6,8 @@ products of the columns :math:`(X, r_0)`; no pixel is read again:
 
 - `pose_products` forms them, and `NormalEquations` adds them up, with a prior;
 - `solved` and `Curvature` solve them, scaled to a unit diagonal, with one cut for rounding;
-- `left_out_steps` and `robust_covariance` leave one pose out at a time;
+- `left_out_steps` and `robust_covariance` leave one pose out at a time, `unbiased_covariance` for
+  many unknowns;
 - `AddedColumns` tests columns beside those of a model, by leaving out poses as well;
 - `reduced` integrates out effects that each pose (here a group) has of its own: data are then
   :math:`y_g = X_g \beta + N_g u_g + \epsilon_g`, with :math:`u_g \sim N(0, T)`,
@@ -189,10 +190,15 @@ def left_out_steps(
 
 def _without_each(whole: Curvature, each: Float[Tensor, "G P P"]) -> Float[Tensor, "G P P"]:
     """Return the inverse curvature without each pose, in the coordinates of the whole's basis."""
+    return torch.linalg.inv(_others(whole, each))
+
+
+def _others(whole: Curvature, each: Float[Tensor, "G P P"]) -> Float[Tensor, "G P P"]:
+    """Return the curvature without each pose, in the coordinates of the whole's basis."""
     # A share well above rounding is added: a direction that one pose alone determines then scatters
     # so much without it that nothing is concluded from it.
     one = torch.eye(each.shape[-1]).to(each)
-    return torch.linalg.inv((1 + 10 * RESOLVED) * one - whole.basis.T @ each @ whole.basis)
+    return (1 + 10 * RESOLVED) * one - whole.basis.T @ each @ whole.basis
 
 
 def robust_covariance(left_out: Float[Tensor, "G P"]) -> Float[Tensor, "P P"]:
@@ -203,6 +209,23 @@ def robust_covariance(left_out: Float[Tensor, "G P"]) -> Float[Tensor, "P P"]:
     """
     centred = left_out - left_out.mean(dim=0)
     return (len(left_out) - 1) / len(left_out) * centred.T @ centred
+
+
+def unbiased_covariance(each: NormalEquations, whole: Curvature) -> Float[Tensor, "P P"]:
+    """Return the covariance of a solution with many unknowns for its poses.
+
+    A solution without one pose is off too far, by one over the share of the curvature that the
+    other poses have; this takes the root of it, so that the covariance is right on average where
+    poses scatter alike: the estimator CRV2 (Bell and McCaffrey 2002).
+
+    Args:
+        each: The equations of the poses, at the solution.
+        whole: The curvature of all poses and of the prior.
+    """
+    shares, vectors = torch.linalg.eigh(_others(whole, each.hessian))
+    along = (each.gradient @ whole.basis)[:, None] @ vectors * shares.rsqrt()[:, None]
+    steps = (along @ vectors.mT)[:, 0] @ whole.basis.T
+    return steps.T @ steps
 
 
 class Added(NamedTuple):

@@ -23,6 +23,7 @@ from tofcorr.estimation.linear import (
     NormalEquations,
     left_out_steps,
     robust_covariance,
+    unbiased_covariance,
 )
 from tofcorr.estimation.moments import (
     HAND_EYE_SYMBOLS,
@@ -92,7 +93,11 @@ def jackknife_covariance(
 
 
 def jackknife(
-    each: NormalEquations, hessian: Float[Tensor, "Q Q"], priors: Sequence[Float[Tensor, "Q1 F"]]
+    each: NormalEquations,
+    hessian: Float[Tensor, "Q Q"],
+    priors: Sequence[Float[Tensor, "Q1 F"]],
+    *,
+    unbiased: bool = False,
 ) -> Covariance:
     """Return the leave-one-pose-out covariance of all unknowns of normal equations.
 
@@ -100,6 +105,8 @@ def jackknife(
         each: Those of each pose, at the optimum.
         hessian: The curvature of all poses and of the priors.
         priors: Standard deviations of the scores of priors on the first unknowns, in the columns.
+        unbiased: Whether the covariance is right on average rather than on the safe side. With
+            nearly as many unknowns as poses that side is far away.
 
     Raises:
         CalibrationDataError: There are fewer than three poses.
@@ -107,7 +114,7 @@ def jackknife(
     if len(each.gradient) < 3:
         raise CalibrationDataError(f"Deviations need at least 3 poses, got {len(each.gradient)}.")
     shift, curvature = left_out_steps(each, hessian)
-    matrix = robust_covariance(shift)
+    matrix = unbiased_covariance(each, curvature) if unbiased else robust_covariance(shift)
     for scores in priors:
         gain = curvature.inverse[:, : len(scores)] @ scores
         matrix = matrix + gain @ gain.T

@@ -73,7 +73,8 @@ class JointFit:
         fits: The fit of each camera.
         problems: What each camera was fitted to, on the walls and poses found.
         together: All unknowns, as found.
-        covariance: Of all unknowns, in the order of `together`.
+        covariance: Of all unknowns, in the order of `together`; right on average, where that of
+            each of the `fits` is on the safe side, as of any training.
         shared: The numbers of each camera's walls among all walls; None: the walls are known.
         arm: The robot's arm; None: its poses are right.
         chosen: Places of the joints whose offsets were estimated.
@@ -154,7 +155,8 @@ def fit_together(problems: Sequence[Problem], arm: Arm | None = None) -> JointFi
         views = [one.view for one in cameras]
         each = together.all_equations(views).by_pose(torch.cat(units))
         prior, scores = _prior(cameras, together, variances[0])
-        covariance = jackknife(each, each.total().plus(prior).hessian, scores)
+        hessian = each.total().plus(prior).hessian
+        own, shared_too = (jackknife(each, hessian, scores, unbiased=k) for k in (False, True))
         cameras, together, shifts = _off_noise(cameras, together, prior, shared)
         fits = [
             Fit(
@@ -163,7 +165,7 @@ def fit_together(problems: Sequence[Problem], arm: Arm | None = None) -> JointFi
                 domain=one.problem.domain,
                 optimum=optimum,
                 hand_eye_only=hand_eye_alone(one.problem, one.core.moments),
-                covariance=covariance.of(place),
+                covariance=own.of(place),
                 residual=None,
                 weights=one.weights,
                 walls=one.problem.walls,
@@ -178,7 +180,7 @@ def fit_together(problems: Sequence[Problem], arm: Arm | None = None) -> JointFi
             fits=tuple(fits),
             problems=tuple(one.problem for one in cameras),
             together=together,
-            covariance=covariance,
+            covariance=shared_too,
             shared=shared,
             arm=arm,
             chosen=chosen,
