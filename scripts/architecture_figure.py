@@ -32,6 +32,7 @@ PURPOSES = {
     "simulation": "light, sensor, effects; knows no error term",
     "data": "recordings on disk: read, check, write",
     "correction": "calibration, runtime corrector, exports",
+    "scene_light": "what the scene does to light, found in one frame",
     "error_terms": "E = D + P + I (+ conditions), one term a file",
     "geometry": "rays, planes, rigid transforms",
     "pages": "one dress for every page and picture",
@@ -55,7 +56,15 @@ COLOURS = {
 GROUPS = {
     "front": ("__main__", "cli", "examples", "module"),
     "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "live", "training"),
-    "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
+    "mathematics": (
+        "fit",
+        "plausibility",
+        "pixels",
+        "estimation",
+        "scene_light",
+        "error_terms",
+        "geometry",
+    ),
     "data": ("importing", "simulation", "data", "correction"),
     "ground": (
         "pages",

@@ -17,6 +17,7 @@ from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.error_terms.signal_terms import unscale
 from tofcorr.geometry.se3 import transformed
+from tofcorr.scene_light.flying import FlyingPixels
 
 # The error is computed times -2^40, so that `torch.lerp` with the weight w = 2^-40 subtracts it:
 # depth + w (-e / w - depth). Unlike a plain subtraction this turns an infinite depth into NaN in
@@ -42,6 +43,8 @@ class DepthCorrector(nn.Module):
     * An amplitude of NaN gives NaN and is not valid, if the model depends on the amplitude. If it
       does not, amplitudes only matter for saturation.
     * A residual network fades to zero outside the calibrated range.
+    * A flying pixel is not valid, where the calibration has these found. Where one surface is
+      certain, its depth is given.
     * Frames are taken to have the mean conditions (time, integration time, temperature) of the
       calibration, until `set_conditions` is called.
 
@@ -86,6 +89,7 @@ class DepthCorrector(nn.Module):
         self.si_per_unit = [condition(name).si_per_unit for name in CONDITIONS]
         self.conditions_inside: bool = True
         self.uncertainty = RuntimeSigma(state, error, limits)
+        self.flying: FlyingPixels | None = state.flying_pixels()
         scale = geometry.radial_of_depth if self.is_z else geometry.radial_of_depth[:1, :1]
         points = geometry.points(torch.ones_like(geometry.radial_of_depth))
         self.register_buffer("radial_of_z", scale.float().contiguous())
@@ -116,6 +120,8 @@ class DepthCorrector(nn.Module):
             self.correct(depth, amplitude, self.error.offset, 0, corrected, valid)
         if not self.conditions_inside:
             valid.zero_()
+        if self.flying is not None:
+            return self.flying(corrected, amplitude, valid)
         return corrected, valid
 
     def set_conditions(

@@ -28,6 +28,7 @@ from tofcorr.options import (
     one_line,
     refused_in_words,
 )
+from tofcorr.scene_light.flying import FlyingPixels, FlyingPixelsState
 from tofcorr.version import __version__
 
 STATE_FILE = "state.pt"
@@ -88,8 +89,18 @@ class ResidualState(Options):
         return network
 
 
+class SceneLight(Options):
+    """What a corrector removes of a frame that comes of the scene, not of the camera.
+
+    Attributes:
+        flying_pixels: Pixels that mix two surfaces; None: they are not looked for.
+    """
+
+    flying_pixels: FlyingPixelsState | None = None
+
+
 class CalibrationExtras(Options):
-    """What a calibration knows beyond what its output depends on; older files lack most of it.
+    """What a calibration knows beside its error model; older files lack most of it.
 
     Attributes:
         covariance: Of the coefficients, shape (K, K), float64, square metres; None if unknown.
@@ -102,6 +113,7 @@ class CalibrationExtras(Options):
             unknown.
         residual_variance: Effective variance of a residual, in the unit of the loss; None if
             unknown.
+        scene: What of the scene's light is removed from every frame.
     """
 
     covariance: Float64 | None = None
@@ -110,6 +122,7 @@ class CalibrationExtras(Options):
     hand_eye_accuracy: HandEyeAccuracy | None = None
     joint_covariance: Float64 | None = None
     residual_variance: PositiveNumber | None = None
+    scene: SceneLight = SceneLight()
 
     def extras(self) -> "CalibrationExtras":
         """Return these alone."""
@@ -219,7 +232,16 @@ class CalibrationState(CalibrationExtras, Setting):
     def corrected(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         """Correct frames (..., H, W) in float64: return corrected depth and where it is valid."""
         reference, frames = self.correction(), (depth.double(), amplitude.double())
-        return reference(*frames), reference.valid(*frames)
+        corrected, valid = reference(*frames), reference.valid(*frames)
+        flying = self.flying_pixels()
+        if flying is None:
+            return corrected, valid
+        return flying.double()(corrected, frames[1], valid)
+
+    def flying_pixels(self) -> FlyingPixels | None:
+        """Build what finds flying pixels; None: it is not asked for."""
+        wanted = self.scene.flying_pixels
+        return wanted and FlyingPixels(self.camera, self.depth_kind, wanted)
 
 
 def corrector_metadata(state: CalibrationState) -> dict[str, object]:
@@ -234,7 +256,8 @@ def corrector_metadata(state: CalibrationState) -> dict[str, object]:
         "residual_network": state.residual and state.residual.options.to_mapping(),
         "symbols": error.symbols(),
         "coefficients": state.coefficients.tolist(),
-        "needs_amplitude": error.needs_amplitude(),
+        "needs_amplitude": error.needs_amplitude() or state.scene.flying_pixels is not None,
+        "scene": state.scene.to_mapping(),
         "sign": "error = measured - true; corrected = measured - error",
         "depth_kind": state.depth_kind,
         "camera": state.camera.section(),

@@ -33,9 +33,13 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
         reference: The calibration that is tabulated.
 
     Raises:
-        ConfigError: The model has a residual network, which no such table can hold.
+        ConfigError: The model has a residual network, or flying pixels are to be found: no such
+            table can hold either.
         ExportError: The table differs from the model by more than `TOLERANCE`; nothing is written.
     """
+    if reference.scene.flying_pixels is not None:
+        said = "A look-up table corrects every pixel alone, and finds no flying pixels"
+        raise ConfigError(f"{said}: export torchscript, pt2, onnx or c.")
     if reference.residual is not None:
         raise ConfigError(f"{reference.name}'s network needs torchscript, pt2 or onnx.")
     metadata = json.loads(corrector.metadata())

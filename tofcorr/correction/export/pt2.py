@@ -122,6 +122,9 @@ class CompilableCorrector(nn.Module):
         valid = torch.empty_like(depth, dtype=torch.int32)
         offset = self.rows + self.columns if self.is_separable else corrector.error.offset
         corrector.correct(depth, amplitude, offset, 0, corrected, valid)
+        if corrector.flying is not None:
+            corrected, kept = corrector.flying(corrected, amplitude, valid > 0)
+            return corrected, kept.to(torch.uint8)
         return corrected, valid.to(torch.uint8)
 
 
