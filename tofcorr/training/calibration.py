@@ -28,6 +28,7 @@ from tofcorr.pixels.dataset import (
 from tofcorr.pixels.lattice import covered_domain, lattice_of
 from tofcorr.pixels.passes import frame_errors
 from tofcorr.pixels.sample import MaskOptions
+from tofcorr.training.scene import RuntimeOptions
 
 
 class TrainingOptions(FitOptions, MaskOptions):
@@ -39,6 +40,7 @@ class TrainingOptions(FitOptions, MaskOptions):
         advice: For how many further poses the report gives advice; 0: for none.
         figures: Whether a page is written, and TensorBoard is given figures; the numbers of the fit
             it gets anyway.
+        runtime: What the corrector finds in a frame besides.
     """
 
     config_folder: ClassVar[str] = "train"
@@ -47,6 +49,7 @@ class TrainingOptions(FitOptions, MaskOptions):
     split: SplitOptions = SplitOptions()
     advice: NonNegativeInt = 5
     figures: bool = True
+    runtime: RuntimeOptions = RuntimeOptions()
 
 
 class Calibration:

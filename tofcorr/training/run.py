@@ -54,6 +54,7 @@ from tofcorr.training.judgement import (
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.pool import CameraType, load_type
 from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report
+from tofcorr.training.scene import scene_light
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,7 +65,7 @@ _LOG = logging.getLogger(__name__)
 def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> CalibrationState:
     """Return the calibration as the numbers that a corrector is built from."""
     recording, parameters = data.first, fit.solution.parameters
-    return CalibrationState.of(
+    state = CalibrationState.of(
         fit.model.error,
         name=options.name,
         error_model=fit.options,
@@ -81,6 +82,7 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
         joint_covariance=fit.joint_covariance,
         residual_variance=fit.residual_variance,
     )
+    return state.model_copy(update={"scene": scene_light(data, options.runtime, state)})
 
 
 def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
@@ -131,7 +133,7 @@ class TrainingResult:
 
     def corrector(self) -> DepthCorrector:
         """Return the corrector of this calibration, as `corrector.ts` holds it."""
-        return DepthCorrector.from_state(calibration_state(self.data, self.options, self.fit))
+        return DepthCorrector.from_state(self._state)
 
     def save(self, folder: Path | str) -> None:
         """Write the run folder, whole or not at all.
@@ -145,8 +147,7 @@ class TrainingResult:
 
     def write_into(self, folder: Path) -> None:
         """Write all files but TensorBoard's and the page into an existing folder."""
-        fit, options = self.fit, self.options
-        state = calibration_state(self.data, options, fit)
+        fit, options, state = self.fit, self.options, self._state
         save_calibration(folder / STATE_FILE, state)
         reference = estimate_reference(self.data, self.calibration.frames, fit, state.noise)
         if reference is not None:
@@ -207,9 +208,14 @@ class TrainingResult:
         return full_text(self.report)
 
     @cached_property
+    def _state(self) -> CalibrationState:
+        return calibration_state(self.data, self.options, self.fit)
+
+    @cached_property
     def _found(self) -> dict[str, Any]:
         """The content of calibration.yaml."""
-        return calibration_mapping(self.data, self.options, self.fit, self.report)
+        found = calibration_mapping(self.data, self.options, self.fit, self.report)
+        return found | {"scene": self._state.scene.to_mapping()}
 
     @cached_property
     def _sample(self) -> PixelSample:
