@@ -5,10 +5,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from simulated_walls import simulated_wall, true_hand_eye
+import torch
+from simulated_walls import EA, QUIET, simulated_wall, true_hand_eye
 
 import tofcorr
 from tofcorr import CalibrationDataError
+from tofcorr.data.recording import planes_in_tool
 from tofcorr.geometry import se3
 from tofcorr.pixels.dataset import Dataset
 
@@ -95,3 +97,38 @@ def test_without_a_named_effect_it_is_a_training_and_another_file_is_refused_in_
         tofcorr.train_with(two_exposures.first.path / "recording.yaml", two_exposures.first)
     with pytest.raises(CalibrationDataError, match="there is no such file"):
         tofcorr.train_with(two_exposures.first.path, two_exposures.first)
+
+
+def test_stray_light_is_taken_back_in_the_fit_and_in_the_corrector(tmp_path: Path) -> None:
+    shares = {"share_0.05": 0.0, "share_0.12": 0.15, "share_0.3": 0.0, "veil": 0.1}
+    wall = simulated_wall(
+        tmp_path / "recording",
+        seed=34,
+        shots=(("checkerboard", 30),),
+        effects=[{"name": "stray_light", **shares}],
+        sensor=QUIET,
+        robot={"tilt_deg": 45.0, "steepest_incidence_deg": 80.0},
+    )
+    named, run = diagnosed(tmp_path, "stray_light", values=shares), tmp_path / "run"
+    found = tofcorr.train_with(
+        named, wall.first, {"name": "EA", "model": EA, "figures": False}, out=run
+    )
+    plain = tofcorr.train(wall.first, "ea")
+    assert found.report["named"]["effects"][0]["kept"]
+    off = [
+        se3.apart(one.fit.solution.parameters.tool_from_camera, true_hand_eye(wall))[0]
+        for one in (found, plain)
+    ]
+    assert off[0] < 0.5 * off[1]
+    # What was taken back in the fit is taken back at run time: points lie as near the walls.
+    chosen = found.calibration.test
+    images = [torch.from_numpy(wall.first.read(name, chosen)) for name in ("depth", "amplitude")]
+    corrector = found.corrector()
+    loaded = tofcorr.load_corrector(run / "corrector.ts", trust=True)
+    torch.testing.assert_close(loaded(*images), corrector(*images), equal_nan=True)
+    normal, offset = (one[chosen] for one in planes_in_tool(wall.first))
+    points = corrector.points_tool(*images).double()
+    apart = (points @ normal[:, None, :, None])[..., 0] + offset[:, None, None]
+    expected = found.report["error_mm"]["after"]["test"]["mean_abs"]
+    usable = next(found.data.batches(chosen)).valid
+    assert 1e3 * float(apart[usable].abs().mean()) == pytest.approx(expected, rel=0.01)

@@ -28,6 +28,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, folds, opened
 from tofcorr.pixels.passes import FrameErrors, held_out_errors
 from tofcorr.pixels.sample import MaskOptions
+from tofcorr.scene_light.stray import StrayLightState
 from tofcorr.training.calibration import TrainingOptions, halves
 from tofcorr.training.run import Carried, Config, TrainingResult, carried_training, inspected
 
@@ -42,6 +43,7 @@ _TERM_OF = {
     "wiggling": "periodic",
 }
 _CLOCK = "timestamp_offset"
+_STRAY = "stray_light"
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ def train_with(
     found, options = _read(Path(diagnosis)), resolve_options(TrainingOptions, config)
     named = dict.fromkeys(name for members in found["cause_sets"] for name in members)
     data, said = Dataset(opened(recordings)), list[Tried]()
+    data = data.without_stray_light(options.runtime.stray_light)
     if named:
         usable, chosen, _, left_out = inspected(data, options, force=force)
         held_out = np.setdiff1d(np.arange(data.num_frames), halves(usable, chosen, left_out)[0])
@@ -111,7 +114,8 @@ def train_with(
         for effect in named:
             best, tried = _tried(best, effect, found, held_out)
             said.append(tried)
-        data, options = best.data, options.model_copy(update={"model": best.options.model})
+        kept = {"model": best.options.model, "runtime": best.options.runtime}
+        data, options = best.data, options.model_copy(update=kept)
 
     def carry(data: Dataset, options: TrainingOptions, frames: np.ndarray) -> Carried:
         del options, frames
@@ -176,9 +180,16 @@ def _tried(
 def _with_effect(best: _Model, effect: str, found: Mapping[str, Any]) -> _Model | str:
     """Return the model that undoes an effect as well, or why there is none."""
     data, options = best
+    values = {one["name"]: one["value"] for one in found["fitted"] if one["cause"] == effect}
+    if effect in (_CLOCK, _STRAY) and not values:
+        return "it is one of several that may be there, and the diagnosis fitted another one"
     if effect == _CLOCK:
-        values = {one["name"]: one["value"] for one in found["fitted"] if one["cause"] == effect}
         return best._replace(data=_at_the_images_time(data, values))
+    if effect == _STRAY:
+        stray = _stray_light(data, values)
+        runtime = options.runtime.model_copy(update={"stray_light": stray})
+        options = options.model_copy(update={"runtime": runtime})
+        return _Model(data.without_stray_light(stray), options)
     if effect not in _TERM_OF:
         return "no single frame tells it, so no corrector can undo it"
     kind, finer = TERMS[_TERM_OF[effect]], effect in _POLYNOMIALS
@@ -216,6 +227,21 @@ def _at_the_images_time(data: Dataset, values: Mapping[str, float]) -> Dataset:
         twist = tool_twists(time, pose).nan_to_num(0.0)
         moved.append((pose @ small_motion(twist * late[:, None])).numpy())
     return data.with_columns(world_from_tool=np.concatenate(moved))
+
+
+def _stray_light(data: Dataset, values: Mapping[str, float]) -> StrayLightState:
+    """Return the stray light that a diagnosis found; its names say where it goes."""
+    ways = {kind: [name for name in values if name.startswith(kind)] for kind in ("share", "ghost")}
+    sizes = {kind: tuple(float(name.split("_")[1]) for name in own) for kind, own in ways.items()}
+    shares = {kind: tuple(values[name] for name in own) for kind, own in ways.items()}
+    return StrayLightState(
+        modulation_frequency=data.first.require("modulation_frequency", _STRAY),
+        sigma_of_width=sizes["share"],
+        shares=shares["share"],
+        veil=values["veil"],
+        ghost_sizes=sizes["ghost"],
+        ghost_shares=shares["ghost"],
+    )
 
 
 def _held_out_error(

@@ -25,7 +25,7 @@ from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.judgement import against_garbage, masks_against_garbage
 
-DECIDED_BY_THE_COMPARISON = ("split", "advice", "device")
+DECIDED_BY_THE_COMPARISON = ("split", "advice", "device", "runtime")
 """Training options that a model cannot set: the comparison decides them for all models."""
 
 BEFORE = "before"

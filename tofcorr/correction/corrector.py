@@ -18,6 +18,7 @@ from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.error_terms.signal_terms import unscale
 from tofcorr.geometry.se3 import transformed
 from tofcorr.scene_light.flying import FlyingPixels
+from tofcorr.scene_light.stray import StrayLight
 
 # The error is computed times -2^40, so that `torch.lerp` with the weight w = 2^-40 subtracts it:
 # depth + w (-e / w - depth). Unlike a plain subtraction this turns an infinite depth into NaN in
@@ -43,6 +44,7 @@ class DepthCorrector(nn.Module):
     * An amplitude of NaN gives NaN and is not valid, if the model depends on the amplitude. If it
       does not, amplitudes only matter for saturation.
     * A residual network fades to zero outside the calibrated range.
+    * Stray light of the camera's own is taken back first, where the calibration knows it.
     * A flying pixel is not valid, where the calibration has these found. Where one surface is
       certain, its depth is given.
     * Frames are taken to have the mean conditions (time, integration time, temperature) of the
@@ -89,6 +91,7 @@ class DepthCorrector(nn.Module):
         self.si_per_unit = [condition(name).si_per_unit for name in CONDITIONS]
         self.conditions_inside: bool = True
         self.uncertainty = RuntimeSigma(state, error, limits)
+        self.stray: StrayLight | None = state.stray_light()
         self.flying: FlyingPixels | None = state.flying_pixels()
         scale = geometry.radial_of_depth if self.is_z else geometry.radial_of_depth[:1, :1]
         points = geometry.points(torch.ones_like(geometry.radial_of_depth))
@@ -110,6 +113,7 @@ class DepthCorrector(nn.Module):
                 scripted).
         """
         check_frames(depth, amplitude, self.height, self.width)
+        depth, amplitude = self.without_stray_light(depth, amplitude)
         depth, amplitude = depth.contiguous(), amplitude.contiguous()
         corrected = torch.empty_like(depth)
         valid = torch.empty_like(depth, dtype=torch.bool)
@@ -123,6 +127,13 @@ class DepthCorrector(nn.Module):
         if self.flying is not None:
             return self.flying(corrected, amplitude, valid)
         return corrected, valid
+
+    def without_stray_light(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        """Return depth and amplitude as they were without the camera's own stray light."""
+        if self.stray is None:
+            return depth, amplitude
+        radial, amplitude = self.stray(depth * self.radial_of_z, amplitude)
+        return radial / self.radial_of_z, amplitude
 
     def set_conditions(
         self,

@@ -29,6 +29,7 @@ from tofcorr.options import (
     refused_in_words,
 )
 from tofcorr.scene_light.flying import FlyingPixels, FlyingPixelsState
+from tofcorr.scene_light.stray import StrayLight, StrayLightState
 from tofcorr.version import __version__
 
 STATE_FILE = "state.pt"
@@ -93,9 +94,12 @@ class SceneLight(Options):
     """What a corrector removes of a frame that comes of the scene, not of the camera.
 
     Attributes:
+        stray_light: Light that lens and sensor send to the wrong pixel, taken back before anything
+            else; None: it is left.
         flying_pixels: Pixels that mix two surfaces; None: they are not looked for.
     """
 
+    stray_light: StrayLightState | None = None
     flying_pixels: FlyingPixelsState | None = None
 
 
@@ -232,11 +236,20 @@ class CalibrationState(CalibrationExtras, Setting):
     def corrected(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         """Correct frames (..., H, W) in float64: return corrected depth and where it is valid."""
         reference, frames = self.correction(), (depth.double(), amplitude.double())
+        flying, stray = self.flying_pixels(), self.stray_light()
+        if stray is not None:
+            scale = reference.geometry.radial_of_depth
+            radial, light = stray.double()(frames[0] * scale, frames[1])
+            frames = radial / scale, light
         corrected, valid = reference(*frames), reference.valid(*frames)
-        flying = self.flying_pixels()
         if flying is None:
             return corrected, valid
         return flying.double()(corrected, frames[1], valid)
+
+    def stray_light(self) -> StrayLight | None:
+        """Build what takes stray light back; None: it is left."""
+        wanted = self.scene.stray_light
+        return wanted and StrayLight(self.camera, wanted)
 
     def flying_pixels(self) -> FlyingPixels | None:
         """Build what finds flying pixels; None: it is not asked for."""
@@ -256,7 +269,7 @@ def corrector_metadata(state: CalibrationState) -> dict[str, object]:
         "residual_network": state.residual and state.residual.options.to_mapping(),
         "symbols": error.symbols(),
         "coefficients": state.coefficients.tolist(),
-        "needs_amplitude": error.needs_amplitude() or state.scene.flying_pixels is not None,
+        "needs_amplitude": error.needs_amplitude() or state.scene != SceneLight(),
         "scene": state.scene.to_mapping(),
         "sign": "error = measured - true; corrected = measured - error",
         "depth_kind": state.depth_kind,

@@ -67,7 +67,8 @@ def check(
         file_to_replace(Path(out), CalibrationDataError)
     if page is not None:
         refuse_page(Path(page))
-    state, dataset = load_calibration(Path(run) / STATE_FILE), Dataset(opened(recordings))
+    state = load_calibration(Path(run) / STATE_FILE)
+    dataset = Dataset(opened(recordings)).without_stray_light(state.scene.stray_light)
     _refuse_unfit(state, dataset, "per_image")
     planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
     headline = vet(dataset, planes, fits=False, force=force).headline

@@ -30,6 +30,7 @@ from tofcorr.data.recording import (
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import Chosen, Rays, ray_directions
 from tofcorr.options import Options
+from tofcorr.scene_light.stray import StrayLight, StrayLightState
 
 Frames = Sequence[int] | np.ndarray
 """Numbers of frames."""
@@ -45,10 +46,12 @@ class Dataset:
         recordings: At least one; all of one camera.
         exclude: Returns True where a valid pixel of a batch is not used, shape (B, H, W); None
             uses all valid pixels. Fits and measured errors both leave these pixels out.
+        stray: Takes the camera's own stray light out of every frame that is read; None: nothing.
     """
 
     recordings: tuple[Recording, ...]
     exclude: Callable[[FrameBatch], Chosen] | None = None
+    stray: StrayLight | None = None
 
     def __post_init__(self) -> None:
         """Refuse recordings that are not of one camera in one setting."""
@@ -97,6 +100,17 @@ class Dataset:
         first = self.exclude
         exclude = further if first is None else lambda batch: first(batch) | further(batch)
         return replace(self, exclude=exclude)
+
+    def without_stray_light(self, state: StrayLightState | None) -> "Dataset":
+        """Return the data set as a camera without this stray light would have recorded it.
+
+        Raises:
+            CalibrationDataError: A recording has no amplitudes.
+        """
+        if state is None:
+            return self
+        self.require("amplitude", "taking stray light back")
+        return replace(self, stray=StrayLight(self.first.camera, state))
 
     def require(self, name: str, needed_by: str) -> None:
         """Refuse a recording without an array, a column or a header entry, naming it.
@@ -173,6 +187,10 @@ class Dataset:
         for recording, start, local in self.by_recording(frames):
             for batch in iterate_frames(recording, local, chunk_pixels, device, image_dtype):
                 numbered = replace(batch, indices=batch.indices + start)
+                if self.stray is not None:
+                    stray = self.stray.to(batch.radial_distance)
+                    distance, light = stray(batch.radial_distance, batch.amplitude)
+                    numbered = replace(numbered, radial_distance=distance, amplitude=light)
                 if self.exclude is not None:
                     numbered = replace(numbered, valid=batch.valid & ~self.exclude(numbered))
                 yield numbered

@@ -24,8 +24,8 @@ from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Number, Options, PositiveNumber
 
-_ROUNDS = 3
-"""How often stray light is computed. Derived: a share of 0.2 leaves 0.0016 of itself."""
+_LEFT = 1e-3
+"""Share of the stray light that may be left. Chosen: a thousandth of centimetres."""
 _CELLS_OF_SIGMA = 4
 """Cells in the standard deviation of the narrowest Gaussian. Chosen: averages over cells widen it
 by 0.3 %."""
@@ -74,7 +74,6 @@ class StrayLight(nn.Module):
         height, width = camera.height, camera.width
         self.turns_per_metre: float = 2 * math.pi / unambiguous_range(state.modulation_frequency)
         self.height, self.width, self.veil = height, width, float(state.veil)
-        self.rounds: int = _ROUNDS
         ghosts = [state.ghost_sigma_of_width] * len(state.ghost_sizes)
         sigmas = [width * share for share in (*state.sigma_of_width, *ghosts)]
         self.cell: int = max(1, int(min(sigmas, default=width) / _CELLS_OF_SIGMA))
@@ -86,7 +85,11 @@ class StrayLight(nn.Module):
             cells = math.ceil(size / self.cell)
             stacked = torch.stack(each) if each else torch.zeros(0, cells, cells)
             self.register_buffer(name, stacked.float())
-        self.register_buffer("shares", torch.tensor([*state.shares, *state.ghost_shares]))
+        shares = [*state.shares, *state.ghost_shares]
+        self.register_buffer("shares", torch.tensor(shares, dtype=torch.float32))
+        # Each round leaves the share of all stray light of what was left.
+        scattered = min(max(sum(map(abs, [*shares, state.veil])), _LEFT), 0.9)
+        self.rounds: int = math.ceil(math.log(_LEFT) / math.log(scattered))
 
     def _spread(self, size: int, centre: float, ghost: float, sigma: float) -> Tensor:
         """Return what each cell of a line receives of each, (N, N), edges repeated.

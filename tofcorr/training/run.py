@@ -385,6 +385,7 @@ def carried_training(
     with timed_stages("training", written=out is not None) as (stage, seconds):
         with stage("read"):
             data = Dataset(opened(recordings))
+            data = data.without_stray_light(options.runtime.stray_light)
             start = None if resume is None else resumed_parameters(resume, options)
         with stage("inspect"):
             data, options, inspection, left_out = inspected(data, options, force=force)

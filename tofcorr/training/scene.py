@@ -18,6 +18,7 @@ from tofcorr.scene_light.flying import (
     FlyingPixelsState,
     squared_spreads,
 )
+from tofcorr.scene_light.stray import StrayLightState
 
 _LOG = logging.getLogger(__name__)
 
@@ -32,9 +33,12 @@ class RuntimeOptions(Options):
     """What the corrector does in a frame besides correcting every pixel; null: nothing.
 
     Attributes:
+        stray_light: Take this stray light back, before the fit as well. `tofcorr train --with` has
+            it from a diagnosis.
         flying_pixels: Find pixels that mix two surfaces.
     """
 
+    stray_light: StrayLightState | None = None
     flying_pixels: FlyingPixelsOptions | None = None
 
 
@@ -50,7 +54,8 @@ def scene_light(data: Dataset, options: RuntimeOptions, state: CalibrationState)
         CalibrationDataError: Flying pixels are to be found, and there are no amplitudes.
     """
     wanted = options.flying_pixels
-    return SceneLight(flying_pixels=wanted and _flying_pixels(data, wanted, state))
+    flying = wanted and _flying_pixels(data, wanted, state)
+    return SceneLight(stray_light=options.stray_light, flying_pixels=flying)
 
 
 @torch.no_grad()

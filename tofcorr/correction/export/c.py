@@ -48,6 +48,8 @@ def export_c(corrector: DepthCorrector, path: Path | str, reference: Calibration
             of the terms.
         ExportError: The compiled source differs from the float64 model; nothing is written.
     """
+    if reference.scene.stray_light is not None:
+        raise ConfigError("C takes no stray light back: export torchscript, pt2 or onnx.")
     path = Path(path)
     name = c_name(path.stem)
     if path.suffix != ".c" or name != path.stem:

@@ -11,7 +11,7 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.loaded import LoadedCorrector
 from tofcorr.correction.lookup import FORMAT, digest_of, interpolate, read_lut
-from tofcorr.correction.state import CalibrationState
+from tofcorr.correction.state import CalibrationState, SceneLight
 from tofcorr.error_terms.base import EVERYTHING, Interval
 from tofcorr.errors import ConfigError
 from tofcorr.files import staged_file
@@ -37,8 +37,8 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
             table can hold either.
         ExportError: The table differs from the model by more than `TOLERANCE`; nothing is written.
     """
-    if reference.scene.flying_pixels is not None:
-        said = "A look-up table corrects every pixel alone, and finds no flying pixels"
+    if reference.scene != SceneLight():
+        said = "A look-up table corrects every pixel alone: no flying pixels, no stray light"
         raise ConfigError(f"{said}: export torchscript, pt2, onnx or c.")
     if reference.residual is not None:
         raise ConfigError(f"{reference.name}'s network needs torchscript, pt2 or onnx.")

@@ -117,6 +117,7 @@ class CompilableCorrector(nn.Module):
         """Return corrected depth, and validity as 0 and 1."""
         corrector = self.corrector
         check_frames(depth, amplitude, corrector.height, corrector.width)
+        depth, amplitude = corrector.without_stray_light(depth, amplitude)
         corrected = torch.empty_like(depth)
         # By way of int32: the generated code converts float32 to uint8 in several times as long.
         valid = torch.empty_like(depth, dtype=torch.int32)
