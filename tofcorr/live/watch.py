@@ -370,11 +370,15 @@ def _finite(value: float) -> float | None:
 
 
 def _ellipse(known: Known) -> list[float]:
-    """Return half axes (mm) and turn (degrees) of the 95 % ellipse across and down the image."""
+    """Return half axes (mm) and turn (degrees) of the camera's place across and down the image.
+
+    It is the outline of an ellipsoid whose longest half axis is `translation_mm`.
+    """
     assert known.fit is not None
-    values, vectors = torch.linalg.eigh(known.fit.hand_eye_covariance[:2, :2])
-    # The 95 % quantile of the sum of two squares.
-    half = 1e3 * (values.clamp(min=0) * -2 * math.log(1 / 20)).sqrt()
+    covariance = known.fit.hand_eye_covariance[:3, :3]
+    values, vectors = torch.linalg.eigh(covariance[:2, :2])
+    worst = torch.linalg.eigvalsh(covariance)[-1]
+    half = known.translation_mm * (values.clamp(min=0) / worst).sqrt()
     return [*half.tolist()[::-1], math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))]
 
 
