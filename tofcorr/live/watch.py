@@ -42,7 +42,7 @@ _New = tuple[Any, str, Callable[[], tuple[Known, np.ndarray | None]]]
 
 _POLL_S = 0.2
 # Least time between two states of the page while frames are added that were there before, seconds.
-# Chosen: as often as somebody looks; a state takes as long as a frame.
+# Chosen: as often as somebody looks.
 _SHOWN_S = 1.0
 _LOCAL = ("127.0.0.1", "localhost")
 # Most points of a curve, ellipses, bars, and sentences that a page shows. Chosen: more are not told
@@ -82,10 +82,12 @@ class LivePage:
         if known.fit is not None and shift is not None:
             self._ellipses.append(_ellipse(known))
             if len(self._ellipses) > _MOST_ELLIPSES:
-                del self._ellipses[1]
+                # Of two that differ least in size, the older one.
+                sizes = np.log([one[0] for one in self._ellipses])
+                del self._ellipses[int(np.abs(np.diff(sizes)).argmin())]
 
     def publish(self, live: LiveCalibration | None, note: str = "") -> None:
-        """Show what is known now.
+        """Show what is known now, and when it is found, the next pose.
 
         Args:
             live: The calibration; None: nothing is known of the camera yet.
@@ -107,9 +109,13 @@ class LivePage:
             state |= {
                 "wanted": [live.wanted_mm, live.wanted_deg],
                 "weakest": known.weakest,
-                "next": _next_pose(live),
                 "cover": _bars(coverage(live.frames, live.camera, live.tool_from_camera)),
             }
+        self._show(state)
+        if live is not None:
+            self._show(state | {"next": _next_pose(live)})
+
+    def _show(self, state: dict[str, Any]) -> None:
         with self.changed:
             self.state = state
             self.changed.notify_all()
@@ -143,7 +149,7 @@ class Watched:
         self._bag, self._new = bag, self._new_frames
         # By what they are called in the source: numbers of frames; None: a frame was refused.
         self._taken: dict[object, int | None] = {}
-        self._staged, self._shown = False, -math.inf
+        self._staged, self._rests_until = False, 0.0
         if bag is not None:
             self._new = self._new_images
         elif (source / START_FILE).exists():
@@ -166,15 +172,17 @@ class Watched:
                 self.page.add(known, depth)
             except TofcorrError as error:
                 self.page.said.append(f"{name} was skipped: {error}")
-            if time.monotonic() > self._shown + _SHOWN_S:
+            if time.monotonic() > self._rests_until:
                 self._publish()
         if added or note != self.note:
             self._publish()
         return added
 
     def _publish(self) -> None:
+        began = time.monotonic()
         self.page.publish(self.live, self.note)
-        self._shown = time.monotonic()
+        # Frames that wait are added for half of the time at least.
+        self._rests_until = max(began + _SHOWN_S, 2 * time.monotonic() - began)
 
     def _new_sums(self) -> Iterator[_New]:
         """Yield the frames that another process has added."""
@@ -366,7 +374,7 @@ def _bars(cover: dict[str, list[float]]) -> dict[str, Any]:
 
 
 def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
 def _ellipse(known: Known) -> list[float]:
