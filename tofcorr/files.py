@@ -116,7 +116,7 @@ def staged_folder(path: Path | str) -> Iterator[Path]:
     refuse_existing(Path(path))
     # absolute() instead of resolve(): a symbolic link in the path is kept.
     target = Path(path).absolute()
-    folder = target.parent / temporary_name()
+    folder = target.parent / temporary_name(_sign(target))
     with ExitStack() as made:
         with writing_to(path):
             made.enter_context(new_folders(target.parent))
@@ -130,6 +130,34 @@ def staged_folder(path: Path | str) -> Iterator[Path]:
             if os.path.lexists(target):
                 raise FileExistsError(0, "something appeared there in the meantime")
             folder.rename(target)
+
+
+def being_written(path: Path, holds: str) -> Path | None:
+    """Return the temporary folder that a running `staged_folder` will rename to `path`.
+
+    Args:
+        path: The folder to come.
+        holds: A file that the temporary folder must hold already.
+
+    Returns:
+        The folder; None: no program is writing it, or that file is not there yet.
+    """
+    target = path.absolute()
+    for file in target.parent.glob(f".tofcorr-*.part{_sign(target)}/{holds}"):
+        with suppress(OSError):
+            try:
+                with _locked(file.parent) as known:
+                    if known:
+                        continue  # A killed run has left it.
+            except FileExistsError:
+                pass
+            return file.parent
+    return None
+
+
+def _sign(target: Path) -> str:
+    """Return what the temporary name of a folder ends with: a digest of the final name."""
+    return f"-{sha256(os.fsencode(target.name)).hexdigest()[:8]}"
 
 
 @contextmanager

@@ -11,8 +11,13 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/launch", ["launch/correct.launch.py"]),
+        (f"share/{NAME}/launch", ["launch/correct.launch.py", "launch/calibrate.launch.py"]),
     ],
     install_requires=["setuptools"],
-    entry_points={"console_scripts": [f"depth_corrector = {NAME}.node:main"]},
+    entry_points={
+        "console_scripts": [
+            f"depth_corrector = {NAME}.node:main",
+            f"live_calibrator = {NAME}.calibrator:main",
+        ]
+    },
 )

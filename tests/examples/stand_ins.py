@@ -1,4 +1,4 @@
-"""Stand-ins for rclpy, sensor_msgs and camera drivers: as much of them as the examples use."""
+"""Stand-ins for rclpy, tf2_ros, messages and camera drivers: as much as the examples use."""
 
 import sys
 from array import array
@@ -69,7 +69,48 @@ class PointCloud2(_Message):
 
 
 class CameraInfo(_Message):
-    fields_of: ClassVar = {"header": Header, "k": list}
+    fields_of: ClassVar = {**_SIZE, "k": list, "d": list, "distortion_model": str}
+
+
+class String(_Message):
+    fields_of: ClassVar = {"data": str}
+
+
+class Point(_Message):
+    fields_of: ClassVar = dict.fromkeys("xyz", float)
+
+
+class Quaternion(_Message):
+    fields_of: ClassVar = dict.fromkeys("xyzw", float)
+
+
+class Pose(_Message):
+    fields_of: ClassVar = {"position": Point, "orientation": Quaternion}
+
+
+class PoseStamped(_Message):
+    fields_of: ClassVar = {"header": Header, "pose": Pose}
+
+
+class TransformException(Exception):  # noqa: N818 - so it is called
+    """What tf2_ros raises where frames are not connected."""
+
+
+class Buffer:
+    """Knows the transforms of `poses`, by target and source."""
+
+    poses: ClassVar[dict[tuple[str, str], Any]] = {}
+
+    def lookup_transform(self, target: str, source: str, time: Any) -> Any:
+        assert time is not None
+        if (target, source) not in self.poses:
+            raise TransformException(f"'{source}' is not connected with '{target}'")
+        x, y, z, *turn = self.poses[target, source]
+        rotation = SimpleNamespace(**dict(zip("xyzw", turn, strict=True)))
+        translation = SimpleNamespace(x=x, y=y, z=z)
+        return SimpleNamespace(
+            transform=SimpleNamespace(translation=translation, rotation=rotation)
+        )
 
 
 @dataclass
@@ -99,6 +140,7 @@ class Node:
         self.subscriptions_by_topic: dict[str, tuple[type, Any]] = {}
         self.publishers_by_topic: dict[str, Publisher] = {}
         self.log: dict[str, list[str]] = {"info": [], "error": []}
+        self.timers: list[Any] = []
 
     def declare_parameter(self, name: str, default: Any) -> Any:
         return SimpleNamespace(value=self.parameters.get(name, default))
@@ -111,6 +153,10 @@ class Node:
     def create_subscription(self, kind: type, topic: str, callback: Any, qos: Any) -> None:
         assert qos
         self.subscriptions_by_topic[topic] = (kind, callback)
+
+    def create_timer(self, period: float, callback: Any) -> None:
+        assert period > 0
+        self.timers.append(callback)
 
     def get_logger(self) -> Any:
         return SimpleNamespace(info=self.log["info"].append, error=self.log["error"].append)
@@ -125,11 +171,18 @@ class Node:
 def ros_modules() -> dict[str, ModuleType]:
     """Return the modules that the node imports, by name."""
     names = ("rclpy", "rclpy.node", "rclpy.qos", "sensor_msgs", "sensor_msgs.msg")
-    names += ("std_msgs", "std_msgs.msg")
+    names += ("std_msgs", "std_msgs.msg", "geometry_msgs", "geometry_msgs.msg")
+    names += ("tf2_ros", "rclpy.time")
     modules: dict[str, Any] = {name: ModuleType(name) for name in names}
     modules["rclpy.node"].Node = Node
     modules["rclpy.qos"].qos_profile_sensor_data = object()
+    modules["rclpy.time"].Time = object
     modules["std_msgs.msg"].Header = Header
+    modules["std_msgs.msg"].String = String
+    modules["geometry_msgs.msg"].PoseStamped = PoseStamped
+    modules["tf2_ros"].Buffer = Buffer
+    modules["tf2_ros"].TransformException = TransformException
+    modules["tf2_ros"].TransformListener = lambda buffer, node: (buffer, node)
     for message in (Image, PointField, PointCloud2, CameraInfo):
         setattr(modules["sensor_msgs.msg"], message.__name__, message)
     return modules

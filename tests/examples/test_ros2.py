@@ -209,3 +209,40 @@ def test_another_lens_calibration_is_remarked_upon(start: Callable[..., Any]) ->
     (line,) = node.log["error"]
     assert "[9.4, 9.5, 3.2, 1.9]" in line
     assert "[9.0, 9.5, 3.2, 1.9]" in line
+
+
+def test_a_new_model_is_taken_over_and_a_damaged_one_is_not(
+    start: Callable[..., Any], tmp_path: Path
+) -> None:
+    node = start()
+    (look,) = node.timers
+    before = expected(tmp_path, *frame())[0]
+    give(node, *frame())
+    model = tmp_path / "corrector.ts"
+    save_corrector(tmp_path / "next.ts", coefficients=torch.full((10,), 0.01).double())
+    (tmp_path / "next.ts").replace(model)
+    look()
+    give(node, *frame())
+    after = expected(tmp_path, *frame())[0]
+    (tmp_path / "bad.ts").write_bytes(b"no model")
+    (tmp_path / "bad.ts").replace(model)
+    look()
+    look()
+    give(node, *frame())
+    assert not np.array_equal(before, after, equal_nan=True)
+    for message, wanted in zip(published(node), (before, after, after), strict=True):
+        np.testing.assert_array_equal(pixels(message), wanted)
+    (line,) = node.log["error"]
+    assert line.startswith("No new model in")
+
+
+def test_a_model_that_is_not_there_yet_is_waited_for(
+    start: Callable[..., Any], tmp_path: Path
+) -> None:
+    node = start(model=str(tmp_path / "later.ts"))
+    node.receive("depth/image_raw", image(frame()[0], "16UC1"))
+    assert published(node) == []
+    save_corrector(tmp_path / "later.ts")
+    node.timers[0]()
+    give(node, *frame())
+    assert len(published(node)) == 1

@@ -21,9 +21,8 @@ from tofcorr.importing.run import Sieve
 
 def read_bag(path: Path) -> None:
     """Read everything that an import reads of a bag."""
-    frames = {"base_frame": bags.BASE, "tool_frame": bags.TOOL}
-    topics = {"amplitude_topic": bags.INFRARED}
-    with open_bag(path, bags.DEPTH, DepthCoding(), **frames, **topics) as images:
+    named = {"base_frame": bags.BASE, "tool_frame": bags.TOOL, "amplitude_topic": bags.INFRARED}
+    with open_bag(path, bags.DEPTH, DepthCoding(), grows=False, **named) as images:
         ImagesOfPlanes(images, PosedOptions()).look(Sieve("bag"))
 
 

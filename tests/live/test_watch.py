@@ -68,7 +68,7 @@ def states(port: int) -> Generator[dict[str, Any]]:
 
 def test_the_stream_says_what_the_calibration_knows(growing: Growing) -> None:
     watched, ended = Watched(growing.folder), threading.Event()
-    server = serve(watched)
+    server = serve(watched.page)
     stream = states(server.server_port)
     thread = threading.Thread(target=watch, args=(watched,), kwargs={"ends": ended.is_set})
     thread.start()
@@ -97,7 +97,7 @@ def filled(growing: Growing, folder: Path) -> Path:
     watched.poll()
     again = Watched(folder)
     assert again.poll() == growing.next
-    assert again.state["frames"] == watched.state["frames"]
+    assert again.page.state["frames"] == watched.page.state["frames"]
     return folder
 
 
@@ -113,7 +113,7 @@ def test_what_is_half_written_is_waited_for(growing: Growing) -> None:
     assert watched.poll() == 0
     growing.append("amplitude.npy", half["amplitude"][100:])
     assert watched.poll() == 1
-    assert watched.damaged == []
+    assert watched.page.said == []
 
 
 def test_a_damaged_frame_is_named_and_skipped(growing: Growing) -> None:
@@ -122,13 +122,13 @@ def test_a_damaged_frame_is_named_and_skipped(growing: Growing) -> None:
     growing.grow()
     watched = Watched(growing.folder)
     assert watched.poll() == 3
-    assert watched.state["frames"] == 2
-    assert len(watched.damaged) == 1
-    assert watched.damaged[0].startswith("Frame 1 was skipped: frames.csv: frame 1, column")
+    assert watched.page.state["frames"] == 2
+    assert len(watched.page.said) == 1
+    assert watched.page.said[0].startswith("Frame 1 was skipped: frames.csv: frame 1, column")
 
 
 def test_only_this_machine_is_answered(growing: Growing) -> None:
-    server = serve(Watched(growing.folder))
+    server = serve(Watched(growing.folder).page)
     answers = {}
     for host, path in (("localhost:1", "/"), ("evil.example:1", "/"), ("localhost:1", "/x")):
         connection = HTTPConnection("127.0.0.1", server.server_port, timeout=5)

@@ -1,5 +1,6 @@
 """The commands that calibrate cameras: inspect, train, update, pool, rig, compare, check."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,9 @@ from tofcorr.cli.shared import (
     run_option,
     show,
 )
+from tofcorr.errors import CalibrationDataError
 from tofcorr.files import REPLACED_FILE, NewPath
+from tofcorr.importing.rosbag import bag_options, opened
 
 if TYPE_CHECKING:
     from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
@@ -245,6 +248,8 @@ _ROTATION = "The same of its rotation, degrees."
 @option("--run", "New folder for the calibration, written at the end.", type=NewPath())
 @option("--once", "Add the frames that are there, say what is known, and end.", is_flag=True)
 @option("--no-browser", "Print the address and open no browser.", is_flag=True)
+@option("--depth", "SOURCE is a bag with depth images on this topic.", "depth_topic")
+@bag_options
 def watch_command(
     options: "TrainingOptions",
     source: Path,
@@ -253,21 +258,28 @@ def watch_command(
     run: Path | None,
     once: bool,
     no_browser: bool,
-    **more: Any,  # noqa: ANN401
+    **given: Any,  # noqa: ANN401
 ) -> None:
     """Calibrate while a recording grows, and show in the browser what is known.
 
-    SOURCE is a recording whose files grow frame by frame, or the folder of a LiveCalibration that
-    another program adds to; that one has its own configuration and limits. Ctrl-C ends it, and
-    writes the calibration to --run.
+    SOURCE is a recording whose files grow frame by frame, or that tofcorr is going to write there;
+    or the folder of a LiveCalibration that another program adds to, which has its own configuration
+    and limits; or, with --depth, a bag. The options after --depth are those of tofcorr import
+    rosbag. Ctrl-C ends it, and writes the calibration to --run.
     """
     from tofcorr.live.watch import Watched, serve, watch
 
-    watched = Watched(source, options, **more)
+    more = {key: given.pop(key) for key in ("wanted_mm", "wanted_deg", "folder")}
+    bag = None
+    if given["depth_topic"] is not None:
+        from tofcorr.importing.rosbag.growing import GrowingBag
+
+        bag = GrowingBag(source, partial(opened, source, given, grows=True))
+    watched = Watched(source, options, bag, **more)
     if once:
         watched.poll()
     else:
-        server = serve(watched, port)
+        server = serve(watched.page, port)
         address = f"http://127.0.0.1:{server.server_port}/"
         click.echo(f"{address} shows {source}; Ctrl-C ends it.")
         if not no_browser:
@@ -277,7 +289,9 @@ def watch_command(
         except KeyboardInterrupt:
             server.shutdown()
             server.server_close()
-    click.echo("\n".join([watched.state["verdict"], *watched.damaged]))
+    click.echo("\n".join([watched.page.state["verdict"], *watched.page.said]))
+    if watched.live is None:
+        raise CalibrationDataError(watched.note)
     if run is not None:
         watched.live.save(run)
         click.echo(f"Written to {run}")

@@ -193,8 +193,9 @@ class ArrayStream:
         return converted
 
     def write(self, frame: np.ndarray) -> None:
-        """Append a converted frame."""
+        """Append a converted frame, for others to read."""
         self._file.write(frame.data)
+        self._file.flush()
 
     def finish(self, num_frames: int) -> None:
         """Write the number of frames into the header and close the file."""

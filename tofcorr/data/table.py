@@ -108,17 +108,21 @@ class FrameTable(FrameRow[np.ndarray]):
         return [self.row(index) for index in range(len(self))]
 
 
-def read_table(path: Path) -> FrameTable:
+def read_table(path: Path, lines: Sequence[Sequence[str]] | None = None) -> FrameTable:
     """Read and check `frames.csv`.
 
     Columns may come in any order; unknown columns are ignored. Quaternions are normalised, and a
     plane's n and d are divided by the length of n, if the length is within the format's tolerance.
 
+    Args:
+        path: The file.
+        lines: Its cells, line by line, where they were read already.
+
     Raises:
         CalibrationDataError: The file is missing or breaks the format; the message names column
             and frame.
     """
-    cells = _read_cells(path)
+    cells = _columns(read_lines(path) if lines is None else lines, path)
     has_covariance = not cells.keys().isdisjoint(COVARIANCE)
     needed = [*REQUIRED_COLUMNS, *(COVARIANCE if has_covariance else ())]
     missing = [name for name in needed if name not in cells]
@@ -214,11 +218,21 @@ def rigid_transforms(
     return se3.assemble(quaternion_to_rotation_matrix(given[:, [3, 0, 1, 2]]), place).numpy()
 
 
-def table_text(rows: Iterable[FrameRow]) -> str:
-    """Return `frames.csv` of these rows; an optional column is left out if no row has it."""
+def table_text(rows: Iterable[FrameRow], first: int | None = None) -> str:
+    """Return `frames.csv` of these rows; an optional column is left out if no row has it.
+
+    Args:
+        rows: The rows.
+        first: Number of the first of them where further rows will follow: then every optional
+            column is written, and of a later number no header; None: these are all rows.
+    """
     rows = list(rows)
     optional = {name: [_cell(row, name) for row in rows] for name in COLUMN_OF}
-    kept = {name: cells for name, cells in optional.items() if any(c is not None for c in cells)}
+    kept = {
+        name: cells
+        for name, cells in optional.items()
+        if first is not None or any(c is not None for c in cells)
+    }
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     # Of some planes alone nothing can be weighed.
@@ -227,13 +241,14 @@ def table_text(rows: Iterable[FrameRow]) -> str:
     angles = [np.atleast_1d(row.joint_angles) for row in rows if row.joint_angles is not None]
     if len(angles) == len(rows) > 0:
         names += [JOINT.format(k + 1) for k in range(len(angles[0]))]
-    writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept), *names])
+    if not first:
+        writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept), *names])
     for frame, row in enumerate(rows):
         # The csv module writes None as an empty cell: unknown.
         more = [cells[frame] for cells in kept.values()]
         more += row.plane_covariance[_UPPER].tolist() if known else []
         more += angles[frame].tolist() if len(angles) == len(rows) else []
-        writer.writerow([frame, *_required_cells(row), row.target, *more])
+        writer.writerow([(first or 0) + frame, *_required_cells(row), row.target, *more])
     return text.getvalue()
 
 
@@ -257,14 +272,28 @@ def _cell(row: FrameRow, name: str) -> int | str | float | None:
     return None if np.isnan(cell) else cell
 
 
-def _read_cells(path: Path) -> dict[str, list[str]]:
-    """Read the file into columns of text; blank lines are skipped."""
+def read_lines(path: Path, *, grows: bool = False) -> list[list[str]]:
+    """Return the cells of the file, line by line; blank lines are skipped.
+
+    Args:
+        path: The file.
+        grows: Whether a last line without its end is one that is being written, and is left out.
+
+    Raises:
+        CalibrationDataError: The file is missing, or is no CSV.
+    """
     try:
         with reading(path), open_regular(path) as file:
-            text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
-            lines = [line for line in csv.reader(text) if line]
+            content = file.read()
+        content = content[: content.rfind(b"\n") + 1] if grows else content
+        text = io.StringIO(content.decode("utf-8-sig"), newline="")
+        return [line for line in csv.reader(text) if line]
     except (UnicodeDecodeError, csv.Error) as error:
         raise CalibrationDataError(f"{path}: cannot be read as CSV ({error}).") from None
+
+
+def _columns(lines: Sequence[Sequence[str]], path: Path) -> dict[str, list[str]]:
+    """Return the columns of text by their names."""
     if not lines:
         raise CalibrationDataError(f"{path}: is empty; expected a header row.")
     names = [name.strip() for name in lines[0]]

@@ -28,8 +28,10 @@ from tofcorr.version import __version__
 class RecordingWriter:
     """Writes a recording frame by frame; the folder appears when the block ends without an error.
 
-    Until then the files are in a hidden folder beside it. Any exception, Ctrl-C included, removes
-    that folder. Nothing is overwritten. The checks of `Recording.open` are applied to all files.
+    Until then the files are in a hidden folder beside it, which `tofcorr watch` finds. No reader
+    takes it for a recording: its arrays say that they hold no frame. Any exception, Ctrl-C
+    included, removes that folder. Nothing is overwritten. The checks of `Recording.open` are
+    applied to all files.
 
     Args:
         path: The folder to write; it must not exist yet.
@@ -146,6 +148,10 @@ class RecordingWriter:
             self._write_images(images)
         if row is not None:
             self._rows.append(row)
+            text = table_text([row], self._num_frames)
+            # Last of all: who watches the frames come takes one when its row is there.
+            with writing_to(self.path), (self._folder / TABLE_FILE).open("ab") as table:
+                table.write(text.encode())
         self._num_frames += 1
 
     def add_truth(self, name: str, value: Mapping[str, Any]) -> None:
@@ -185,6 +191,7 @@ class RecordingWriter:
 
     def _write_images(self, images: Mapping[str, np.ndarray]) -> None:
         if self._num_frames == 0:
+            self._write_header()
             size = (self._header.camera.height, self._header.camera.width)
             for name, image in images.items():
                 known, file = IMAGE_ARRAYS.get(name), self._folder / f"{name}.npy"
@@ -203,15 +210,20 @@ class RecordingWriter:
         for name, frame in frames.items():
             self._streams[name].write(frame)
 
-    def _finish(self) -> None:
-        for stream in self._streams.values():
-            stream.finish(self._num_frames)
-        folder, header = self._folder, self._header.to_mapping()
+    def _write_header(self) -> None:
+        header = self._header.to_mapping()
         for key in ("planes", "frames", "corrected_by"):  # Only where they say more.
             if getattr(self._header, key) == Header.model_fields[key].default:
                 del header[key]
         text = dump_yaml(header, last="depth_kind")
-        (folder / HEADER_FILE).write_text(text, encoding="utf-8")
+        (self._folder / HEADER_FILE).write_text(text, encoding="utf-8")
+
+    def _finish(self) -> None:
+        for stream in self._streams.values():
+            stream.finish(self._num_frames)
+        folder = self._folder
+        if not self._num_frames:
+            self._write_header()
         if self._rows_from is not None:
             shutil.copyfile(self._rows_from, folder / TABLE_FILE)
         else:

@@ -39,7 +39,7 @@ def number_list(*counts: int) -> Callable[[str], tuple[float, ...]]:
     return numbers
 
 
-def _adding(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+def adding(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
     """Return a decorator that adds options to a command, in this order."""
     return lambda command: reduce(lambda made, add: add(made), reversed(options), command)
 
@@ -59,7 +59,7 @@ pose_format_option = option(
     type=click.Choice(["tum", "csv", "matrix", "matrices", "moveit"]),
 )  # fmt: skip
 
-intrinsics_options = _adding(
+intrinsics_options = adding(
     option("--intrinsics", "YAML, JSON, ROS camera_info, OpenCV, text of 3x3, or a shipped name."),
     option("--calibrate", "Calibrate the intrinsics from the boards.", is_flag=True),
     option("--focal", "Focal length F or FX,FY, pixels.", type=number_list(1, 2)),
@@ -74,7 +74,7 @@ _TURNS = "Degrees clockwise by which images are turned to fit the intrinsics."
 invalid_option = option("--invalid", _NONE, default="0,65535", type=number_list(*range(1, 9)))
 _TURN = click.Choice(["0", "90", "180", "270"])
 rotate_option = option("--rotate", _TURNS, default="0", type=_TURN)
-coding_options = _adding(
+coding_options = adding(
     option("--depth-unit-mm", _COUNTS, "unit_mm", type=float),
     invalid_option,
     option("--big-endian", "The two bytes of each number are swapped.", is_flag=True),
@@ -84,7 +84,7 @@ coding_options = _adding(
 
 _MOVING = "Also use images taken while the robot moved."
 _FULL = "Pixels at or above this amplitude are saturated and not used."
-posed_options = _adding(
+posed_options = adding(
     option("--eye-to-hand", "The camera stands still; the robot moves the target.", is_flag=True),
     depth_kind_option,
     option("--time-offset-s", "Added to the images' time stamps.", default=0.0),
@@ -164,7 +164,7 @@ def take_posed_options(given: dict[str, Any], camera_frame: str = "") -> "PosedO
 
 def command_name() -> str:
     """Return what messages call the command that is run."""
-    return f"tofcorr import {click.get_current_context().info_name}"
+    return click.get_current_context().command_path
 
 
 def print_report(report: Mapping[str, Any], out: Path) -> None:

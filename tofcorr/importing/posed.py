@@ -88,16 +88,22 @@ class PosedImport:
     Args:
         source: Images and poses.
         options: How to pair, choose and look for walls.
+        planes: As of `ImagesOfPlanes`.
     """
 
-    def __init__(self, source: RobotImages, options: PosedOptions) -> None:
+    def __init__(
+        self,
+        source: RobotImages,
+        options: PosedOptions,
+        planes: dict[str, list[ImagePlane]] | None = None,
+    ) -> None:
         self._source, self._options = source, options
         self._times = None if source.times is None else source.times + options.time_offset_s
         self._track = source.track
         if options.eye_to_hand:
             inverse = np.linalg.inv(source.track.world_from_tool)
             self._track = replace(source.track, world_from_tool=inverse)
-        self._images = ImagesOfPlanes(source, options)
+        self._images = ImagesOfPlanes(source, options, planes)
 
     def prepare(self, sieve: Sieve) -> PreparedImport:
         """Read all images once or twice, and find out everything but the frames themselves."""

@@ -96,6 +96,7 @@ class ImagesOfPlanes:
     Args:
         source: The images.
         options: What depth means, which amplitudes are saturated, and how planes are found.
+        planes: Those of images that were seen before, by their names; further ones are added.
 
     Attributes:
         camera: Of the size of the first image that could be read; `look` finds it.
@@ -105,9 +106,14 @@ class ImagesOfPlanes:
     camera: CameraIntrinsics
     rays: Tensor
 
-    def __init__(self, source: RobotImages, options: PosedOptions) -> None:
+    def __init__(
+        self,
+        source: RobotImages,
+        options: PosedOptions,
+        planes: dict[str, list[ImagePlane]] | None = None,
+    ) -> None:
         self.source, self._options = source, options
-        self._planes: dict[int, list[ImagePlane]] = {}
+        self._planes = {} if planes is None else planes
 
     def look(self, sieve: Sieve) -> tuple[np.ndarray, np.ndarray]:
         """Read every image once, and keep a few numbers of each.
@@ -157,9 +163,10 @@ class ImagesOfPlanes:
 
     def planes(self, number: int) -> list[ImagePlane]:
         """Return the planes of an image, found once."""
-        if number not in self._planes:
-            self._planes[number] = self.planes_in(self.read(number))
-        return self._planes[number]
+        name = self.source.names[number]
+        if name not in self._planes:
+            self._planes[name] = self.planes_in(self.read(number))
+        return self._planes[name]
 
     def planes_in(self, image: DepthImage) -> list[ImagePlane]:
         """Find the planes of an image of this camera."""

@@ -7,6 +7,7 @@ at a time. Writing and reporting are the same for all (`run_import`).
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -95,7 +96,7 @@ class PreparedImport:
 
     views: Sequence[Mapping[str, Any]]
     frames: Iterator[Frame]
-    writer: Callable[[Path], RecordingWriter]
+    writer: partial[RecordingWriter]
     camera: Mapping[str, Any]
     findings: Mapping[str, Any] = field(default_factory=dict)
     warnings: Sequence[str] = ()

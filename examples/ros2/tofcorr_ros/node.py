@@ -4,6 +4,8 @@ Needs rclpy, NumPy and torch; tofcorr itself is not needed on the robot.
 """
 
 import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -25,13 +27,16 @@ _PATIENCE = 30
 # Largest relative difference of the focal lengths and centres that is not remarked upon. A
 # focal length 0.1 % off moves a point at the image's edge by 1 mm at 2 m.
 _LENS_TOLERANCE = 1e-3
+# How often the file of the model is looked at, seconds.
+_LOOK_S = 1.0
 
 
 class DepthCorrector(Node):
     """Corrects the depth images of one camera.
 
     Parameters:
-        model: The `corrector.ts` of a run.
+        model: The `corrector.ts` of a run. When it is replaced by another one, that one is used
+            from then on.
         only_valid: Whether pixels outside the calibrated range become NaN; otherwise they are
             corrected with the error at the range's edge.
         sync_tolerance_s: Largest difference of the stamps of depth and infrared, seconds.
@@ -41,8 +46,11 @@ class DepthCorrector(Node):
         super().__init__("depth_corrector")
         self.only_valid = self.declare_parameter("only_valid", False).value
         self.pairs = StampPairs(self.declare_parameter("sync_tolerance_s", 0.002).value)
-        self.corrector = torch.jit.load(self.declare_parameter("model", "").value)
-        self.camera = json.loads(self.corrector.metadata())
+        self.model = self.declare_parameter("model", "").value
+        self.written: tuple[int, int] | None = None
+        self.corrector: Any = None
+        self.camera: dict[str, Any] = {}
+        self.hears_infrared = False
         self.unpaired = 0
         self.said: set[str] = set()
         self.depth = self.create_publisher(Image, "depth/image_corrected", 10)
@@ -50,16 +58,37 @@ class DepthCorrector(Node):
         qos = qos_profile_sensor_data
         self.create_subscription(CameraInfo, "depth/camera_info", self.on_camera_info, qos)
         self.create_subscription(Image, "depth/image_raw", self.on_depth, qos)
-        if self.camera["needs_amplitude"]:
+        self.load()
+        self.create_timer(_LOOK_S, self.load)
+
+    def load(self) -> None:
+        """Use the model that is in the file now; keep the one before where that cannot be read."""
+        try:
+            status = Path(self.model).stat()
+            if (status.st_mtime_ns, status.st_ino) == self.written:
+                return
+            self.written = status.st_mtime_ns, status.st_ino
+            corrector = torch.jit.load(self.model)
+            camera = json.loads(corrector.metadata())
+        except (OSError, RuntimeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            self.say_once(f"model {self.written}", f"No new model in '{self.model}': {reason}")
+            return
+        self.corrector, self.camera = corrector, camera
+        if camera["needs_amplitude"] and not self.hears_infrared:
+            qos = qos_profile_sensor_data
             self.create_subscription(Image, "infrared/image_raw", self.on_infrared, qos)
-        size = self.camera["camera"]
+            self.hears_infrared = True
+        size = camera["camera"]
         self.get_logger().info(
-            f"Model {self.camera['model']} for {size['width']}x{size['height']} pixels, "
-            f"{self.camera['depth_kind']} depth."
+            f"Model {camera['model']} for {size['width']}x{size['height']} pixels, "
+            f"{camera['depth_kind']} depth."
         )
 
     def on_depth(self, message: Image) -> None:
         """Correct a depth image, or keep it until its infrared image comes."""
+        if self.corrector is None:
+            return
         if not self.camera["needs_amplitude"]:
             self.correct(message, None)
             return
@@ -79,6 +108,8 @@ class DepthCorrector(Node):
 
     def on_camera_info(self, message: CameraInfo) -> None:
         """Remark upon another lens calibration than the model was trained with."""
+        if self.corrector is None:
+            return
         known = np.array(self.camera["camera"]["K"]).ravel()
         found = np.array(message.k)
         if np.abs(found - known).max() > _LENS_TOLERANCE * known[0]:

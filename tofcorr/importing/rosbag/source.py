@@ -25,6 +25,7 @@ from tofcorr.importing.intrinsics import (
 )
 from tofcorr.importing.pose_track import PoseTrack, nearest
 from tofcorr.importing.robot_images import RobotImages
+from tofcorr.importing.rosbag.growing import files_so_far
 from tofcorr.importing.run import Refused, RefusedViewError
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -83,8 +84,12 @@ class Bag:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Bag]:
+def _opened(path: Path, *, grows: bool = False) -> Iterator[Bag]:
     """Open a bag.
+
+    Args:
+        path: The file or folder.
+        grows: Whether it may be one that is still being written, which is read as far as it goes.
 
     Raises:
         CalibrationDataError: It is no bag, is damaged, or the package `rosbags` is missing.
@@ -101,7 +106,8 @@ def _opened(path: Path) -> Iterator[Bag]:
             open_regular(file, math.inf).close()
         # The message types of bags that do not hold their own.
         default = get_typestore(Stores.ROS2_HUMBLE)
-        reader = highlevel.AnyReader([path], default_typestore=default)
+        paths = files_so_far(path) if grows else [path]
+        reader = highlevel.AnyReader(paths, default_typestore=default)
         reader.open()
     with closing(reader):
         yield Bag(path, reader)
@@ -207,7 +213,7 @@ def _compressed(coding: str, content: bytes, topic: str) -> np.ndarray:
 
 
 @contextmanager
-def open_bag(
+def open_bag(  # noqa: PLR0913 - a bag has many topics
     path: Path,
     depth_topic: str,
     coding: DepthCoding,
@@ -217,6 +223,7 @@ def open_bag(
     amplitude_topic: str | None = None,
     camera_info: str | None = None,
     intrinsics: str | None = None,
+    grows: bool = False,
 ) -> Iterator[RobotImages]:
     """Open a bag and read everything but the images.
 
@@ -229,6 +236,7 @@ def open_bag(
         amplitude_topic: Topic of the amplitude images.
         camera_info: Topic of the intrinsics; None: the one beside the images.
         intrinsics: A file of intrinsics, or a shipped name, instead.
+        grows: Whether the bag may be one that is still being written.
 
     Yields:
         The images, to be read before the block ends, and the poses of the tool in the base.
@@ -240,7 +248,7 @@ def open_bag(
     if camera_info is not None and intrinsics is not None:
         raise ConfigError("name the intrinsics once: --camera-info or --intrinsics.")
     with ExitStack() as opened:
-        bag, warnings = opened.enter_context(_opened(path)), list[str]()
+        bag, warnings = opened.enter_context(_opened(path, grows=grows)), list[str]()
         with damage_reported(path):
             for named, option in ((depth_topic, "--depth"), (amplitude_topic, "--amplitude")):
                 if named is not None:
@@ -256,7 +264,8 @@ def open_bag(
             depth, amplitude = TopicMessages(bag, depth_topic), None
             if amplitude_topic is not None:
                 # Of its own, so that two topics can be read in turn.
-                amplitude = TopicMessages(opened.enter_context(_opened(path)), amplitude_topic)
+                own = opened.enter_context(_opened(path, grows=grows))
+                amplitude = TopicMessages(own, amplitude_topic)
             if not depth.stamped:
                 said = f"The headers of {depth.topic} hold no time stamps"
                 warnings.append(f"{said}; the times of receipt are used.")
