@@ -239,11 +239,11 @@ def observability(
     vectors[:, :undetermined] = sparse_basis(vectors[:, :undetermined])
     left, right = torch.triu_indices(len(names), len(names), offset=1)
     order = correlation[left, right].abs().argsort(descending=True)
+    # The standard errors of such a pair are more than three times those of either alone.
+    order = order[20 * correlation[left, right][order].abs() >= 19]
     pairs = {
         (names[a], names[b]): float(correlation[a, b])
         for a, b in zip(left[order].tolist(), right[order].tolist(), strict=True)
-        # The standard errors of such a pair are more than three times those of either alone.
-        if 20 * abs(correlation[a, b]) >= 19
     }
 
     def direction(k: int) -> Direction:
@@ -279,10 +279,10 @@ def named_components(vector: Float[Tensor, "P"], names: list[str]) -> dict[str, 
 
     Components below a fifth of the largest are left out.
     """
-    size = vector.abs()
+    size = vector.abs().tolist()
     # Of equal ones the first comes first, whatever their rounding.
-    order = sorted(range(len(names)), key=lambda k: -round(float(size[k]), 9))
-    named = [k for k in order if 5 * size[k] > size.max()]
+    order = sorted(range(len(names)), key=lambda k: -round(size[k], 9))
+    named = [k for k in order if 5 * size[k] > max(size)]
     return {names[k]: float(vector[k]) for k in named}
 
 

@@ -30,13 +30,13 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.base import Domain, Term
-from tofcorr.error_terms.model import ErrorModel, Pixels
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.joint import estimate_walls
+from tofcorr.estimation.joint import Together, View, estimate_together, estimate_walls
 from tofcorr.estimation.linear import Curvature, NormalEquations, solvable
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.planes import joint_image_equations, within_prior
+from tofcorr.estimation.planes import Planes, Walls, joint_image_equations, within_prior
 from tofcorr.estimation.regularisation import (
     penalties_of,
     smoothness,
@@ -44,7 +44,7 @@ from tofcorr.estimation.regularisation import (
     total_weight,
     with_strengths,
 )
-from tofcorr.estimation.solvers import Watcher, minimise
+from tofcorr.estimation.solvers import Solution, Watcher, minimise
 from tofcorr.estimation.uncertainty import (
     PRIOR_SIGMA,
     Covariance,
@@ -161,6 +161,58 @@ def estimate(problem: Problem, moments: ImageMoments) -> tuple[Problem, Core, Co
     return problem, core, covariance
 
 
+def fit_of_moments(problem: Problem, moments: ImageMoments, most_steps: int) -> Fit:
+    """Return the fit of moments alone, quickly: for few steps, all unknowns and walls at once.
+
+    What the images do not determine stays near the start, and the noise's shift is left in.
+
+    Args:
+        problem: What to fit, without penalties; it starts where it is resumed.
+        moments: Of its frames, with exactly the model's image columns.
+        most_steps: Of the solver.
+
+    Raises:
+        CalibrationDataError: The frames do not determine the model, or are of fewer than 3 poses.
+    """
+    dataset, frames, options = (
+        problem.dataset,
+        problem.frames,
+        with_time_constants(problem, moments),
+    )
+    model = ErrorModel(options, problem.domain)
+    moments = with_condition_terms(model, moments, dataset.conditions(frames))
+    start, found = problem.start(moments), None
+    columns = "normal_world", "offset", "world_from_tool"
+    normal, offset, pose = (dataset.column(name)[frames] for name in columns)
+    view = View(moments, Walls(normal, offset, torch.arange(len(frames)), pose))
+    if problem.estimates_walls:
+        found = recorded_walls(dataset, frames)
+        view = View(moments, found.walls)
+    planes = found and Planes(found.walls.normal_world, found.walls.offset)
+    together = Together.start([start], planes, offset.new_zeros(0))
+    end = estimate_together([view], together, most_steps=most_steps)
+    best, walls = end.cameras[0], end.walls_of(view)
+    refuse_diverged(best)
+    seen, estimated = walls.seen_by(moments), None if found is None else walls
+    observed = observability(seen, best, None, estimated)
+    prior = prior_on_undetermined(observed, problem.guess(seen))
+    return Fit(
+        options=options,
+        moments=seen,
+        start=start,
+        solution=Solution(best),
+        smoothness=None,
+        observability=observed,
+        prior=prior,
+        model=calibrated(model, best),
+        domain=problem.domain,
+        optimum=best,
+        hand_eye_only=best,
+        covariance=jackknife_covariance(seen, best, prior, problem.poses(), estimated),
+        walls=found and replace(found, walls=walls),
+    )
+
+
 def hand_eye_alone(problem: Problem, moments: ImageMoments) -> Parameters:
     """Fit the hand-eye transform alone to moments of the problem's frames.
 
@@ -266,18 +318,10 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
     Raises:
         CalibrationDataError: There is one, and the options ask to refuse it.
     """
-    options, solver = problem.options.model, problem.options.solver
-    conditions = problem.dataset.conditions(problem.frames)
-    if any(term.is_open("time_constants_s") for term in options.terms):
-        around = minimise(MomentObjective(moments), problem.start(moments), solver).parameters
-        found = time_constant(moments, around, conditions[:, CONDITIONS.index("timestamp")])
-        options = options.with_found("time_constants_s", repeat((found,)))
+    solver, conditions = problem.options.solver, problem.dataset.conditions(problem.frames)
+    options = with_time_constants(problem, moments)
     model = ErrorModel(options, problem.domain)
-    frame_terms: list[Term] = list(model.condition_terms)  # type: ignore[arg-type]
-    if frame_terms:
-        functions = torch.cat([term.basis(conditions) for term in frame_terms])  # type: ignore[operator]
-        symbols = [symbol for term in frame_terms for symbol in term.symbols]
-        moments = moments.with_conditions(functions.T, symbols)
+    moments = with_condition_terms(model, moments, conditions)
     if problem.known is not None and problem.known.variance:
         # Few frames may determine little: what they cannot tell starts where it is known.
         carried = problem.known.prior(problem.start(moments.columns([])))
@@ -301,6 +345,28 @@ def solve(problem: Problem, moments: ImageMoments, *, held: bool = True) -> Core
         solution=minimise(MomentObjective(moments, prior), start, solver, problem.watcher),
     )
     return hold(problem, core) if held else core
+
+
+def with_time_constants(problem: Problem, moments: ImageMoments) -> ErrorModelOptions:
+    """Return the terms with the time constants that reduce the loss most where they are open."""
+    options = problem.options.model
+    if any(term.is_open("time_constants_s") for term in options.terms):
+        start, seconds = problem.start(moments), problem.dataset.conditions(problem.frames)
+        around = minimise(MomentObjective(moments), start, problem.options.solver).parameters
+        found = time_constant(moments, around, seconds[:, CONDITIONS.index("timestamp")])
+        options = options.with_found("time_constants_s", repeat((found,)))
+    return options
+
+
+def with_condition_terms(
+    model: ErrorModel, moments: ImageMoments, conditions: Tensor
+) -> ImageMoments:
+    """Return moments with the columns of a model's condition terms, at conditions (N, C)."""
+    terms: list[Term] = list(model.condition_terms)  # type: ignore[arg-type]
+    if not terms:
+        return moments
+    functions = torch.cat([term.basis(conditions) for term in terms])  # type: ignore[operator]
+    return moments.with_conditions(functions.T, [one for term in terms for one in term.symbols])
 
 
 def _start(problem: Problem, moments: ImageMoments, model: ErrorModel) -> Parameters:

@@ -1,12 +1,12 @@
 """`tofcorr.LiveCalibration`: a calibration that grows frame by frame.
 
 A frame is kept as its moments, which hold all that the loss needs, and a lattice of its pixels,
-which gives the ranges and the noise: 70 kB in place of 2.5 MB of a VGA image. Its moments are those
-of its own ranges; a linear map takes them to the ranges of all frames. So the finished calibration
-is that of `tofcorr.train` on the same frames, in any order.
+which gives the ranges and the noise: 11 kB for ever, and 64 kB that become fewer beyond 256 frames,
+in place of 2.5 MB of a VGA image. A linear map takes moments to other ranges. So the finished
+calibration is that of `tofcorr.train` on the same frames, in any order.
 
-What `add` returns is a fit of the moments alone, on ranges that are a little wider than any frame's
-so that they seldom change, and without what the noise moves (`fit.fitting`).
+What `add` returns is a quick fit of the moments alone (`fit.fitting.fit_of_moments`), on ranges
+that are a little wider than any frame's so that they seldom change.
 """
 
 # Long: one class, told in order from a frame to what is known with it.
@@ -50,17 +50,18 @@ from tofcorr.estimation.planes import within_prior
 from tofcorr.estimation.robust import outlying_images, student_quantile
 from tofcorr.estimation.uncertainty import posterior_covariance, worst_axes
 from tofcorr.files import refuse_existing, staged_folder
-from tofcorr.fit.fitting import calibrated, estimate, fit
+from tofcorr.fit.fitting import fit, fit_of_moments, with_condition_terms
 from tofcorr.fit.problem import Fit, Problem
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
-from tofcorr.geometry.rays import plane_in_frame, planes_through
+from tofcorr.geometry.rays import plane_in_frame, planes_through, ray_directions
 from tofcorr.live.frames import (
     FRAME_FORM,
     KeptFrame,
     frame_of,
     is_of_frames,
     mapped,
+    nominal_domain,
     of_images,
     suitable,
     values_of_frame,
@@ -68,7 +69,7 @@ from tofcorr.live.frames import (
 )
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, thread_number
-from tofcorr.pixels.lattice import condition_ranges, covered_domain, joined, lattice_in
+from tofcorr.pixels.lattice import condition_ranges, covered_domain, joined, lattice_in, most_pixels
 from tofcorr.pixels.sample import usable_pixels
 from tofcorr.training.advice import Workspace, choose_views, draw_pool, predicted_precision
 from tofcorr.training.calibration import TrainingOptions
@@ -108,9 +109,14 @@ class Known:
     enough: bool = False
     fit: Fit | None = None
 
+    @property
+    def is_determined(self) -> bool:
+        """Whether the frames determine the hand-eye transform."""
+        return math.isfinite(self.translation_mm + self.rotation_deg)
+
     def __repr__(self) -> str:
         """Say in two lines what is known, and what is odd."""
-        if math.isinf(self.translation_mm + self.rotation_deg):
+        if not self.is_determined:
             known = f"{self.poses} poses: the hand-eye transform is not determined yet"
         else:
             size = f"{self.translation_mm:.2f} mm and {self.rotation_deg:.3f} degrees"
@@ -174,13 +180,17 @@ class LiveCalibration:
                 tool_from_camera=se3.nearest_rigid(guess),
             )
         self._frames: dict[int, KeptFrame] = {}
-        self._accumulator: MomentAccumulator | None = None
-        # The ranges of what `add` returns, the moments on them, and where its fit stands.
+        # What the ranges are is not part of what it holds.
+        camera, terms = self._like.camera, of_images(self.options.model)
+        domain = nominal_domain(camera.height, camera.width)
+        design = Design(ErrorModel(terms, domain), domain, ray_directions(camera))
+        self._accumulator = MomentAccumulator(design)
+        # The ranges that scale the moments of all frames.
         self._domain: Domain | None = None
-        self._sums: dict[int, Tensor] = {}
-        self._last: Parameters | None = None
+        # The last fit, of how many frames, and the planes of the walls that it found.
         self._known: Known | None = None
-        self._seen: Dataset | None = None
+        self._fitted = 0
+        self._planes: dict[str, dict[str, Any]] = {}
         if self._folder is not None:
             refuse_existing(self._folder)
             start = {"header": self._like.header.to_mapping(), "config": self.options.to_mapping()}
@@ -200,7 +210,7 @@ class LiveCalibration:
         for file in sorted(folder.glob("frame-*.pt")):
             live._read(file)
         if live._frames:
-            live._known = live._learn(max(live._frames))
+            live._learn(max(live._frames))
         return live
 
     @classmethod
@@ -225,8 +235,7 @@ class LiveCalibration:
             CalibrationDataError: The file is damaged.
         """
         with thread_number(1):
-            self._known = self._learn(self._read(file))
-        return self._known
+            return self._taught(self._read(file))
 
     def _read(self, file: Path) -> int:
         """Add the frame of a file to those that are fitted, and return its number."""
@@ -353,8 +362,7 @@ class LiveCalibration:
                 name, FRAME_FORM, {"like": like, **values_of_frame(frame)}, CalibrationDataError
             )
         self._take(number, frame)
-        self._known = self._learn(number)
-        return self._known
+        return self._taught(number)
 
     def remove(self, frame: int) -> Known | None:
         """Take a frame out again, and say what is known without it; None: it was the only one.
@@ -366,7 +374,7 @@ class LiveCalibration:
             raise CalibrationDataError(f"There is no frame {frame} to remove.")
         if self._folder is not None:
             (self._folder / f"frame-{frame:06d}.pt").unlink()
-        del self._frames[frame], self._sums[frame]
+        del self._frames[frame]
         self._known = self._learn(max(self._frames)) if self._frames else None
         return self._known
 
@@ -387,11 +395,11 @@ class LiveCalibration:
             candidates: How many poses are compared.
             seed: Of the candidates.
         """
-        dataset = self._seen
-        if self._known is None or self._known.fit is None or dataset is None:
+        if self._known is None or self._known.fit is None:
             return None
         found, random = self._known.fit, np.random.default_rng([seed, len(self)])
         lattice, frames = joined([one.lattice for one in self.frames]), np.arange(len(self))
+        dataset = self._dataset(self._order())
         wanted = [self.wanted_mm / 1e3] * 3 + [math.radians(self.wanted_deg)] * 3
         with thread_number(1):
             pool = draw_pool(
@@ -414,16 +422,17 @@ class LiveCalibration:
             CalibrationDataError: The frames do not determine it.
         """
         order = self._order()
-        dataset, frames = self._dataset([self._frames[k].row for k in order]), np.arange(len(order))
+        dataset, frames = self._dataset(order, found=False), np.arange(len(order))
         lattice = joined([self._frames[k].lattice for k in order])
-        domain = covered_domain(dataset, frames, lattice)
-        moments = concatenate([self._on(domain, self._frames[k]) for k in order])
+        domain, moments = covered_domain(dataset, frames, lattice), self._moments(dataset, order)
+        assert self._domain is not None
+        change = columns_on(of_images(self.options.model), domain, self._domain)
+        moments = replace(moments, gram=mapped(moments.gram, change))
         return fit(dataset, frames, self.options, domain, moments=moments, lattice=lattice)
 
     def state(self) -> CalibrationState:
         """Return the calibration as the numbers that a corrector is built from."""
-        rows = [self._frames[k].row for k in self._order()]
-        return calibration_state(self._dataset(rows), self.options, self.result())
+        return calibration_state(self._dataset(self._order()), self.options, self.result())
 
     def save(self, folder: Path | str) -> None:
         """Write `state.pt` and `corrector.ts` into a new folder, whole or not at all.
@@ -477,16 +486,10 @@ class LiveCalibration:
         # What is known of the frames scales the condition terms, which the sums do not hold.
         domain = replace(covered_domain(data, [0], lattice), conditions={})
         model = ErrorModel(of_images(self.options.model), domain)
-        if self._accumulator is None:
-            self._accumulator = MomentAccumulator(Design(model, domain, data.ray_directions()))
         moments = self._accumulator.on(model, domain)(batch)
         if planes == "estimated":
             row = self._on_its_wall(row, moments)
-        pose, normal = (torch.from_numpy(x)[None] for x in (row.world_from_tool, row.normal_world))
-        offset = torch.tensor([row.offset], dtype=torch.float64)
-        normal, offset = plane_in_frame(normal, offset, pose)
-        moments = replace(moments, normal_tool=normal, offset_tool=offset)
-        return KeptFrame(row, domain, moments, lattice)
+        return KeptFrame.of(row, domain, moments, lattice)
 
     def _on_its_wall(self, row: FrameRow, moments: ImageMoments) -> FrameRow:
         """Return the row with the plane where its target's wall starts: that of its first frame."""
@@ -500,76 +503,100 @@ class LiveCalibration:
         normal, offset = plane_in_frame(*plane, se3.inverse(camera))
         return replace(row, normal_world=normal.numpy(), offset=float(offset))
 
-    def _dataset(self, rows: list[FrameRow]) -> Dataset:
-        """Return the frames as a recording whose images were not kept: no pixel has a return."""
+    def _dataset(self, numbers: list[int], *, found: bool = True) -> Dataset:
+        """Return frames as a recording whose images were not kept: no pixel has a return.
+
+        Args:
+            numbers: Those of the frames.
+            found: Whether walls are where the last fit found them; else where they start.
+        """
+        planes = self._planes if found else {}
+        rows = [self._frames[k].row for k in numbers]
+        table = FrameTable.of([replace(one, **planes.get(one.target, {})) for one in rows])
         like, size = self._like, (self._like.camera.height, self._like.camera.width)
         nothing = np.broadcast_to(np.float32(np.nan), (len(rows), *size))
         amplitude = None if like.amplitude is None else nothing
-        images = {"depth": nothing, "amplitude": amplitude, "mask": None}
-        return Dataset((replace(like, frames=FrameTable.of(rows), **images),))
+        return Dataset(
+            (replace(like, frames=table, depth=nothing, amplitude=amplitude, mask=None),)
+        )
+
+    def _moments(self, dataset: Dataset, numbers: list[int]) -> ImageMoments:
+        """Return the moments of frames, which see the planes of their data set."""
+        columns = "normal_world", "offset", "world_from_tool"
+        normal, offset = plane_in_frame(*(dataset.column(name) for name in columns))
+        moments = concatenate([self._frames[k].moments for k in numbers])
+        return replace(moments, normal_tool=normal, offset_tool=offset)
 
     def _order(self) -> list[int]:
         """Return the frames' numbers in the order of their time stamps."""
         return sorted(self._frames, key=lambda k: (self._frames[k].row.timestamp, k))
 
-    def _on(self, domain: Domain, frame: KeptFrame) -> ImageMoments:
-        """Return the moments of a frame with the columns scaled to other ranges."""
-        change = columns_on(of_images(self.options.model), domain, frame.domain)
-        return replace(frame.moments, gram=mapped(frame.moments.gram, change))
-
     def _take(self, number: int, frame: KeptFrame) -> None:
         """Add a frame to those that are fitted, on ranges that hold it."""
         before, terms = self._domain, of_images(self.options.model)
         if before is None or before.joined(frame.domain) != before:
-            self._domain = wider(frame.domain if before is None else before.joined(frame.domain))
-            if before is not None:
-                change = columns_on(terms, self._domain, before)
-                self._sums = {k: mapped(gram, change) for k, gram in self._sums.items()}
-                self._last = None
+            here = wider(frame.domain if before is None else before.joined(frame.domain))
+            if self._frames and before is not None:
+                change = columns_on(terms, here, before)
+                self._frames = {k: one.on(here, change) for k, one in self._frames.items()}
+            self._domain = here
         assert self._domain is not None
-        self._frames[number] = frame
-        self._sums[number] = self._on(self._domain, frame).gram
+        change = columns_on(terms, self._domain, frame.domain)
+        self._frames[number] = frame.on(self._domain, change)
+        count = len(self._frames)
+        fewer = most_pixels(count) < most_pixels(count - 1)
+        for k in self._frames if fewer else [number]:
+            one = self._frames[k]
+            self._frames[k] = replace(one, lattice=one.lattice.thinned(count))
+
+    def _taught(self, number: int) -> Known:
+        """Say what is odd about a new frame, and what is known with it."""
+        odd, further = tuple(self._odd(number)), len(self._frames) - self._fitted
+        if self._known is not None and further < _ONE_OF * len(self._frames):
+            self._known = replace(self._known, frame=number, odd=odd, gained=0.0)
+        else:
+            self._known = replace(self._learn(number), odd=odd)
+        return self._known
 
     def _learn(self, number: int) -> Known:
         """Fit the moments of all frames, and say how well the calibration is known."""
-        order = self._order()
-        rows, here = [self._frames[k].row for k in order], self._domain
-        dataset, frames = self._dataset(rows), np.arange(len(order))
-        assert here is not None
-        poses = len(np.unique(dataset.pose_groups()))
-        moments = concatenate([self._frames[k].moments for k in order])
-        moments = replace(moments, gram=torch.cat([self._sums[k] for k in order]))
+        order, before = self._order(), self._known
+        dataset, frames = self._dataset(order), np.arange(len(order))
+        assert self._domain is not None
+        here = self._domain
         if any(is_of_frames(term) for term in self.options.model.terms):
             here = replace(here, conditions=condition_ranges(dataset.conditions()))
-            self._last = None
-        # Where few frames do not determine it, further steps of the solver tell no more.
-        few = self.options.solver.model_copy(update={"max_iterations": _MOST_STEPS})
-        options = self.options.model_copy(update={"solver": few})
-        problem = Problem(dataset, frames, options, here, resumed=self._last)
+        problem = Problem(dataset, frames, self.options, here, resumed=self._last_on(here))
+        self._fitted, self._planes = len(order), {}
+        self._known = Known(number, int(problem.poses().max()) + 1)
         try:
             with solvable(self._like.path, "fit"):
-                problem, core, covariance = estimate(problem, moments)
+                moments = self._moments(dataset, order)
+                found = fit_of_moments(problem, moments, _MOST_STEPS)
         except CalibrationDataError:  # So few frames do not determine it.
-            return Known(number, poses)
-        assert core.observability is not None
-        best = core.solution.parameters
-        self._last, self._seen = best, problem.dataset
-        found = Fit(
-            **vars(core),
-            model=calibrated(ErrorModel(core.options, here), best),
-            domain=here,
-            optimum=best,
-            hand_eye_only=best,
-            covariance=covariance,
-            walls=problem.walls,
-        )
-        return self._judged(Known(number, poses, fit=found), core.moments, order.index(number))
+            return self._known
+        self._known = self._judged(replace(self._known, fit=found), before)
+        if found.walls is not None and self._known.is_determined:
+            walls, names = found.walls.walls, [found.walls.names[k] for k in found.walls.numbers]
+            both = zip(names, walls.normal_world.numpy(), walls.offset.tolist(), strict=True)
+            self._planes = {name: {"normal_world": n, "offset": d} for name, n, d in both}
+        return self._known
 
-    def _judged(self, now: Known, moments: ImageMoments, place: int) -> Known:
-        """Return the same with intervals, gain and what is odd about one image of the moments."""
-        found, before = now.fit, self._known
+    def _last_on(self, domain: Domain) -> Parameters | None:
+        """Return where the last fit stands, for some ranges; None: it was not determined.
+
+        A fit that starts from anywhere may stay there, whatever further frames say.
+        """
+        last = None if self._known is None or not self._known.is_determined else self._known.fit
+        if last is None or last.domain == domain:
+            return last and last.optimum
+        change = columns_on(last.options, last.domain, domain)
+        return replace(last.optimum, coefficients=change.T @ last.optimum.coefficients)
+
+    def _judged(self, now: Known, before: Known | None) -> Known:
+        """Return the same with intervals, and what they gained on those before."""
+        found = now.fit
         assert found is not None
-        best = found.optimum
         # Of few poses the scatter between them may be small by chance, but not what they determine.
         expected = posterior_covariance(found.observability.precision)[:6, :6]
         both = zip(worst_axes(found.hand_eye_covariance), worst_axes(expected), strict=True)
@@ -578,63 +605,74 @@ class LiveCalibration:
         free = {name for one in found.observability.undetermined for name in one.shares}
         if free & {*HAND_EYE_SYMBOLS}:
             shift = turn = math.inf
-            # A fit that starts from anywhere may stay there, whatever further frames say.
-            self._last = None
         shift, turn, gained = 1e3 * shift, math.degrees(turn), 0.0
         if before is not None and math.isfinite(shift):
             gained = 1 - max(shift / before.translation_mm, turn / before.rotation_deg)
-        spread = 1e3 * found.covariance.matrix.diagonal().clamp(min=0).sqrt()[best.twist_size :]
+        spread = found.covariance.matrix.diagonal().clamp(min=0).sqrt()[found.optimum.twist_size :]
         return replace(
             now,
-            odd=tuple(self._odd(found, moments, place)),
             translation_mm=shift,
             rotation_deg=turn,
-            terms_mm=dict(zip(moments.symbols, spread.tolist(), strict=True)),
+            terms_mm=dict(zip(found.moments.symbols, (1e3 * spread).tolist(), strict=True)),
             weakest=found.directions[0].in_words(),
             gained=gained,
             enough=shift <= self.wanted_mm and turn <= self.wanted_deg,
         )
 
-    def _odd(self, found: Fit, moments: ImageMoments, place: int) -> list[str]:
-        """Return what is odd about an image beside the others, a sentence each."""
-        before, number, said = self._known, np.arange(len(moments.count)), []
+    def _odd(self, number: int) -> list[str]:
+        """Return what is odd about a frame, a sentence each."""
+        row, others = self._frames[number].row, [k for k in sorted(self._frames) if k != number]
+        said = self._apart([*others[-_MOST_COMPARED:], number])
+        earlier = [one for k in others if (one := self._frames[k].row).timestamp <= row.timestamp]
+        last = max(earlier, key=lambda one: one.timestamp, default=row)
+        moved = np.abs(row.world_from_tool - last.world_from_tool).max()
+        if row.timestamp - last.timestamp <= _STREAM_S and moved > STANDSTILL:
+            said.append("was taken while the robot moved: stand still for each frame.")
+        return said
+
+    def _apart(self, numbers: list[int]) -> list[str]:
+        """Return what sets the last of some frames apart from the others, a sentence each."""
+        # A wrong frame spoils the fit: it is judged by the one without it.
+        last, here = None if self._known is None else self._known.fit, self._domain
+        if last is None or here is None or len(numbers) < _ENOUGH_TO_COMPARE:
+            return []
+        here = replace(here, conditions=last.domain.conditions)
+        best = self._last_on(here)
+        if best is None:
+            return []
+        dataset, model = self._dataset(numbers), ErrorModel(last.options, here)
+        moments = self._moments(dataset, numbers)
+        moments = with_condition_terms(model, moments, dataset.conditions())
+        # Of each image's plane nothing is known, but for one ray, which shows no tilt.
+        ridge = moments.count[:, None, None] * torch.eye(3).double() / 1e9
+        within, whole = (
+            (MomentObjective(own).image_losses(best).clamp(min=0) / own.count).sqrt().numpy()
+            for own in (within_prior(moments, best, ridge), moments)
+        )
+        every, said = np.arange(len(numbers)), list[str]()
 
         def is_outlying(sizes: np.ndarray) -> bool:
-            return any(one["frame"] == place for one in outlying_images(number, sizes))
+            return any(one["frame"] == every[-1] for one in outlying_images(every, sizes))
 
-        # A wrong frame spoils the fit: it is judged by the one without it.
-        known = before is not None and math.isfinite(before.translation_mm)
-        if known and len(number) >= _ENOUGH_TO_COMPARE and before and before.fit:
-            change = columns_on(found.options, before.fit.domain, found.domain)
-            best = before.fit.optimum
-            best = replace(best, coefficients=change.T @ best.coefficients)
-            # Of each image's plane nothing is known, but for one ray, which shows no tilt.
-            ridge = moments.count[:, None, None] * torch.eye(3).double() / 1e9
-            within, whole = (
-                (MomentObjective(own).image_losses(best).clamp(min=0) / own.count).sqrt().numpy()
-                for own in (within_prior(moments, best, ridge), moments)
-            )
-            noise = np.array([one.noise for one in self.frames])
-            # Dark targets have more noise: within an image it is the unit.
-            if is_outlying(within / noise):
-                said.append(f"shows no plane: {1e3 * within[place]:.1f} mm are left within it.")
-            elif is_outlying(whole):
-                size = f"{1e3 * whole[place]:.1f} mm"
-                said.append(f"disagrees with the others by {size}: pose, plane or time?")
-            own, usual = float(moments.count[place]), float(moments.count.median())
-            if 2 * own < usual:
-                said.append(f"has {own:.0f} usable pixels, where {usual:.0f} are usual.")
-        rows = [one.row for one in self.frames][max(place - 1, 0) : place + 1]
-        if len(rows) > 1 and rows[1].timestamp - rows[0].timestamp <= _STREAM_S:
-            moved = np.abs(rows[1].world_from_tool - rows[0].world_from_tool).max()
-            if moved > STANDSTILL:
-                said.append("was taken while the robot moved: stand still for each frame.")
+        # Dark targets have more noise: within an image it is the unit.
+        if is_outlying(within / np.array([self._frames[k].noise for k in numbers])):
+            said.append(f"shows no plane: {1e3 * within[-1]:.1f} mm are left within it.")
+        elif is_outlying(whole):
+            size = f"{1e3 * whole[-1]:.1f} mm"
+            said.append(f"disagrees with the others by {size}: pose, plane or time?")
+        own, usual = float(moments.count[-1]), float(moments.count.median())
+        if 2 * own < usual:
+            said.append(f"has {own:.0f} usable pixels, where {usual:.0f} are usual.")
         return said
 
 
 # Steps of the solver for what `add` returns. Chosen: from the last fit it takes three to five.
 _MOST_STEPS = 25
-# Frames from which on one is compared with the others. Chosen: the spread of fewer is chance.
-_ENOUGH_TO_COMPARE = 8
+# Frames from which on one is compared with the others, and the most of these, the newest. Chosen:
+# the spread of fewer is chance, and more tell no more.
+_ENOUGH_TO_COMPARE, _MOST_COMPARED = 8, 99
+# Share of the frames that are new before they are fitted once more. Chosen: an interval shrinks by
+# a quarter of a percent with them, and what a frame costs does not grow with their number.
+_ONE_OF = 1 / 200
 # Time between frames of a stream, seconds: no robot moves and stands still again within it. Chosen.
 _STREAM_S = 0.2

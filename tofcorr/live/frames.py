@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,18 +25,34 @@ FRAME_FORM = "tofcorr-live-frame"
 
 @dataclass(frozen=True)
 class KeptFrame:
-    """What is kept of a frame: its row, its ranges, its moments on them, and its lattice."""
+    """What is kept of a frame.
+
+    Attributes:
+        row: What is known of it besides its images.
+        domain: The ranges that scale the columns of its moments; when it comes, its own.
+        moments: Of its pixels; their plane is nobody's.
+        lattice: Some of its pixels.
+        noise: Typical standard deviation of a distance, metres, from neighbours; 1 if unknown.
+    """
 
     row: FrameRow
     domain: Domain
     moments: ImageMoments
     lattice: Lattice
+    noise: float
 
-    @cached_property
-    def noise(self) -> float:
-        """Typical standard deviation of a distance, metres, from neighbours; 1 if unknown."""
-        between = self.lattice.difference[self.lattice.difference.isfinite()]
-        return robust_scale(between) if len(between) else 1.0
+    @classmethod
+    def of(
+        cls, row: FrameRow, domain: Domain, moments: ImageMoments, lattice: Lattice
+    ) -> "KeptFrame":
+        """Return what is kept, with the noise that the pixels show."""
+        between = lattice.difference[lattice.difference.isfinite()]
+        return cls(row, domain, moments, lattice, robust_scale(between) if len(between) else 1.0)
+
+    def on(self, domain: Domain, change: Tensor) -> "KeptFrame":
+        """Return it with other ranges, given the change of the columns (`columns_on`)."""
+        moments = replace(self.moments, gram=mapped(self.moments.gram, change))
+        return replace(self, domain=domain, moments=moments)
 
 
 def seen_from(
@@ -98,21 +113,27 @@ def suitable(options: TrainingOptions) -> TrainingOptions:
     }
     for name in [name for name, given in asked.items() if given]:
         raise ConfigError(f"{name} looks at all frames at once; train on the recording for it.")
-    near, far = Interval(1.0, 2.0), Interval(1.5, 3.0)
-    one = Domain(
-        height=4,
-        width=4,
-        radial_distance=near,
-        amplitude=near,
-        normalised_amplitude=near,
-        modulation_frequency=1e7,
-    )
-    other = replace(one, radial_distance=far, amplitude=far, normalised_amplitude=far)
+    one = nominal_domain(4, 4)
+    ranges = "radial_distance", "amplitude", "normalised_amplitude"
+    other = replace(one, **dict.fromkeys(ranges, Interval(1.5, 3.0)))
     try:
         columns_on(of_images(options.model), one, other)
     except CalibrationDataError as error:
         raise ConfigError(str(error)) from None
     return options
+
+
+def nominal_domain(height: int, width: int) -> Domain:
+    """Return ranges for an image of which nothing is known yet."""
+    one = Interval(1.0, 2.0)
+    return Domain(
+        height=height,
+        width=width,
+        radial_distance=one,
+        amplitude=one,
+        normalised_amplitude=one,
+        modulation_frequency=1e7,
+    )
 
 
 def is_of_frames(term: Any) -> bool:  # noqa: ANN401 - options of any term
@@ -162,4 +183,5 @@ def frame_of(values: dict[str, Any]) -> KeptFrame:
     """Return the frame that `values_of_frame` wrote."""
     row = {k: v.numpy() if isinstance(v, Tensor) else v for k, v in values["row"].items()}
     moments, lattice = ImageMoments(**values["moments"]), Lattice(**values["lattice"])
-    return KeptFrame(FrameRow(**row), _DOMAIN.validate_python(values["domain"]), moments, lattice)
+    domain = _DOMAIN.validate_python(values["domain"])
+    return KeptFrame.of(FrameRow(**row), domain, moments, lattice)

@@ -1,8 +1,8 @@
 """Evenly spread pixels of every frame: all that a fit reads of pixels besides their sums.
 
 They give the ranges that scale the model's variables, the noise of a distance, and what that noise
-moves. The same pixels of a frame are taken whatever the other frames are, so that a calibration
-that grows frame by frame sees what one of the finished recording sees.
+moves. Which pixels of a frame are taken depends on how many frames there are, and not on what they
+show, so that a calibration that grows frame by frame sees what one of the finished recording sees.
 """
 
 from dataclasses import dataclass, replace
@@ -27,6 +27,9 @@ from tofcorr.pixels.sample import FramePixels
 # Most pixels of a frame. Chosen: ten frames then have forty beyond each end of the ranges, which
 # leave out a thousandth, and a frame takes 64 kB in place of the 2.5 MB of a VGA image.
 _MOST = 4096
+# Most pixels of all frames together. Chosen: a thousand are then beyond each end of the ranges, and
+# they take 17 MB; up to 256 frames none is left out.
+_MOST_OF_ALL = 2**20
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,19 @@ class Lattice:
         pick = torch.as_tensor(np.asarray(chosen))
         return replace(self, **{name: getattr(self, name)[pick] for name in _IMAGES})
 
+    def thinned(self, frames: int) -> "Lattice":
+        """Return the pixels that are kept of each of so many frames.
+
+        They are among those that are kept of fewer frames, whatever these are.
+        """
+        most = most_pixels(frames)
+        if most >= len(self.place):
+            return self
+        # Multiples of the golden ratio, less their whole parts, spread numbers evenly (Knuth).
+        kept = (self.place * 2654435769 % 2**32).argsort()[:most].sort().values
+        images = {name: getattr(self, name)[:, kept] for name in _IMAGES}
+        return Lattice(place=self.place[kept], **images)
+
 
 _IMAGES = ("radial_distance", "amplitude", "difference", "brightness")
 
@@ -63,10 +79,16 @@ def joined(parts: list[Lattice]) -> Lattice:
     return replace(parts[0], **images)
 
 
+def most_pixels(frames: int) -> int:
+    """Return how many pixels are kept of each of so many frames."""
+    return _MOST_OF_ALL >> (max(frames, 1) - 1).bit_length()
+
+
 def lattice_of(dataset: Dataset, frames: Frames | None = None) -> Lattice:
     """Return the lattice of frames, in increasing order: one pass over the images."""
-    rays = dataset.ray_directions()
-    return joined([*in_threads(lambda batch: lattice_in(batch, rays), dataset.batches(frames))])
+    rays, count = dataset.ray_directions(), dataset.num_frames if frames is None else len(frames)
+    batches = dataset.batches(frames)
+    return joined([*in_threads(lambda one: lattice_in(one, rays).thinned(count), batches)])
 
 
 def lattice_in(batch: FrameBatch, rays: Rays) -> Lattice:
