@@ -1,12 +1,19 @@
 """Flying pixels are found where surfaces are mixed, and hardly anywhere else."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from correction.export.states import calibration, write
+from kinds_of_terms import DOMAIN
 from torch import Generator, Tensor
 
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.parity import probe_frames
+from tofcorr.correction.state import CalibrationState, SceneLight
+from tofcorr.errors import ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.scene_light.flying import FlyingPixels, FlyingPixelsState, squared_spreads
 
@@ -92,6 +99,47 @@ def test_pixels_of_a_slat_two_pixels_wide_are_not_flying(generator: Generator) -
     distance += NOISE_M * torch.randn(distance.shape, generator=generator)
     flying, _ = finder(false_alarm=1e-4).found(distance, torch.ones_like(distance))
     assert not flying.any()
+
+
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+@pytest.mark.parametrize("name", ["torchscript", "c", "pt2"])
+def test_an_exported_corrector_finds_what_the_float64_model_finds(
+    name: str, depth_kind: str, tmp_path: Path
+) -> None:
+    # Every export is compared with the model before it is kept, on an edge besides.
+    domain = replace(DOMAIN, width=64, height=48)
+    scene = {"flying_pixels": STATE.to_mapping()}
+    state = calibration(depth_kind=depth_kind, camera=CAMERA, domain=domain, scene=scene)
+    depth, amplitude = (one[-1] for one in probe_frames(state))
+    corrected, valid = state.corrected(depth, amplitude)
+    edge = state.model_copy(update={"scene": SceneLight()}).corrected(depth, amplitude)[1] & ~valid
+    assert edge[:, 32].all()
+    assert edge.sum() == 48
+    # Of the rows that a tenth, half and nine tenths of the farther wall share, two are certain.
+    near, far = ((corrected[:, 32] - corrected[:, k]).abs() < 0.01 for k in (31, 33))
+    kinds = torch.stack([near, far]).view(2, -1, 3)[:, 2:-2].all(dim=1)
+    assert kinds.tolist() == [[True, False, False], [False, False, True]]
+    if name == "pt2":  # What it compiles; compiling it takes long.
+        from tofcorr.correction.export.pt2 import CompilableCorrector
+
+        found = CompilableCorrector(DepthCorrector.from_state(state))(depth, amplitude)
+        expected = DepthCorrector.from_state(state)(depth, amplitude)
+        torch.testing.assert_close(found[0], expected[0], rtol=0, atol=1e-6)
+        assert torch.equal(found[1].bool(), expected[1])
+        return
+    write(name, state, tmp_path / f"corrector.{'ts' if name == 'torchscript' else 'c'}")
+
+
+def test_a_table_refuses_flying_pixels_in_words(tmp_path: Path) -> None:
+    state = calibration(scene={"flying_pixels": STATE.to_mapping()})
+    with pytest.raises(ConfigError, match="finds no flying pixels: export torchscript, pt2, onnx"):
+        write("lut", state, tmp_path / "table.npz")
+
+
+def test_a_calibration_of_before_has_none() -> None:
+    values = calibration().model_dump()
+    del values["scene"]
+    assert CalibrationState.model_validate(values).flying_pixels() is None
 
 
 def test_scripted_it_finds_the_same(generator: Generator) -> None:

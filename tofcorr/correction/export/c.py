@@ -168,7 +168,7 @@ def _filled_in(state: CalibrationState, metadata: str, name: str) -> dict[str, A
     row_error, column_error, rest = separated(model.pixel_error() + runtime.left_over)
     pieces = [pieces_of(term, limits) for term in polynomials(model)[1]]
     variables = {axis.variable for one in pieces for axis in one.axes}
-    saturation = state.saturation_amplitude
+    saturation, flying = state.saturation_amplitude, state.flying_pixels()
     if runtime.needs_amplitude and amplitudes.high < np.float32(saturation or 0.0):
         saturation = None  # The calibrated range excludes saturated pixels already.
     return {
@@ -182,13 +182,14 @@ def _filled_in(state: CalibrationState, metadata: str, name: str) -> dict[str, A
         "row_error": row_error,
         "column_error": column_error,
         "error_image": rest,
-        "z_of_radial": ray_directions(camera)[..., 2] if is_z else None,
+        "z_of_radial": ray_directions(camera)[..., 2] if is_z or flying is not None else None,
         "limits": limits,
         "is_z": is_z,
         # The clamped distance is read in float32; depth along the axis is tested in double.
         "uses_distance": not is_z or "distance" in variables or runtime.distance.degree > 0,
         "saturation": saturation,
         "reads_amplitude": runtime.needs_amplitude or saturation,
+        "flying": flying,
         "has_log": "log_amplitude" in variables or (network is not None and network.uses_amplitude),
         "runtime": runtime,
         "pieces": pieces,
@@ -201,13 +202,19 @@ def _filled_in(state: CalibrationState, metadata: str, name: str) -> dict[str, A
 
 def _probes(state: CalibrationState) -> list[tuple[int, float, float, float, bool]]:
     """Return pixels, their depth and amplitude, the depth as corrected and whether it is valid."""
-    depth, amplitude = probe_frames(state)
-    expected, valid = state.corrected(depth, amplitude)
+    frames = probe_frames(state)
     # 1 % of the pixels is of each kind of missing value: each kind is there five times.
     generator = torch.Generator().manual_seed(0)
-    chosen = torch.randperm(depth[0].numel(), generator=generator)[:512].tolist()
-    columns = (one[0].flatten()[chosen].tolist() for one in (depth, amplitude, expected, valid))
-    return list(zip(chosen, *columns, strict=True))
+    chosen = torch.randperm(frames[0][0].numel(), generator=generator)[:512]
+    if state.scene.flying_pixels is not None:
+        # Neighbours decide with it: the middle of the frame with an edge, and nothing around it.
+        row, column = ((torch.arange(size) - size // 2).abs() < 12 for size in frames[0].shape[1:])
+        chosen = (row[:, None] & column).flatten().nonzero()[:, 0]
+    alone = [torch.zeros_like(one[-1]) for one in frames]
+    for one, frame in zip(alone, frames, strict=True):
+        one.view(-1)[chosen] = frame[-1].flatten()[chosen]
+    columns = (one.flatten()[chosen].tolist() for one in (*alone, *state.corrected(*alone)))
+    return list(zip(chosen.tolist(), *columns, strict=True))
 
 
 def comment(text: str) -> str:
