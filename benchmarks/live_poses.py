@@ -74,7 +74,8 @@ class Cell:
     def poses_needed(self, way: str) -> tuple[int, float, float]:
         """Return how many poses are enough, and how far off the hand-eye then is, mm, degrees."""
         random = np.random.default_rng(self.random.bit_generator.seed_seq.entropy)  # type: ignore[attr-defined]
-        live = LiveCalibration(CAMERA, CONFIG, tool_from_camera=self.hand_eye.numpy())
+        guess = self.hand_eye.numpy()
+        live = LiveCalibration(CAMERA, CONFIG, tool_from_camera=guess, space=SPACE)
         order = random.permutation(len(self.pool.target))
         if way == "grid":
             order = np.concatenate([order[:4], self.grid()])
@@ -82,7 +83,7 @@ class Cell:
         while taken < MOST and not (known is not None and known.enough):
             pose = None
             if way == "advice" and taken >= 4:
-                pose = live.next_pose(self.is_reachable, SPACE, seed=taken)
+                pose = live.next_pose(self.is_reachable, seed=taken)
             if pose is None:
                 pose = self.pool.world_from_tool[order[taken % len(order)]].numpy()
             known, taken = self.add(live, pose, random), taken + 1

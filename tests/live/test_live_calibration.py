@@ -1,5 +1,9 @@
 """A calibration that grows frame by frame, against one of the finished recording."""
 
+import json
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +16,9 @@ import tofcorr
 from tofcorr.fit.problem import Fit
 from tofcorr.geometry import se3
 from tofcorr.live.calibration import Known, LiveCalibration
+from tofcorr.live.frames import seen_from
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.training.advice import Workspace
 
 CONFIG = {
     "name": "live",
@@ -52,8 +58,12 @@ def same(one: Fit, other: Fit, most: float = 1e-9) -> None:
     assert torch.allclose(one.covariance.matrix, other.covariance.matrix, rtol=1e-4, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_it_is_what_train_finds_whatever_the_order(wall: Dataset, seed: int) -> None:
+# With few pixels in all, lattices are thinned while frames come, and by train at once.
+@pytest.mark.parametrize(("seed", "pixels"), [(0, 2**20), (1, 2**20), (2, 2**14)])
+def test_it_is_what_train_finds_whatever_the_order(
+    wall: Dataset, seed: int, pixels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tofcorr.pixels.lattice._MOST_OF_ALL", pixels)
     live = LiveCalibration(wall.first, CONFIG)
     for k in np.random.default_rng(seed).permutation(wall.num_frames):
         add(live, wall, int(k))
@@ -64,6 +74,53 @@ def test_it_is_what_train_finds_whatever_the_order(wall: Dataset, seed: int) -> 
     assert known.fit is not None
     apart = se3.apart(known.fit.optimum.tool_from_camera, trained.fit.optimum.tool_from_camera)
     assert apart == pytest.approx((0, 0), abs=2e-4)  # What the ranges change of it.
+
+
+@pytest.fixture(scope="module")
+def long_wall(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("live") / "long"
+    return simulated_wall(folder, shots=(("white", 30), ("checkerboard", 30)))
+
+
+@pytest.mark.slow
+def test_sixty_frames_in_any_order_are_what_train_finds(long_wall: Dataset) -> None:
+    trained = tofcorr.train(long_wall.first, CONFIG).fit
+    for seed in range(5):
+        live = LiveCalibration(long_wall.first, CONFIG)
+        for k in np.random.default_rng(seed).permutation(long_wall.num_frames):
+            add(live, long_wall, int(k))
+        same(live.result(), trained)
+
+
+# A process that adds ten frames to what is there, and is killed.
+KILLED = """
+import json, os, signal, sys
+import tofcorr
+recording, folder = tofcorr.Recording.open(sys.argv[1]), sys.argv[2]
+if os.path.exists(folder):
+    live = tofcorr.LiveCalibration.resume(folder)
+else:
+    live = tofcorr.LiveCalibration(recording, json.loads(sys.argv[3]), folder=folder)
+for k in range(len(live), len(live) + 10):
+    images = recording.depth[k], recording.amplitude[k]
+    live.add_frame(recording.frames.row(k), *images, plane_is_known=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_after_every_tenth_frame_loses_nothing(
+    long_wall: Dataset, tmp_path: Path
+) -> None:
+    given = [str(long_wall.first.path), str(tmp_path / "live"), json.dumps(CONFIG)]
+    for _ in range(6):
+        ended = subprocess.run([sys.executable, "-c", KILLED, *given], check=False)
+        assert ended.returncode == -signal.SIGKILL
+    live, again = LiveCalibration(long_wall.first, CONFIG), LiveCalibration.resume(given[1])
+    for k in range(60):
+        add(live, long_wall, k)
+    assert len(again) == 60
+    same(again.result(), live.result())
 
 
 def test_walls_that_nobody_measured_are_estimated(wall: Dataset) -> None:
@@ -110,7 +167,8 @@ def test_what_was_added_is_there_after_a_crash(wall: Dataset, tmp_path: Path) ->
 
 
 def test_intervals_shrink_and_the_next_pose_is_one_that_is_reachable(wall: Dataset) -> None:
-    live = LiveCalibration(wall.first, CONFIG)
+    space = Workspace(nearest=1.0, farthest=1.1)
+    live = LiveCalibration(wall.first, CONFIG, space=space)
     assert live.next_pose() is None
     first = [add(live, wall, k) for k in range(2)]
     assert all(not one.enough and np.isinf(one.translation_mm) for one in first)
@@ -118,18 +176,27 @@ def test_intervals_shrink_and_the_next_pose_is_one_that_is_reachable(wall: Datas
     every = [add(live, wall, k) for k in range(2, wall.num_frames)]
     assert every[-1].translation_mm < every[9].translation_mm
     assert every[-1].poses == wall.num_frames
-    pose = live.next_pose()
+    pose = every[-1].next_pose()
     assert pose is not None
+    distance, tilt, _ = seen_from(pose, live.frames[-1].row, live.tool_from_camera)
+    assert space.nearest <= distance <= space.farthest
+    assert tilt <= space.tilt_deg
     assert float(np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()) < 1e-9
     assert live.next_pose(lambda pose: bool(pose[2, 3] > 1e3)) is None
     live.wanted_mm, live.wanted_deg = 1e3, 90.0
     assert add(live, wall, 0).enough
 
 
-def test_an_odd_frame_is_named(wall: Dataset) -> None:
+@pytest.mark.parametrize("share", [1 / 200, 1 / 2])
+def test_an_odd_frame_is_named_whether_or_not_it_is_fitted(
+    wall: Dataset, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tofcorr.live.calibration._ONE_OF", share)
     live = LiveCalibration(wall.first, CONFIG)
     known = [add(live, wall, k) for k in range(20)]
     assert [one for one in known if one.odd] == []
+    # Every frame from the third on is fitted; or those that double the frames: 4, 8 and 16.
+    assert len({id(one.fit) for one in known if one.fit}) == (18 if share < 1 / 20 else 3)
     row = wall.first.frames.row(20)
     depth, amplitude = (wall.first.read(x, np.array([20])) for x in ("depth", "amplitude"))
     assert depth is not None

@@ -13,7 +13,7 @@ that are a little wider than any frame's so that they seldom change.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,10 +48,12 @@ from tofcorr.estimation.moments import (
 )
 from tofcorr.estimation.planes import within_prior
 from tofcorr.estimation.robust import outlying_images, student_quantile
-from tofcorr.estimation.uncertainty import posterior_covariance, worst_axes
+from tofcorr.estimation.solvers import Solution
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance, worst_axes
 from tofcorr.files import refuse_existing, staged_folder
 from tofcorr.fit.fitting import fit, fit_of_moments, with_condition_terms
 from tofcorr.fit.problem import Fit, Problem
+from tofcorr.fit.walls import recorded_walls
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.geometry.rays import plane_in_frame, planes_through, ray_directions
@@ -75,7 +77,7 @@ from tofcorr.training.advice import Workspace, choose_views, draw_pool, predicte
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import Config, calibration_state
 
-_START = "tofcorr-live"
+_START, _FILE = "tofcorr-live", "frame-{:06d}.pt"
 START_FILE = "live.pt"
 """What a folder of a live calibration begins with."""
 
@@ -85,6 +87,7 @@ class Known:
     """How well a calibration is known, and what its newest frame has to do with it.
 
     Attributes:
+        next_pose: Chooses the next pose, as `LiveCalibration.next_pose`.
         frame: Number of the newest frame, by which `remove` takes it out.
         poses: How many poses there are.
         odd: What is odd about the newest frame, a sentence each.
@@ -98,6 +101,7 @@ class Known:
         fit: The fit of the moments; None of fewer than three poses.
     """
 
+    next_pose: Callable[..., np.ndarray | None]
     frame: int
     poses: int
     odd: tuple[str, ...] = ()
@@ -111,7 +115,7 @@ class Known:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the frames determine the hand-eye transform."""
+        """Whether the frames determine the hand-eye transform to 100 mm and 100 mrad at least."""
         return math.isfinite(self.translation_mm + self.rotation_deg)
 
     def __repr__(self) -> str:
@@ -138,6 +142,8 @@ class LiveCalibration:
         saturation_amplitude: Pixels at or above it are not used; None if unknown.
         wanted_mm: Half the 95 % interval of the translation that is enough, along its worst axis.
         wanted_deg: The same of the rotation, degrees.
+        space: Where the camera may go, turned by `roll_deg` from the frames; None: to the distances
+            and tilts of the frames so far, which takes about twice as many poses in the end.
         folder: Where every frame's sums are written as it comes, so that `resume` loses nothing;
             None: they are in memory alone.
 
@@ -148,7 +154,7 @@ class LiveCalibration:
     Example:
         live = tofcorr.LiveCalibration(camera, "e0", folder="live")
         known = live.add(depth, None, world_from_tool)
-        print(known, known.enough, live.next_pose())
+        print(known, known.enough, known.next_pose())
     """
 
     def __init__(  # noqa: PLR0913 - a camera has many numbers
@@ -162,10 +168,11 @@ class LiveCalibration:
         saturation_amplitude: float | None = None,
         wanted_mm: float = 0.5,
         wanted_deg: float = 0.05,
+        space: Workspace | None = None,
         folder: Path | str | None = None,
     ) -> None:
         self.options = suitable(resolve_options(TrainingOptions, config))
-        self.wanted_mm, self.wanted_deg = wanted_mm, wanted_deg
+        self.wanted_mm, self.wanted_deg, self.space = wanted_mm, wanted_deg, space
         self._folder = None if folder is None else Path(folder)
         if isinstance(camera, Recording):
             self._like = camera
@@ -195,6 +202,7 @@ class LiveCalibration:
             refuse_existing(self._folder)
             start = {"header": self._like.header.to_mapping(), "config": self.options.to_mapping()}
             start |= {"wanted_mm": wanted_mm, "wanted_deg": wanted_deg}
+            start |= {"space": space and asdict(space)}
             with staged_folder(self._folder) as staged:
                 save_values(staged / START_FILE, _START, start, CalibrationDataError)
 
@@ -226,7 +234,8 @@ class LiveCalibration:
             raise CalibrationDataError(f"{folder}: holds no live calibration ({START_FILE}).")
         where = str(folder / START_FILE)
         header = Header.from_mapping(start.pop("header"), where, CalibrationDataError)
-        return cls(header.recording(folder), **start)
+        space = start.pop("space")
+        return cls(header.recording(folder), space=space and Workspace(**space), **start)
 
     def take(self, file: Path) -> Known:
         """Take a frame that another process wrote, `frame-*.pt`, and say what is known with it.
@@ -260,7 +269,7 @@ class LiveCalibration:
     @property
     def tool_from_camera(self) -> np.ndarray:
         """The hand-eye transform as far as it is known, shape (4, 4)."""
-        fitted = None if self._known is None else self._known.fit
+        fitted = None if self._known is None or not self._known.is_determined else self._known.fit
         guess = self._like.tool_from_camera
         return guess if fitted is None else fitted.optimum.tool_from_camera.numpy()
 
@@ -346,23 +355,17 @@ class LiveCalibration:
         images = self._images(number, depth=depth, amplitude=amplitude, mask=mask)
         with thread_number(1):  # Threads would wait longer than they compute.
             frame = self._summed(row, images, "recorded" if plane_is_known else "estimated")
-            return self._added(number, frame)
+            if self._folder is not None:
+                like = {"planes": self._like.planes, "amplitude": self._like.amplitude}
+                file, values = self._folder / _FILE.format(number), values_of_frame(frame)
+                save_values(file, FRAME_FORM, {"like": like, **values}, CalibrationDataError)
+            self._take(number, frame)
+            return self._taught(number)
 
     @property
     def _next(self) -> int:
         """Number of the next frame."""
         return max(self._frames, default=-1) + 1
-
-    def _added(self, number: int, frame: KeptFrame) -> Known:
-        """Keep a frame, on disk first, and say what is known with it."""
-        if self._folder is not None:
-            name = self._folder / f"frame-{number:06d}.pt"
-            like = {"planes": self._like.planes, "amplitude": self._like.amplitude}
-            save_values(
-                name, FRAME_FORM, {"like": like, **values_of_frame(frame)}, CalibrationDataError
-            )
-        self._take(number, frame)
-        return self._taught(number)
 
     def remove(self, frame: int) -> Known | None:
         """Take a frame out again, and say what is known without it; None: it was the only one.
@@ -373,7 +376,7 @@ class LiveCalibration:
         if frame not in self._frames:
             raise CalibrationDataError(f"There is no frame {frame} to remove.")
         if self._folder is not None:
-            (self._folder / f"frame-{frame:06d}.pt").unlink()
+            (self._folder / _FILE.format(frame)).unlink()
         del self._frames[frame]
         self._known = self._learn(max(self._frames)) if self._frames else None
         return self._known
@@ -381,7 +384,6 @@ class LiveCalibration:
     def next_pose(
         self,
         reachable: Callable[[np.ndarray], bool] | None = None,
-        space: Workspace | None = None,
         *,
         candidates: int = 300,
         seed: int = 0,
@@ -390,8 +392,6 @@ class LiveCalibration:
 
         Args:
             reachable: Whether the robot reaches a pose (4, 4); None: it reaches every one.
-            space: Where the camera may go; None: to the distances and tilts of the frames so far,
-                which takes about twice as many poses in the end.
             candidates: How many poses are compared.
             seed: Of the candidates.
         """
@@ -400,10 +400,19 @@ class LiveCalibration:
         found, random = self._known.fit, np.random.default_rng([seed, len(self)])
         lattice, frames = joined([one.lattice for one in self.frames]), np.arange(len(self))
         dataset = self._dataset(self._order())
+        if not self._known.is_determined:
+            # Where the fit stands says nothing yet: the guess does.
+            guess = torch.from_numpy(self.tool_from_camera)
+            zero = torch.zeros_like(found.optimum.coefficients)
+            best = replace(found.optimum, tool_from_camera=guess, coefficients=zero)
+            found = replace(found, optimum=best, solution=Solution(best))
+            if found.walls is not None:
+                walls = recorded_walls(dataset, frames)
+                found = replace(found, walls=walls, moments=walls.walls.seen_by(found.moments))
         wanted = [self.wanted_mm / 1e3] * 3 + [math.radians(self.wanted_deg)] * 3
         with thread_number(1):
             pool = draw_pool(
-                dataset, frames, found, random, candidates, space, lattice, checkerboard=False
+                dataset, frames, found, random, candidates, self.space, lattice, checkerboard=False
             )
             if pool is not None and reachable is not None:
                 reached = [reachable(pose) for pose in pool.world_from_tool.numpy()]
@@ -568,7 +577,7 @@ class LiveCalibration:
             here = replace(here, conditions=condition_ranges(dataset.conditions()))
         problem = Problem(dataset, frames, self.options, here, resumed=self._last_on(here))
         self._fitted, self._planes = len(order), {}
-        self._known = Known(number, int(problem.poses().max()) + 1)
+        self._known = Known(self.next_pose, number, int(problem.poses().max()) + 1)
         try:
             with solvable(self._like.path, "fit"):
                 moments = self._moments(dataset, order)
@@ -603,7 +612,8 @@ class LiveCalibration:
         quantile = student_quantile(39 / 40, found.covariance.degrees_of_freedom)
         shift, turn = (quantile * max(pair) for pair in both)
         free = {name for one in found.observability.undetermined for name in one.shares}
-        if free & {*HAND_EYE_SYMBOLS}:
+        # No less is known of a mount that nobody has measured.
+        if free & {*HAND_EYE_SYMBOLS} or max(shift, turn) > PRIOR_SIGMA:
             shift = turn = math.inf
         shift, turn, gained = 1e3 * shift, math.degrees(turn), 0.0
         if before is not None and math.isfinite(shift):
