@@ -236,6 +236,9 @@ def check_command(run: Path, recordings: tuple[Path, ...], **given: Any) -> None
 
 _TRANSLATION = "Half the 95 % interval of the hand-eye translation that is enough, mm."
 _ROTATION = "The same of its rotation, degrees."
+_BETWEEN = (
+    "Distances to the wall between which the next pose lies, metres; else those of the frames."
+)
 
 
 @click.command()
@@ -244,6 +247,7 @@ _ROTATION = "The same of its rotation, degrees."
 @option("--port", "Of the page on this machine; 0: any free one.", default=0)
 @option("--wanted-mm", _TRANSLATION, default=0.5)
 @option("--wanted-deg", _ROTATION, default=0.05)
+@option("--distance", _BETWEEN, nargs=2, type=float, metavar="NEAR FAR")
 @option("--live", "New folder that keeps each frame's sums.", "folder", type=NewPath())
 @option("--run", "New folder for the calibration, written at the end.", type=NewPath())
 @option("--once", "Add the frames that are there, say what is known, and end.", is_flag=True)
@@ -268,8 +272,11 @@ def watch_command(
     rosbag. Ctrl-C ends it, and writes the calibration to --run.
     """
     from tofcorr.live.watch import Watched, serve, watch
+    from tofcorr.training.advice import Workspace
 
     more = {key: given.pop(key) for key in ("wanted_mm", "wanted_deg", "folder")}
+    if between := given.pop("distance"):
+        more["space"] = Workspace(nearest=between[0], farthest=between[1])
     bag = None
     if given["depth_topic"] is not None:
         from tofcorr.importing.rosbag.growing import GrowingBag

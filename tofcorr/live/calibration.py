@@ -679,8 +679,8 @@ class LiveCalibration:
 # Steps of the solver for what `add` returns. Chosen: from the last fit it takes three to five.
 _MOST_STEPS = 25
 # Frames from which on one is compared with the others, and the most of these, the newest. Chosen:
-# the spread of fewer is chance, and more tell no more.
-_ENOUGH_TO_COMPARE, _MOST_COMPARED = 8, 99
+# the spread of fewer is chance (of eight, a clean one was called odd), and more tell no more.
+_ENOUGH_TO_COMPARE, _MOST_COMPARED = 12, 99
 # Share of the frames that are new before they are fitted once more. Chosen: an interval shrinks by
 # a quarter of a percent with them, and what a frame costs does not grow with their number.
 _ONE_OF = 1 / 200
