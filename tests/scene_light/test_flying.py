@@ -163,7 +163,7 @@ def test_the_point_spread_is_measured_at_edges_of_any_direction(blur: float) -> 
         fine = across[..., None] + (torch.arange(32) + 0.5) / 32 - 0.5
         images.append(100 + 400 * torch.special.ndtr(fine / blur).mean(-1))
     amplitude = torch.stack(images)
-    found = squared_spreads(amplitude, torch.ones_like(amplitude, dtype=torch.bool))
+    found = squared_spreads(amplitude)
     assert len(found) > 500
     # Of the tails of a wide spread, the slopes beside the edge take a part.
     assert float(found.median()) ** 0.5 == pytest.approx(width, rel=0.1)

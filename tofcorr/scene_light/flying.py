@@ -269,7 +269,7 @@ class FlyingPixels(nn.Module):
         return level - (across * (column * pixels) + down * (row * pixels))
 
 
-def squared_spreads(amplitude: Tensor, valid: Tensor) -> Tensor:
+def squared_spreads(amplitude: Tensor) -> Tensor:
     """Return the squared point spread that every sharp edge of brightness shows, (M,), pixels.
 
     The differences of neighbours on a line across an edge, less the slopes of brightness on either
@@ -277,12 +277,11 @@ def squared_spreads(amplitude: Tensor, valid: Tensor) -> Tensor:
     the slope of an oblique edge.
 
     Args:
-        amplitude: Images (B, H, W).
-        valid: Where the amplitude is to be used (B, H, W).
+        amplitude: Images (B, H, W); NaN: not to be used.
     """
     found = []
-    for images, usable in ((amplitude, valid), (amplitude.mT, valid.mT)):
-        lines = torch.where(usable, images, torch.nan).unfold(-1, 2 * _REACH + 2, 1)
+    for images in (amplitude, amplitude.mT):
+        lines = images.unfold(-1, 2 * _REACH + 2, 1)
         steps = lines.diff(dim=-1)
         before, after = (steps[..., part].mean(-1) for part in (slice(2), slice(-2, None)))
         sides = [before] * _REACH + [(before + after) / 2] + [after] * _REACH
