@@ -204,7 +204,7 @@ def rendered(
     return phasor, truth.reshape(HEIGHT, WIDTH), owner.reshape(HEIGHT, WIDTH).astype(int)
 
 
-def smooth(light: np.ndarray, owner: np.ndarray) -> np.ndarray:
+def smooth(light: Any, owner: np.ndarray) -> np.ndarray:  # noqa: ANN401 - complex
     """Phasors (H, W), averaged with neighbours on the same panel: takes off the noise of paths."""
     from scipy.ndimage import gaussian_filter
 
