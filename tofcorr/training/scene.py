@@ -100,8 +100,7 @@ def shown_by(
     spreads = torch.cat([squared_spreads(one[None]) for one in amplitude])
     if len(spreads) < _EDGES:
         return None
-    # No light spreads less than over the area of a pixel.
-    spread = float(spreads.median().clamp(min=1 / 12).sqrt())
+    spread = float(spreads.median().clamp(min=0).sqrt())
     values = wanted.to_mapping() | {"point_spread_px": spread}
     finder = FlyingPixels(camera, depth_kind, FlyingPixelsState(**values, noise=(0.0, 0.0, 0.0)))
     # `fit_noise` takes differences of two pixels.
