@@ -132,7 +132,7 @@ def test_an_exported_corrector_finds_what_the_float64_model_finds(
 
 def test_a_table_refuses_flying_pixels_in_words(tmp_path: Path) -> None:
     state = calibration(scene={"flying_pixels": STATE.to_mapping()})
-    with pytest.raises(ConfigError, match="finds no flying pixels: export torchscript, pt2, onnx"):
+    with pytest.raises(ConfigError, match="no flying pixels.* export torchscript"):
         write("lut", state, tmp_path / "table.npz")
 
 
@@ -163,7 +163,7 @@ def test_the_point_spread_is_measured_at_edges_of_any_direction(blur: float) -> 
         fine = across[..., None] + (torch.arange(32) + 0.5) / 32 - 0.5
         images.append(100 + 400 * torch.special.ndtr(fine / blur).mean(-1))
     amplitude = torch.stack(images)
-    found = squared_spreads(amplitude, torch.ones_like(amplitude, dtype=torch.bool))
+    found = squared_spreads(amplitude)
     assert len(found) > 500
     # Of the tails of a wide spread, the slopes beside the edge take a part.
     assert float(found.median()) ** 0.5 == pytest.approx(width, rel=0.1)

@@ -44,10 +44,6 @@ MAJORITY = 0.75
 """Share of a pixel's area from which a surface counts as certain. Set on
 `benchmarks/scene_light/edges.py`: at 0.6 one replaced pixel in 150 gets the wrong surface, at 0.75
 one in 600."""
-_AROUND = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
-_ENOUGH = 3
-"""Neighbours of equal depth that make a surface. Along a straight edge two neighbours mix the same
-surfaces in the same shares."""
 _REACH = 5
 """Pixels on either side of an edge at which its brightness is read. Chosen: light of a camera in
 focus spreads over one."""
@@ -77,7 +73,7 @@ class FlyingPixelsState(FlyingPixelsOptions):
             neighbours on a plane, metres and the camera's units.
     """
 
-    point_spread_px: Annotated[Number, Field(gt=0, le=10)]
+    point_spread_px: Annotated[Number, Field(ge=0, le=10)]
     noise: tuple[NonNegativeNumber, NonNegativeNumber, NonNegativeNumber]
 
 
@@ -112,8 +108,8 @@ class FlyingPixels(nn.Module):
         self.noise = list(state.noise)
         self.steepest: float = STEEPEST
         self.majority: float = MAJORITY
-        self.enough: int = _ENOUGH
-        self.around = list(_AROUND)
+        beside = (-1, 0, 1)
+        self.around = [(row, column) for row in beside for column in beside if row or column]
         # As far apart as light spreads, so that no plane fits a blurred edge.
         self.spacing: int = max(1, round(state.point_spread_px))
         # Planes on either side of an edge in the pixel: their squares begin where the edge leaves
@@ -176,7 +172,7 @@ class FlyingPixels(nn.Module):
         planes = self.planes(padded, torch.full_like(padded, math.inf))
         off = inverse - self.continued(planes, inverse, 0, 1, 2 * self.spacing)
         # The variance of the plane there is 1/9 + 4/6 of a pixel's.
-        return 0.75 * off / (inverse * inverse * self.inner(self.z_of_ray))
+        return off * 3 / (4 * inverse * inverse * self.inner(self.z_of_ray))
 
     def planes(self, inverse: Tensor, variance: Tensor) -> list[Tensor]:
         """Return the planes of the squares around the pixels of images with a margin.
@@ -190,12 +186,12 @@ class FlyingPixels(nn.Module):
         level, down, down_bent = self.three(level, -2)
         across, twist, across_bent = self.three(across, -2)
         bent, bent_down, bent_twice = self.three(bent, -2)
-        misfit = (bent.square() + down_bent.square()) / 18.0 + twist.square() / 4.0
-        misfit = misfit + (bent_down.square() + across_bent.square()) / 12.0
-        misfit = misfit + bent_twice.square() / 36.0
-        pixels = 6.0 * self.spacing
-        level, across, down = level / 9.0, across / pixels, down / pixels
-        noise = self.three(self.three(variance, -1)[0], -2)[0] / 9.0
+        misfit = (bent.square() + down_bent.square()) / 18 + twist.square() / 4
+        misfit = misfit + (bent_down.square() + across_bent.square()) / 12
+        misfit = misfit + bent_twice.square() / 36
+        pixels = 6 * self.spacing
+        level, across, down = level / 9, across / pixels, down / pixels
+        noise = self.three(self.three(variance, -1)[0], -2)[0] / 9
         slope = (across * self.focal[0]).square() + (down * self.focal[1]).square()
         plane = (misfit <= self.most_misfit * noise) & (slope <= (self.steepest * level).square())
         return [torch.where(plane, level, torch.full_like(level, math.nan)), across, down, noise]
@@ -204,17 +200,19 @@ class FlyingPixels(nn.Module):
         """Return which pixels are on no plane beside them, and unlike most of their neighbours."""
         own, own_variance = self.inner(inverse), self.inner(variance)
         continued = torch.zeros_like(own, dtype=torch.bool)
+        # Along a straight edge two neighbours mix the same surfaces in the same shares: three alike
+        # are a surface.
         alike = torch.zeros_like(own)
         limit = self.threshold * self.threshold
         for row, column in self.around:
             plane = self.continued(planes, own, row, column, 2 * self.spacing)
             noise = self.beside(planes[3], own, row, column, 2 * self.spacing)
-            noise = own_variance + noise * (1.0 / 9.0 + (row * row + column * column) / 1.5)
+            noise = own_variance + noise * (2 + 12 * (row * row + column * column)) / 18
             continued = continued | ((own - plane).square() <= limit * noise)
             other = self.beside(inverse, own, row, column, self.spacing)
             noise = own_variance + self.beside(variance, own, row, column, self.spacing)
             alike = alike + ((own - other).square() <= limit * noise).to(own.dtype)
-        return (own_variance > 0) & ~continued & (alike < self.enough)
+        return (own_variance > 0) & ~continued & (alike < 3)
 
     def seen_surface(
         self, inverse: Tensor, variance: Tensor, lights: Tensor, planes: list[Tensor]
@@ -269,7 +267,7 @@ class FlyingPixels(nn.Module):
         return level - (across * (column * pixels) + down * (row * pixels))
 
 
-def squared_spreads(amplitude: Tensor, valid: Tensor) -> Tensor:
+def squared_spreads(amplitude: Tensor) -> Tensor:
     """Return the squared point spread that every sharp edge of brightness shows, (M,), pixels.
 
     The differences of neighbours on a line across an edge, less the slopes of brightness on either
@@ -277,12 +275,11 @@ def squared_spreads(amplitude: Tensor, valid: Tensor) -> Tensor:
     the slope of an oblique edge.
 
     Args:
-        amplitude: Images (B, H, W).
-        valid: Where the amplitude is to be used (B, H, W).
+        amplitude: Images (B, H, W); NaN: not to be used.
     """
     found = []
-    for images, usable in ((amplitude, valid), (amplitude.mT, valid.mT)):
-        lines = torch.where(usable, images, torch.nan).unfold(-1, 2 * _REACH + 2, 1)
+    for images in (amplitude, amplitude.mT):
+        lines = images.unfold(-1, 2 * _REACH + 2, 1)
         steps = lines.diff(dim=-1)
         before, after = (steps[..., part].mean(-1) for part in (slice(2), slice(-2, None)))
         sides = [before] * _REACH + [(before + after) / 2] + [after] * _REACH
@@ -290,7 +287,7 @@ def squared_spreads(amplitude: Tensor, valid: Tensor) -> Tensor:
         contrast = edge.sum(-1, keepdim=True)
         share, place = edge / contrast, torch.arange(-_REACH, _REACH + 1.0)
         middle = (share * place).sum(-1, keepdim=True)
-        spread = (share * (place - middle).square()).sum(-1) - 1 / 12
+        spread = (12 * (share * (place - middle).square()).sum(-1) - 1) / 12
         # By how many pixels the edge moves from line to line.
         slope = nn.functional.pad(
             (lines[..., 2:, :, :] - lines[..., :-2, :, :]).sum(-1), [0, 0, 1, 1]

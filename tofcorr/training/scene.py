@@ -4,11 +4,13 @@ import logging
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import CalibrationState, SceneLight
 from tofcorr.data.recording import valid_pixels
 from tofcorr.estimation.noise import fit_noise
+from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import thinned
@@ -58,37 +60,53 @@ def scene_light(data: Dataset, options: RuntimeOptions, state: CalibrationState)
     return SceneLight(stray_light=options.stray_light, flying_pixels=flying)
 
 
-@torch.no_grad()
 def _flying_pixels(
     data: Dataset, wanted: FlyingPixelsOptions, state: CalibrationState
 ) -> FlyingPixelsState | None:
-    """Measure point spread and noise; None, and a warning, where the recordings show none."""
+    """Measure what finding flying pixels takes; None, and a warning, where there are none."""
     data.require("amplitude", "finding flying pixels (runtime.flying_pixels)")
-    corrector, frames, spreads = DepthCorrector.from_state(state), [], []
+    corrector, frames = DepthCorrector.from_state(state), []
     for batch in data.batches(thinned(np.arange(data.num_frames), _FRAMES)):
         assert batch.amplitude is not None
-        depth, amplitude = (batch.radial_distance / corrector.radial_of_z).float(), batch.amplitude
+        depth, amplitude = batch.radial_distance / corrector.radial_of_z, batch.amplitude
         usable = valid_pixels(depth, amplitude, None, state.saturation_amplitude)
-        spreads.append(squared_spreads(amplitude, usable))
-        amplitude = amplitude.float()
-        frames.append((corrector(depth, amplitude)[0].where(usable, torch.nan), amplitude))
-    found = torch.cat(spreads)
-    if len(found) < _EDGES:
-        _LOG.warning("Flying pixels are not looked for: the recording shows no edge of brightness.")
-        return None
-    shown = FlyingPixelsState(
-        false_alarm=wanted.false_alarm,
-        point_spread_px=float(found.median().clamp(min=1 / 12).sqrt()),
-        noise=(0.0, 0.0, 0.0),
-    )
+        with torch.no_grad():
+            corrected, _ = corrector(depth.float(), amplitude.float())
+        frames.append((corrected.where(usable, torch.nan), amplitude.where(usable, torch.nan)))
     depths, amplitudes = (torch.cat(images) for images in zip(*frames, strict=True))
-    finder = FlyingPixels(state.camera, state.depth_kind, shown)
-    departures = finder.departures(depths)
-    noise = fit_noise(2**0.5 * departures.flatten(), amplitudes.flatten(), "neighbours")
-    shown = shown.model_copy(update={"noise": noise[:3]})
-    finder = FlyingPixels(state.camera, state.depth_kind, shown)
-    flying = sum(finder.found(*frame)[0].sum() for frame in frames)
-    if flying <= wanted.false_alarm * depths.isfinite().sum():
+    shown = shown_by(depths, amplitudes.float(), state.camera, state.depth_kind, wanted)
+    if shown is None:
         _LOG.warning("Flying pixels are not looked for: the recording shows none.")
-        return None
     return shown
+
+
+@torch.no_grad()
+def shown_by(
+    depth: Tensor,
+    amplitude: Tensor,
+    camera: CameraIntrinsics,
+    depth_kind: DepthKind,
+    wanted: FlyingPixelsOptions,
+) -> FlyingPixelsState | None:
+    """Measure point spread and noise of frames; None if they have no edges, or no flying pixels.
+
+    Args:
+        depth: Of the camera's kind, corrected, shape (B, H, W), metres; NaN: not to be used.
+        amplitude: The camera's units, the same shape; NaN: not to be used.
+        camera: The lateral parameters.
+        depth_kind: What depth means.
+        wanted: What was asked for.
+    """
+    spreads = torch.cat([squared_spreads(one[None]) for one in amplitude])
+    if len(spreads) < _EDGES:
+        return None
+    spread = float(spreads.median().clamp(min=0).sqrt())
+    values = wanted.to_mapping() | {"point_spread_px": spread}
+    finder = FlyingPixels(camera, depth_kind, FlyingPixelsState(**values, noise=(0.0, 0.0, 0.0)))
+    # `fit_noise` takes differences of two pixels.
+    off = torch.cat([finder.departures(one[None]) for one in depth]) * 2**0.5
+    noise = fit_noise(off.flatten(), amplitude.flatten(), "neighbours")[:3]
+    shown = FlyingPixelsState(**values, noise=noise)
+    finder = FlyingPixels(camera, depth_kind, shown)
+    flying = sum(int(finder.found(*one)[0].sum()) for one in zip(depth, amplitude, strict=True))
+    return shown if flying > wanted.false_alarm * int(depth.isfinite().sum()) else None

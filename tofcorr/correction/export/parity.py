@@ -32,9 +32,9 @@ def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
         return depth, amplitude
     share = (torch.arange(shape[2]) > shape[2] // 2).float().repeat(shape[1], 1)
     # Far from the share at which a surface is certain.
-    share[:, shape[2] // 2] = torch.tensor([0.1, 0.5, 0.9]).repeat(shape[1])[: shape[1]]
-    walls = ends[0] + (0.3 + 0.4 * share) * (ends[1] - ends[0])
-    light = torch.full_like(share, min(sum(amplitudes) / 2, 1e6))
+    share[:, shape[2] // 2] = (torch.tensor([1, 5, 9]) / 10).repeat(shape[1])[: shape[1]]
+    walls = ends[0] + (1 + share) / 3 * (ends[1] - ends[0])
+    light = torch.full_like(share, min(sum(amplitudes) / 2, 10**6))
     frames = ((depth, walls), (amplitude, light))
     depth, amplitude = (torch.cat([images, own[None]]) for images, own in frames)
     return depth, amplitude
