@@ -1,20 +1,23 @@
 """Is what changed since a calibration named, and does a bumped camera find its place again?
 
     python -m benchmarks.carry_on changes --seed S --count 40
+    python -m benchmarks.carry_on bump --seed S --count 20
     python -m benchmarks.carry_on pool --seed S --count 10
 
 `changes`: every draw has a camera and a robot of its own. It is calibrated before a measured wall
 from 30 poses; then it takes 10 frames of another wall, whose plane nobody measured, unchanged, with
 the mount bumped by 8 mm and 1 degree, with a constant of 3 to 8 mm more, and as another camera that
-is mounted elsewhere. `pool`: a camera type is known from 6 units; a new one is calibrated from few
-poses, with the type and without, and compared on held-out views. Draws are independent; shares have
-Wilson intervals.
+is mounted elsewhere. `bump`: of 80 frames after a bump some are used, drawn at random or by advice,
+each the one that the update of all expects to tell most. `pool`: a camera type is known from 6
+units; a new one is calibrated from few poses, with the type and without, and compared on held-out
+views. Draws are independent; shares have Wilson intervals.
 """
 
 import json
 import math
 import tempfile
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,10 +31,11 @@ from benchmarks.hand_eye_bias import hand_eye_error
 from benchmarks.sealed.scores import share, table
 from benchmarks.timing import write
 from tofcorr.correction.state import save_values
+from tofcorr.data.arrays import IMAGE_ARRAYS
 from tofcorr.data.recording import Recording
 from tofcorr.errors import TofcorrError
 from tofcorr.estimation.moments import MomentObjective
-from tofcorr.estimation.planes import marginal_hessian, within_prior
+from tofcorr.estimation.planes import joint_image_equations, within_prior
 from tofcorr.estimation.robust import student_quantile
 from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
@@ -39,6 +43,7 @@ from tofcorr.pixels.dataset import Dataset, PlaneChoice
 from tofcorr.pixels.passes import frame_errors
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
+from tofcorr.training.advice import choose_views
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.pool import CameraType, pool
 from tofcorr.training.run import TrainingResult, train
@@ -55,6 +60,10 @@ STATES = {
 # Of the other wall's recorded plane, which is a mere start: metres and radians.
 UNMEASURED = 0.03
 POSES = (5, 7, 10, 15, 20, 30)
+FRAMES = (10, 15, 20, 30)
+QUIET = resolve_options(
+    TrainingOptions, "ea", ("split.test_fraction=0", "advice=0", "figures=false")
+)
 
 
 def drawn_camera(rng: np.random.Generator, repeatability: float) -> Values:
@@ -108,16 +117,21 @@ def later(values: Values, state: str, rng: np.random.Generator, frames: int) -> 
     return values
 
 
+def calibrated_once(
+    rng: np.random.Generator, repeatability: float, folder: Path
+) -> tuple[Values, TrainingResult]:
+    """Draw a camera, and calibrate it; the run is in `folder / "run"`."""
+    values = drawn_camera(rng, repeatability)
+    simulate(SimulatorOptions.from_mapping(values, "drawn"), folder / "first")
+    return values, train(folder / "first", QUIET, out=folder / "run")
+
+
 def one_draw(
     number: int, seed: int, repeatability: float, frames: int, planes: PlaneChoice, folder: Path
 ) -> list[Values]:
     """Calibrate once, and update in every state; return a line for each."""
     rng = np.random.default_rng([seed, 37, number])
-    values = drawn_camera(rng, repeatability)
-    simulate(SimulatorOptions.from_mapping(values, "drawn"), folder / "first")
-    options = resolve_options(TrainingOptions, "ea", ("split.test_fraction=0", "advice=0"))
-    options = options.model_copy(update={"figures": False})
-    train(folder / "first", options, out=folder / "run")
+    values, _ = calibrated_once(rng, repeatability, folder)
     lines = []
     for state, expected in STATES.items():
         new = SimulatorOptions.from_mapping(later(values, state, rng, frames), "drawn")
@@ -157,7 +171,9 @@ def moved_planes(recording: Recording, rng: np.random.Generator) -> Recording:
     return replace(recording, frames=replace(frames, normal_world=normals, offset=offset))
 
 
-def bound(found: TrainingResult, repeatability: float) -> float:
+def bound(
+    found: TrainingResult, repeatability: float, frames: Sequence[int] | None = None
+) -> float:
     """Return the least standard error of the hand-eye's place, all axes together, mm.
 
     It is that of generalised least squares with all coefficients known, and with the variances of
@@ -166,6 +182,7 @@ def bound(found: TrainingResult, repeatability: float) -> float:
     Args:
         found: The update.
         repeatability: Of the robot, mm and mrad.
+        frames: Which of its frames; None: all.
     """
     fit = found.fit
     moments, at, walls = fit.moments, fit.optimum, fit.walls and fit.walls.walls
@@ -174,8 +191,55 @@ def bound(found: TrainingResult, repeatability: float) -> float:
     noise = alone / moments.count.sum()
     # A plane in the tool's frame turns and shifts as the tool does.
     of_poses = noise / (1e-3 * repeatability) ** 2 * each
-    known = marginal_hessian(within_prior(moments, at, of_poses), at, walls)[:6, :6] / noise
-    return 1e3 * math.sqrt(float(torch.linalg.inv(known).diagonal()[:3].sum()))
+    images = joint_image_equations(within_prior(moments, at, of_poses), at, walls).hessian / noise
+    total = (images if frames is None else images[list(frames)]).sum(dim=0)
+    # Without the coefficients: known.
+    others = torch.cat([torch.arange(6), torch.arange(at.size, len(total))])
+    covariance = torch.linalg.inv(total[others][:, others])
+    return 1e3 * math.sqrt(float(covariance.diagonal()[:3].sum()))
+
+
+def one_bump(number: int, seed: int, repeatability: float, folder: Path) -> list[Values]:
+    """Calibrate once, bump the mount, and update with some of 80 frames; a line for each choice."""
+    rng = np.random.default_rng([seed, 39, number])
+    values, first = calibrated_once(rng, repeatability, folder)
+    new = SimulatorOptions.from_mapping(later(values, "bumped", rng, 80), "drawn")
+    every = moved_planes(simulate(new, folder / "bumped"), rng)
+    old = SimulatorOptions.from_mapping(values, "drawn")
+    whole = update(folder / "run", every, planes="unknown", figures=False)
+    walls = whole.fit.walls and whole.fit.walls.walls
+    images = joint_image_equations(whole.fit.moments, whole.fit.optimum, walls).hessian
+    images = images / whole.fit.observability.variance
+    # What is known before: the coefficients, by the old calibration.
+    before, size = torch.zeros_like(images[0]), whole.fit.optimum.size
+    known = first.fit.joint_covariance[6:, 6:]
+    before[6:size, 6:size] = torch.linalg.inv(known)
+    ways = {"random": rng.permutation(len(images)).tolist()}
+    ways["advice"] = choose_views(before, images, max(FRAMES))[0]
+    chosen = [(way, order[:number]) for way, order in ways.items() for number in FRAMES]
+    results = [("first run", [], old, first), ("all", list(range(len(images))), new, whole)]
+    results += [
+        (way, own, new, update(folder / "run", some(every, own), planes="unknown", figures=False))
+        for way, own in chosen
+    ]
+    lines = []
+    for way, own, truth, found in results:
+        mount = found.fit.solution.parameters.tool_from_camera
+        shift, turn = hand_eye_error(truth.hand_eye.tool_from_camera(), mount).norm(dim=1).tolist()
+        least = bound(whole, repeatability, own) if own else math.nan
+        one = {"way": way, "frames": len(own), "off_mm": 1e3 * shift, "bound_mm": least}
+        lines.append(one | {"turned_deg": math.degrees(turn)})
+    return lines
+
+
+def some(recording: Recording, frames: list[int]) -> Recording:
+    """Return a recording of some frames."""
+    arrays = {
+        name: np.array(own)[frames]
+        for name in IMAGE_ARRAYS
+        if (own := getattr(recording, name)) is not None
+    }
+    return replace(recording, frames=recording.frames.select(frames), **arrays)
 
 
 def tables(lines: list[Values]) -> str:
@@ -238,6 +302,39 @@ def changes(seed: int, count: int, *, out: Path | None, **given: Any) -> None:  
     write(lines, out)
 
 
+@group.command("bump")
+@click.option("--seed", type=int, required=True)
+@click.option("--count", default=20, show_default=True)
+@click.option("--repeatability", default=0.1, show_default=True, help="Of the robot, mm and mrad.")
+@click.option("--out", type=click.Path(path_type=Path), help="JSON file for every update.")
+def bumps(seed: int, count: int, repeatability: float, out: Path | None) -> None:
+    """Find a bumped mount again with more and more frames, random ones and advised ones."""
+    lines: list[Values] = []
+    for number in tqdm(range(count), desc="cameras", disable=None):
+        with tempfile.TemporaryDirectory() as folder:
+            lines += one_bump(number, seed, repeatability, Path(folder))
+    rows = []
+    for way, frames in dict.fromkeys((one["way"], one["frames"]) for one in lines):
+        own = [one for one in lines if (one["way"], one["frames"]) == (way, frames)]
+        off, turned, least = (
+            np.array([one[key] for one in own]) for key in ("off_mm", "turned_deg", "bound_mm")
+        )
+        sizes = (np.median(off), math.sqrt(np.mean(off**2)), np.median(least))
+        close = share((off < 0.5) & (turned < 0.05))
+        rows.append((way, frames, len(own), *(f"{one:.2f}" for one in sizes), close))
+    head = (
+        "frames",
+        "number",
+        "draws",
+        "off, median mm",
+        "RMS",
+        "bound",
+        "0.5 mm and 0.05 deg held",
+    )
+    click.echo(table(head, rows))
+    write(lines, out)
+
+
 @group.command("pool")
 @click.option("--seed", type=int, required=True)
 @click.option("--count", default=10, show_default=True)
@@ -274,17 +371,15 @@ def one_type(
     """Calibrate units of a type, and then one more from few poses; return a line for each."""
     rng = np.random.default_rng([seed, 38, number])
     base = drawn_camera(rng, repeatability)
-    options = resolve_options(TrainingOptions, "ea", ("split.test_fraction=0", "advice=0"))
-    options = options.model_copy(update={"figures": False})
     for unit in range(units):
         recorded(another_camera(base, rng, 10.0), rng, 30, folder / f"recording_{unit}")
-        train(folder / f"recording_{unit}", options, out=folder / f"run_{unit}")
+        train(folder / f"recording_{unit}", QUIET, out=folder / f"run_{unit}")
     pool([folder / f"run_{unit}" for unit in range(units)], out=folder / "type")
     new = another_camera(base, rng, 10.0)
     # Without noise, and at the poses reported: what is left is of the calibration. What the best
     # model of these terms leaves there is no matter of poses.
     held_out = recorded(new, rng, 30, folder / "held_out", noise=False)
-    best = train(held_out, options)
+    best = train(held_out, QUIET)
     least, size = off(best, held_out), len(best.fit.optimum.coefficients)
     # A type whose units are all this one: no prior can help more.
     exact = CameraType(
@@ -300,7 +395,7 @@ def one_type(
     for poses in POSES:
         few = recorded(new, rng, poses, folder / f"few_{poses}")
         found = {
-            name: math.sqrt(max(off(train(few, options, prior=prior), held_out) ** 2 - least**2, 0))
+            name: math.sqrt(max(off(train(few, QUIET, prior=prior), held_out) ** 2 - least**2, 0))
             for name, prior in priors.items()
         }
         lines.append({"draw": number, "poses": poses, "rms_mm": found})

@@ -55,9 +55,9 @@ def drawn_camera(generator: np.random.Generator) -> dict[str, Any]:
     return values
 
 
-def problem_of(folder: Path, planes: str = "unknown") -> Problem:
+def problem_of(folder: Path, planes: str = "unknown", changes: tuple[str, ...] = ()) -> Problem:
     """Return the fit of EA to a recording, of the frames and pixels that `tofcorr rig` uses."""
-    changes = ("split.test_fraction=0", f"planes={planes}")
+    changes = ("split.test_fraction=0", f"planes={planes}", *changes)
     options = resolve_options(TrainingOptions, "ea", changes)
     data, options, _, left_out = inspected(Dataset((Recording.open(folder),)), options, force=True)
     frames, _ = halves(data, options, left_out)
@@ -70,8 +70,14 @@ def true_hand_eye(values: dict[str, Any]) -> Tensor:
     return SimulatorOptions.from_mapping(values, "drawn").hand_eye.tool_from_camera()
 
 
-def one_case(seed: int, number: int, stops: int | None) -> np.ndarray:
+def one_case(seed: int, number: int, stops: int | None, changes: tuple[str, ...]) -> np.ndarray:
     """Draw and fit two cameras; the second is used at the first so many stops, or at all.
+
+    Args:
+        seed: Of all cases.
+        number: Of this one.
+        stops: None: all.
+        changes: Of the options, `KEY=VALUE`.
 
     Returns:
         (4, 6), metres and radians: error and half-width of the transform between them, by the
@@ -83,7 +89,7 @@ def one_case(seed: int, number: int, stops: int | None) -> np.ndarray:
         front, rear = Path(folder) / "front", Path(folder) / "rear"
         simulate(first, front)
         simulate(second | {"robot_of": str(front)}, rear, num_frames=stops)
-        problems = [problem_of(front), problem_of(rear)]
+        problems = [problem_of(one, changes=changes) for one in (front, rear)]
         joint = fit_together(problems)
         alone = [fit(one.dataset, one.frames, one.options, one.domain) for one in problems]
     true = se3.inverse(true_hand_eye(first)) @ true_hand_eye(second)
@@ -203,10 +209,11 @@ _COUNT = click.option("--count", default=100, show_default=True)
 @_SEED
 @_COUNT
 @click.option("--stops", type=int, help="Stops at which the second camera is used; all by default.")
-def cameras(seed: int, count: int, stops: int | None) -> None:
+@click.option("--set", "changes", multiple=True, help="KEY=VALUE, an option of both fits.")
+def cameras(seed: int, count: int, stops: int | None, changes: tuple[str, ...]) -> None:
     """Measure the coverage of intervals and the error between two cameras."""
     numbers = tqdm(range(count), leave=False, disable=None)
-    click.echo(tables([one_case(seed, number, stops) for number in numbers]))
+    click.echo(tables([one_case(seed, number, stops, changes) for number in numbers]))
 
 
 @main.command()

@@ -144,7 +144,11 @@ def fit_together(problems: Sequence[Problem], arm: Arm | None = None) -> JointFi
         together = Together.start([_found(one) for one in cameras], planes, zero)
         undetermined = _undetermined(cameras, together, variances[0])
         chosen = tuple(k for k in joints if k not in undetermined)
-        cameras = [_with_joints(one, chosen) for one in cameras]
+        arms = [one.view.arm and replace(one.view.arm, chosen=chosen) for one in cameras]
+        cameras = [
+            replace(one, view=replace(one.view, arm=own))
+            for one, own in zip(cameras, arms, strict=True)
+        ]
         together = Together.start(together.cameras, planes, zero[: len(chosen)])
         coupled = shared is not None and len(torch.cat(shared).unique()) < sum(map(len, shared))
         if coupled or chosen:
@@ -295,13 +299,6 @@ def _shared_walls(
         shared.append(torch.tensor(own))
     both = torch.stack(planes)
     return Planes(both[:, :3], both[:, 3]), tuple(shared)
-
-
-def _with_joints(camera: _Camera, chosen: tuple[int, ...]) -> _Camera:
-    """Return a camera whose view has the offsets of some joints."""
-    arm = camera.view.arm
-    arm = None if arm is None or not chosen else replace(arm, chosen=chosen)
-    return replace(camera, view=replace(camera.view, arm=arm))
 
 
 def _undetermined(

@@ -1,9 +1,10 @@
 """Every effect of the catalogue obeys the same laws, in the simulator and in a fit."""
 
-from dataclasses import replace
+from dataclasses import inspect
 from typing import Any
 
 import pytest
+import replace
 import torch
 from simulation.effects.scenes import Scene
 from torch import Generator
@@ -75,7 +76,7 @@ def test_every_effect_says_what_it_is_where_from_and_what_to_record(name: str) -
     effect = CATALOGUE[name]
     assert effect.name == name
     assert min(map(len, (effect.summary, effect.remedy))) > 10
-    assert "\n    Source: " in str(effect.__doc__)
+    assert "\nSource: " in inspect.cleandoc(str(effect.__doc__))
     assert set(effect.contains) <= set(CATALOGUE) - {name}
 
 
