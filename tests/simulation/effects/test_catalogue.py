@@ -1,6 +1,7 @@
 """Every effect of the catalogue obeys the same laws, in the simulator and in a fit."""
 
-from dataclasses import inspect
+import inspect
+from dataclasses import replace
 from typing import Any
 
 import pytest
