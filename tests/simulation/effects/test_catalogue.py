@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-import replace
 import torch
 from simulation.effects.scenes import Scene
 from torch import Generator
