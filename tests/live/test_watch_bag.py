@@ -115,7 +115,7 @@ def test_a_bag_that_grows_ends_with_the_frames_that_an_import_of_it_gives(
     with opened(whole) as (images, options):
         prepared = PosedImport(images, options, {}).prepare(Sieve("bag"))
         frames = list(prepared.frames)
-    imported = [(row.target, row.timestamp, np.sum(mask)) for row, _, _, mask in frames]
+    imported = [(row.target, row.timestamp, np.sum(present(mask))) for row, _, _, mask in frames]
     found = present(watched.live).frames
     assert sorted(imported) == sorted(
         (x.row.target, x.row.timestamp, int(x.moments.count)) for x in found
