@@ -4,17 +4,23 @@ import json
 import shutil
 import socket
 import threading
-from collections.abc import Generator
-from contextlib import closing
+from collections.abc import Callable, Generator
+from contextlib import closing, suppress
+from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from optional import present
 from simulated_walls import simulated_wall
 
 import tofcorr
+from tofcorr.data.recording import Recording
+from tofcorr.data.writing import RecordingWriter
+from tofcorr.files import being_written
 from tofcorr.live.calibration import LiveCalibration
 from tofcorr.live.watch import Watched, serve, watch
 
@@ -126,6 +132,109 @@ def test_a_damaged_frame_is_named_and_skipped(growing: Growing) -> None:
     assert watched.page.state["frames"] == 2
     assert len(watched.page.said) == 1
     assert watched.page.said[0].startswith("Frame 1 was skipped: frames.csv: frame 1, column")
+
+
+def test_columns_are_known_by_their_names(growing: Growing) -> None:
+    order = np.random.default_rng(1).permutation(len(growing.head.split(",")))
+
+    def shuffled(line: str) -> str:
+        return ",".join(np.array(line.split(","))[order])
+
+    for _ in range(2):
+        growing.grow()
+    same = Watched(growing.folder)
+    same.poll()
+    rows = "\n".join(map(shuffled, [growing.head, *growing.rows[:2]]))
+    (growing.folder / "frames.csv").write_text(rows + "\n")
+    other = Watched(growing.folder)
+    assert other.poll() == 2
+    assert other.page.said == []
+    for one, two in zip(present(same.live).frames, present(other.live).frames, strict=True):
+        np.testing.assert_array_equal(one.row.world_from_tool, two.row.world_from_tool)
+        torch.testing.assert_close(one.moments.gram, two.moments.gram)
+    growing.append("frames.csv", f"{shuffled(growing.rows[1])}\n".encode())
+    for name, image in growing.images.items():
+        growing.append(f"{name}.npy", image[2].tobytes())
+    assert other.poll() == 1
+    assert (
+        "frame 2, column 'frame': expected 2 (counting up from zero), got '1'" in other.page.said[0]
+    )
+
+
+def writer_of(whole: Path, folder: Path) -> tuple[RecordingWriter, Callable[[int], None]]:
+    """Begin a recording; return the writer, and what appends a frame of another recording."""
+    one = Recording.open(whole)
+    names = ("camera", "depth_kind", "modulation_frequency", "tool_from_camera", "planes")
+    writer = RecordingWriter(folder, **{name: getattr(one, name) for name in names})
+
+    def append(k: int) -> None:
+        assert one.amplitude is not None
+        row = one.frames.row(k)
+        row = replace(row, integration_time=5e-4 if k else None)  # A column that comes later.
+        writer.append(one.depth[k], row=row, amplitude=one.amplitude[k])
+
+    return writer, append
+
+
+def test_what_tofcorr_writes_is_seen_before_it_is_there(whole: Path, tmp_path: Path) -> None:
+    watched = Watched(tmp_path / "wall")
+    assert watched.poll() == 0
+    assert watched.note == f"Nothing is at {tmp_path / 'wall'} yet."
+    writer, append = writer_of(whole, tmp_path / "wall")
+    with writer:
+        assert watched.poll() == 0
+        for k in range(2):
+            append(k)
+            assert watched.poll() == 1
+            assert watched.page.state["frames"] == k + 1
+        assert watched.note == ""
+        assert not (tmp_path / "wall").exists()
+        (hidden,) = tmp_path.iterdir()
+        with pytest.raises(tofcorr.CalibrationDataError, match="stand behind the array"):
+            Recording.open(hidden)
+        append(2)
+    assert watched.poll() == 1
+    assert watched.note == "The recording is complete."
+    rows = [one.row for one in present(watched.live).frames]
+    assert [row.integration_time for row in rows] == [None, 5e-4, 5e-4]
+    assert watched.page.said == []
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_writer_that_stops_before_the_end_is_said(
+    killed: bool, whole: Path, tmp_path: Path
+) -> None:
+    place = tmp_path / "wall"
+    watched = Watched(place)
+    writer, append = writer_of(whole, place)
+    hidden = tmp_path
+    with suppress(KeyboardInterrupt), writer:
+        append(0)
+        assert watched.poll() == 1
+        (hidden,) = tmp_path.iterdir()
+        if killed:  # Nobody holds the folder of a killed writer any more.
+            shutil.copytree(hidden, tmp_path / "left")
+        raise KeyboardInterrupt
+    if killed:
+        (tmp_path / "left").rename(hidden)
+    assert watched.poll() == 0
+    assert "has ended, and has kept no recording" in watched.page.state["note"]
+    assert being_written(place, "frames.csv") is None
+    assert watched.page.state["frames"] == 1
+
+
+def test_the_state_of_the_page_does_not_grow(whole: Path) -> None:
+    watched = Watched(whole)
+    watched.poll()
+    page, live = watched.page, present(watched.live)
+    known, sizes = present(live.known), list[int]()
+    for count in (300, 2000):
+        for _ in range(count):
+            page.add(replace(known, odd=("is odd.",)), np.ones((480, 640)))
+        page.publish(live)
+        sizes.append(len(json.dumps(page.state)))
+    assert sizes[1] < 1.5 * sizes[0]
+    assert sum(page.state["cover"]["distance"]["count"]) == len(live)
 
 
 def test_only_this_machine_is_answered(growing: Growing) -> None:

@@ -88,7 +88,8 @@ class PosedImport:
     Args:
         source: Images and poses.
         options: How to pair, choose and look for walls.
-        planes: As of `ImagesOfPlanes`.
+        planes: As of `ImagesOfPlanes`, where this import is one of many of a source that grows: no
+            mistake is then searched for.
     """
 
     def __init__(
@@ -97,7 +98,7 @@ class PosedImport:
         options: PosedOptions,
         planes: dict[str, list[ImagePlane]] | None = None,
     ) -> None:
-        self._source, self._options = source, options
+        self._source, self._options, self._searches = source, options, planes is None
         self._times = None if source.times is None else source.times + options.time_offset_s
         self._track = source.track
         if options.eye_to_hand:
@@ -239,7 +240,7 @@ class PosedImport:
         """
         origin, most = self._source.origin, FoundWalls.SUSPICIOUS_MM
         before = FoundWalls.OFF_WALL_MM if given is None else given.misfit_mm
-        if before <= most or self._source.targets is not None:
+        if before <= most or self._source.targets is not None or not self._searches:
             return []
         left = {}
         for said, misfit, unit in self._mistakes_undone(chosen):

@@ -53,10 +53,11 @@ class Calibrating:
         folder: Keeps each frame's sums; where it exists, the calibration goes on. Empty: none.
         model: File that gets the corrector whenever the calibration is enough. Empty: none.
         page: Shows what is known.
-        wanted: What else `LiveCalibration` takes: `wanted_mm`, `wanted_deg`.
+        wanted_mm: As of `LiveCalibration`.
+        wanted_deg: As of `LiveCalibration`.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what ROS calls parameters
         self,
         camera: CameraIntrinsics,
         frames: FrameNames,
@@ -67,7 +68,8 @@ class Calibrating:
         folder: str,
         model: str,
         page: LivePage,
-        **wanted: float,
+        wanted_mm: float,
+        wanted_deg: float,
     ) -> None:
         self.camera, self.page, self._model = camera, page, model
         self._rays, self._depth_kind = ray_directions(camera), depth_kind
@@ -82,7 +84,9 @@ class Calibrating:
                 planes="estimated",
                 frame_names=frames,
             )
-            self.live = tofcorr.LiveCalibration(like, config, folder=folder or None, **wanted)
+            self.live = tofcorr.LiveCalibration(
+                like, config, folder=folder or None, wanted_mm=wanted_mm, wanted_deg=wanted_deg
+            )
         page.publish(self.live)
 
     def take(

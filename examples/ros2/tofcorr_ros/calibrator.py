@@ -3,6 +3,8 @@
 Needs tofcorr. What it does stands in `calibrating`; here is only what ROS asks for.
 """
 
+from typing import Any
+
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
@@ -47,7 +49,7 @@ class Calibrator(Node):
     def __init__(self) -> None:
         super().__init__("live_calibrator")
 
-        def parameter(name: str, default: object) -> object:
+        def parameter(name: str, default: object) -> Any:  # noqa: ANN401
             return self.declare_parameter(name, default).value
 
         self.options = {name: parameter(name, default) for name, default in PARAMETERS.items()}
@@ -96,7 +98,7 @@ class Calibrator(Node):
             if not self.stops.takes(time, pose):
                 return
             if self.calibrating is None:
-                self.begin(depth.header.frame_id)
+                self.calibrating = self.begin(depth.header.frame_id, self.info)
             light = None if infrared is None else amplitude_from_image(infrared)
             known = self.calibrating.take(depth_from_image(depth), light, pose, time)
         except (TofcorrError, TransformException, ValueError) as error:
@@ -109,14 +111,13 @@ class Calibrator(Node):
         if wanted is not None:
             self.next_pose.publish(self.stamped(wanted, depth))
 
-    def begin(self, camera: str) -> None:
+    def begin(self, camera: str, info: CameraInfo) -> Calibrating:
         """Begin the calibration; tf may hold where the camera roughly is on the tool."""
         try:
             guess = self.transform(self.tool, camera)
         except TransformException:
             guess = np.eye(4)
-        info = self.info
-        self.calibrating = Calibrating(
+        return Calibrating(
             intrinsics(info.k, info.d, info.distortion_model, info.width, info.height),
             FrameNames(world=self.base, tool=self.tool, camera=camera or "camera"),
             tool_from_camera=guess,

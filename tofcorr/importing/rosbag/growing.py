@@ -97,7 +97,7 @@ class GrowingBag:
         opened: Callable[[], AbstractContextManager[tuple[RobotImages, PosedOptions]]],
     ) -> None:
         self.path, self.whole, self._opened = path, False, opened
-        self._size, self._rests_until = 0, 0.0
+        self._size, self._rests_until = -1, 0.0
         self._planes: dict[str, list[ImagePlane]] = {}
 
     @contextmanager
@@ -107,8 +107,8 @@ class GrowingBag:
         Raises:
             CalibrationDataError: What is there so far cannot be imported; the message says why.
         """
-        began, files = time.monotonic(), self.path.rglob("*") if self.path.is_dir() else [self.path]
-        size = sum(file.stat().st_size for file in files)
+        began, files = time.monotonic(), [self.path, *self.path.rglob("*")]
+        size = sum(file.stat().st_size for file in files if file.is_file())
         if began < self._rests_until or size == self._size:
             yield None
             return
