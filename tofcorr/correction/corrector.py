@@ -17,6 +17,7 @@ from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.error_terms.signal_terms import unscale
 from tofcorr.geometry.se3 import transformed
+from tofcorr.scene_light.bounces import SecondBounces
 from tofcorr.scene_light.flying import FlyingPixels
 from tofcorr.scene_light.stray import StrayLight
 
@@ -45,6 +46,8 @@ class DepthCorrector(nn.Module):
       does not, amplitudes only matter for saturation.
     * A residual network fades to zero outside the calibrated range.
     * Stray light of the camera's own is taken back first, where the calibration knows it.
+    * Second bounces of light are removed after the camera's own error, where the calibration has
+      their gain.
     * A flying pixel is not valid, where the calibration has these found. Where one surface is
       certain, its depth is given.
     * Frames are taken to have the mean conditions (time, integration time, temperature) of the
@@ -92,6 +95,7 @@ class DepthCorrector(nn.Module):
         self.conditions_inside: bool = True
         self.uncertainty = RuntimeSigma(state, error, limits)
         self.stray: StrayLight | None = state.stray_light()
+        self.bounces: SecondBounces | None = state.second_bounces()
         self.flying: FlyingPixels | None = state.flying_pixels()
         scale = geometry.radial_of_depth if self.is_z else geometry.radial_of_depth[:1, :1]
         points = geometry.points(torch.ones_like(geometry.radial_of_depth))
@@ -124,6 +128,8 @@ class DepthCorrector(nn.Module):
             self.correct(depth, amplitude, self.error.offset, 0, corrected, valid)
         if not self.conditions_inside:
             valid.zero_()
+        if self.bounces is not None:
+            corrected = self.bounces(corrected * self.radial_of_z, amplitude) / self.radial_of_z
         if self.flying is not None:
             return self.flying(corrected, amplitude, valid)
         return corrected, valid

@@ -28,6 +28,7 @@ from tofcorr.options import (
     one_line,
     refused_in_words,
 )
+from tofcorr.scene_light.bounces import SecondBounces, SecondBouncesState
 from tofcorr.scene_light.flying import FlyingPixels, FlyingPixelsState
 from tofcorr.scene_light.stray import StrayLight, StrayLightState
 from tofcorr.version import __version__
@@ -97,9 +98,11 @@ class SceneLight(Options):
         stray_light: Light that lens and sensor send to the wrong pixel, taken back before anything
             else; None: it is left.
         flying_pixels: Pixels that mix two surfaces; None: they are not looked for.
+        second_bounces: Light that comes by further surfaces; None: it is left in.
     """
 
     stray_light: StrayLightState | None = None
+    second_bounces: SecondBouncesState | None = None
     flying_pixels: FlyingPixelsState | None = None
 
 
@@ -237,11 +240,13 @@ class CalibrationState(CalibrationExtras, Setting):
         """Correct frames (..., H, W) in float64: return corrected depth and where it is valid."""
         reference, frames = self.correction(), (depth.double(), amplitude.double())
         flying, stray = self.flying_pixels(), self.stray_light()
+        bounces, scale = self.second_bounces(), reference.geometry.radial_of_depth
         if stray is not None:
-            scale = reference.geometry.radial_of_depth
             radial, light = stray.double()(frames[0] * scale, frames[1])
             frames = radial / scale, light
         corrected, valid = reference(*frames), reference.valid(*frames)
+        if bounces is not None:
+            corrected = bounces.double()(corrected * scale, frames[1]) / scale
         if flying is None:
             return corrected, valid
         return flying.double()(corrected, frames[1], valid)
@@ -250,6 +255,11 @@ class CalibrationState(CalibrationExtras, Setting):
         """Build what takes stray light back; None: it is left."""
         wanted = self.scene.stray_light
         return wanted and StrayLight(self.camera, wanted)
+
+    def second_bounces(self) -> SecondBounces | None:
+        """Build what removes second bounces of light; None: it is not asked for."""
+        wanted = self.scene.second_bounces
+        return wanted and SecondBounces(self.camera, wanted)
 
     def flying_pixels(self) -> FlyingPixels | None:
         """Build what finds flying pixels; None: it is not asked for."""

@@ -17,6 +17,7 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.noise import NoiseModel
 from tofcorr.files import write_text
+from tofcorr.scene_light.bounces import SecondBounces
 from tofcorr.sensor.scene import Eye, Group, ImageEffects, SceneFrames, conditions_of
 from tofcorr.sensor.sensor_file import ErrorSection, SensorFile, read_sensor, sensor_text
 
@@ -189,6 +190,18 @@ class Measurement(NamedTuple):
     valid: Tensor
 
 
+def _with_second_bounces(frames: SceneFrames, bounces: SecondBounces) -> SceneFrames:
+    """Return frames as the light of all bounces shows them; the surfaces stay."""
+    seen = torch.where(frames.seen, frames.distance, torch.nan)
+    found = [bounces.added(*frame) for frame in zip(seen, frames.amplitude, strict=True)]
+    distance, amplitude = (torch.stack(images) for images in zip(*found, strict=True))
+    return replace(
+        frames,
+        distance=torch.where(frames.seen, distance, frames.distance),
+        amplitude=torch.where(frames.seen, amplitude, frames.amplitude),
+    )
+
+
 class SensorModel(DescribedModule):
     r"""Turns true depth of any scene into what one camera measures.
 
@@ -210,6 +223,7 @@ class SensorModel(DescribedModule):
     Attributes:
         base: Constant and error terms.
         effects: Effects beyond them.
+        bounces: What adds second bounces of light; None: nothing does.
         noise: None if unknown.
         dropouts: None if unknown.
         left_out: Effects that no depth image can show, and why, a sentence each.
@@ -240,7 +254,8 @@ class SensorModel(DescribedModule):
         self.effects = ImageEffects(camera, sensor.effects, sensor.modulation_frequency_hz)
         size = (camera.height, camera.width)
         self.noise = None if sensor.noise is None else SensorNoise(sensor.noise, size)
-        self.dropouts = sensor.dropouts
+        self.dropouts, bounces = sensor.dropouts, sensor.second_bounces
+        self.bounces = None if bounces is None else SecondBounces(camera, bounces)
         self._ranges = self.base.domain.conditions
         self._said: set[str] = set()
         self.to(dtype)
@@ -323,7 +338,10 @@ class SensorModel(DescribedModule):
         )
         parts = (self.base, self.effects, self.noise, self.dropouts)
         needed = any(part.needs_amplitude for part in parts if part is not None)
+        needed = needed or self.bounces is not None
         frames = self.eye(true_depth, amplitude, reflectivity, known, needs_amplitude=needed)
+        if self.bounces is not None:
+            frames = _with_second_bounces(frames, self.bounces)
         radial = self._expected(frames, frame_shift)
         reported = frames.amplitude
         if noise and self.noise is not None:

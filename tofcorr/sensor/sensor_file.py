@@ -27,6 +27,7 @@ from tofcorr.options import (
     resolve_options,
     shipped_names,
 )
+from tofcorr.scene_light.bounces import SecondBouncesState
 from tofcorr.simulation.options import CameraOptions
 from tofcorr.simulation.scene import UniformTarget
 
@@ -125,6 +126,7 @@ class SensorFile(Options):
         dropouts: Null: unknown, every pixel gives a distance.
         light: Null: unknown; scenes then need amplitudes, where anything depends on them.
         validity: The ranges of what was measured.
+        second_bounces: Light by further surfaces, added to what a scene returns; null: none.
     """
 
     config_folder: ClassVar[str] = "sensor"
@@ -144,6 +146,7 @@ class SensorFile(Options):
     dropouts: DropoutModel | None = None
     light: LightSection | None = None
     validity: ValiditySection
+    second_bounces: SecondBouncesState | None = None
 
     def intrinsics(self) -> CameraIntrinsics:
         """Return the camera."""

@@ -1,6 +1,7 @@
 """What a corrector removes of the scene's light: what that takes, measured from a recording."""
 
 import logging
+import math
 
 import numpy as np
 import torch
@@ -9,17 +10,25 @@ from torch import Tensor
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import CalibrationState, SceneLight
 from tofcorr.data.recording import valid_pixels
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import fit_noise
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
-from tofcorr.options import Options
+from tofcorr.options import Options, PositiveNumber
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import thinned
+from tofcorr.scene_light.bounces import (
+    Frequencies,
+    SecondBounces,
+    SecondBouncesOptions,
+    SecondBouncesState,
+)
 from tofcorr.scene_light.flying import (
     FlyingPixels,
     FlyingPixelsOptions,
     FlyingPixelsState,
     squared_spreads,
 )
+from tofcorr.scene_light.gain import fit_gain
 from tofcorr.scene_light.stray import StrayLightState
 
 _LOG = logging.getLogger(__name__)
@@ -31,6 +40,19 @@ _EDGES = 30
 """Fewest edges from which the point spread is known. Chosen: their median is then known to 5 %."""
 
 
+class SecondBouncesWanted(SecondBouncesOptions):
+    """What is to be removed.
+
+    Attributes:
+        frequencies_hz: Modulation frequencies; null: that of the recording.
+        gain: One over pi times the amplitude of white paper at 1 m; null: found from the curvature
+            that second bounces give to walls.
+    """
+
+    frequencies_hz: Frequencies | None = None
+    gain: PositiveNumber | None = None
+
+
 class RuntimeOptions(Options):
     """What the corrector does in a frame besides correcting every pixel; null: nothing.
 
@@ -38,8 +60,10 @@ class RuntimeOptions(Options):
         stray_light: Take this stray light back, before the fit as well. `tofcorr train --with` has
             it from a diagnosis.
         flying_pixels: Find pixels that mix two surfaces.
+        second_bounces: Remove light that comes by further surfaces.
     """
 
+    second_bounces: SecondBouncesWanted | None = None
     stray_light: StrayLightState | None = None
     flying_pixels: FlyingPixelsOptions | None = None
 
@@ -57,7 +81,39 @@ def scene_light(data: Dataset, options: RuntimeOptions, state: CalibrationState)
     """
     wanted = options.flying_pixels
     flying = wanted and _flying_pixels(data, wanted, state)
-    return SceneLight(stray_light=options.stray_light, flying_pixels=flying)
+    bounces = options.second_bounces and _second_bounces(data, options.second_bounces, state)
+    return SceneLight(stray_light=options.stray_light, flying_pixels=flying, second_bounces=bounces)
+
+
+def _second_bounces(
+    data: Dataset, wanted: SecondBouncesWanted, state: CalibrationState
+) -> SecondBouncesState:
+    """Return what removing second bounces takes, with the gain found where none is given."""
+    data.require("amplitude", "removing second bounces (runtime.second_bounces)")
+    frequency, values = data.first.modulation_frequency, wanted.to_mapping()
+    if wanted.frequencies_hz is None and frequency is None:
+        said = "Second bounces need the modulation frequency, which the recording does not state"
+        raise CalibrationDataError(f"{said}: set runtime.second_bounces.frequencies_hz.")
+    values["frequencies_hz"] = wanted.frequencies_hz or (frequency,)
+    if wanted.gain is not None:
+        return SecondBouncesState.model_validate(values)
+    frames = [
+        (depth * DepthCorrector.from_state(state).radial_of_z, light)
+        for depth, light in zip(*_corrected(data, state), strict=True)
+    ]
+    # Half white, seen straight on, to begin with.
+    bright = torch.cat([(d.square() * a).flatten() for d, a in frames]).nanmedian()
+    values["gain"] = 1 / (2 * math.pi * float(bright))
+    bounces = SecondBounces(state.camera, SecondBouncesState.model_validate(values))
+    terms = state.correction().error_model.signal_terms
+
+    def functions(distance: Tensor, amplitude: Tensor) -> Tensor:
+        found = [distance[None], *(term.basis(distance, amplitude) for term in terms)]  # type: ignore[operator]
+        return torch.cat(found)
+
+    fit = fit_gain(bounces, frames, functions)
+    values |= {"gain": fit.gain, "gain_interval": fit.interval}
+    return SecondBouncesState.model_validate(values)
 
 
 def _flying_pixels(
@@ -65,6 +121,15 @@ def _flying_pixels(
 ) -> FlyingPixelsState | None:
     """Measure what finding flying pixels takes; None, and a warning, where there are none."""
     data.require("amplitude", "finding flying pixels (runtime.flying_pixels)")
+    depths, amplitudes = _corrected(data, state)
+    shown = shown_by(depths, amplitudes.float(), state.camera, state.depth_kind, wanted)
+    if shown is None:
+        _LOG.warning("Flying pixels are not looked for: the recording shows none.")
+    return shown
+
+
+def _corrected(data: Dataset, state: CalibrationState) -> tuple[Tensor, Tensor]:
+    """Return depth, corrected, and amplitude of some frames (B, H, W); NaN where not usable."""
     corrector, frames = DepthCorrector.from_state(state), []
     for batch in data.batches(thinned(np.arange(data.num_frames), _FRAMES)):
         assert batch.amplitude is not None
@@ -74,10 +139,7 @@ def _flying_pixels(
             corrected, _ = corrector(depth.float(), amplitude.float())
         frames.append((corrected.where(usable, torch.nan), amplitude.where(usable, torch.nan)))
     depths, amplitudes = (torch.cat(images) for images in zip(*frames, strict=True))
-    shown = shown_by(depths, amplitudes.float(), state.camera, state.depth_kind, wanted)
-    if shown is None:
-        _LOG.warning("Flying pixels are not looked for: the recording shows none.")
-    return shown
+    return depths, amplitudes
 
 
 @torch.no_grad()

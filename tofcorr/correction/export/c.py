@@ -21,7 +21,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector, RuntimeErrorModel, polynomials, separated
-from tofcorr.correction.export.parity import Correct, probe_frames, require_parity
+from tofcorr.correction.export.parity import (
+    Correct,
+    probe_frames,
+    refuse_second_bounces,
+    require_parity,
+)
 from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING, Axis, Domain, SignalTerm
@@ -50,6 +55,7 @@ def export_c(corrector: DepthCorrector, path: Path | str, reference: Calibration
     """
     if reference.scene.stray_light is not None:
         raise ConfigError("C takes no stray light back: export torchscript, pt2 or onnx.")
+    refuse_second_bounces(reference)
     path = Path(path)
     name = c_name(path.stem)
     if path.suffix != ".c" or name != path.stem:

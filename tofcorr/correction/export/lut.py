@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.parity import require_parity
+from tofcorr.correction.export.parity import refuse_second_bounces, require_parity
 from tofcorr.correction.loaded import LoadedCorrector
 from tofcorr.correction.lookup import FORMAT, digest_of, interpolate, read_lut
 from tofcorr.correction.state import CalibrationState, SceneLight
@@ -37,6 +37,7 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
             table can hold either.
         ExportError: The table differs from the model by more than `TOLERANCE`; nothing is written.
     """
+    refuse_second_bounces(reference)
     if reference.scene != SceneLight():
         said = "A look-up table corrects every pixel alone: no flying pixels, no stray light"
         raise ConfigError(f"{said}: export torchscript, pt2, onnx or c.")

@@ -1,0 +1,241 @@
+"""Second bounces of light are as an integral over the scene has them, and are removed again."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from correction.export.states import calibration, write
+from kinds_of_terms import DOMAIN
+from torch import Generator, Tensor
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.state import CalibrationState, SceneLight
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
+from tofcorr.scene_light.bounces import SecondBounces, SecondBouncesState
+from tofcorr.scene_light.gain import fit_gain
+from tofcorr.sensor.model import SensorModel
+from tofcorr.sensor.sensor_file import SensorFile
+
+FREQUENCY, GAIN = 20e6, 1 / 500
+CAMERA = CameraIntrinsics(
+    width=32, height=24, matrix=((26.0, 0, 15.5), (0, 26.0, 11.5), (0, 0, 1.0))
+)
+STATE = SecondBouncesState(frequencies_hz=(FREQUENCY,), gain=GAIN, patch_px=2)
+LEFT, RIGHT = (0.7071068, 0.0, -0.7071068), (-0.7071068, 0.0, -0.7071068)
+"""Normals of the sides of a corner, upright, that opens towards the camera."""
+
+
+def bounces(**changed: object) -> SecondBounces:
+    return SecondBounces(CAMERA, STATE.model_copy(update=changed)).double()
+
+
+def walls(*planes: tuple[tuple[float, float, float], float]) -> tuple[Tensor, Tensor]:
+    """The nearest of planes n . x + d = 0 along each ray, and its light at a reflectivity of pi."""
+    rays, near, light = ray_directions(CAMERA), torch.tensor(math.inf), torch.tensor(0.0)
+    for normal, offset in planes:
+        cosine = -(rays @ torch.tensor(normal, dtype=torch.float64))
+        distance = torch.where(cosine > 0, offset / cosine, math.inf)
+        light = torch.where(distance < near, cosine / distance**2 / GAIN, light)
+        near = torch.minimum(near, distance)
+    return near, 0.5 * light / math.pi
+
+
+CORNER = walls((LEFT, 1.3), (RIGHT, 1.1))
+
+
+def integral(pixel: tuple[int, int]) -> complex:
+    """One bounce at a pixel of the corner over its direct light: a sum over fine patches."""
+    step = 8
+    rows, columns = np.mgrid[: 24 * step, : 32 * step] / step + (0.5 / step - 0.5)
+
+    def seen(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        slope = np.stack([(x - 15.5) / 26, (y - 11.5) / 26, np.ones_like(x)], axis=-1)
+        at = [
+            slope * (offset / -(slope @ n))[..., None] for n, offset in ((LEFT, 1.3), (RIGHT, 1.1))
+        ]
+        left = at[0][..., 2] < at[1][..., 2]
+        return (
+            slope,
+            np.where(left[..., None], at[0], at[1]),
+            np.where(left[..., None], LEFT, RIGHT),
+        )
+
+    slope, at, normal = seen(columns, rows)
+    _, here, up = (one[0] for one in seen(np.array([float(pixel[1])]), np.array([float(pixel[0])])))
+    away, own = np.linalg.norm(at, axis=-1), np.linalg.norm(here)
+    # A patch of the plane z = 1 has an area of z^2 n_z / (n . ray) on a plane.
+    area = at[..., 2] ** 2 / -(slope * normal).sum(-1) / (26 * step) ** 2
+    light = 0.5 / math.pi * -(at * normal).sum(-1) / away**3
+    way = here - at
+    length = np.linalg.norm(way, axis=-1)
+    facing = (way * normal).sum(-1).clip(0) * (-way @ up).clip(0) / length**4
+    turn = 2j * np.pi * FREQUENCY / SPEED_OF_LIGHT * (away + length - own)
+    return complex((area * light * facing * np.exp(turn)).sum() * own**3 / -(here @ up))
+
+
+@pytest.mark.parametrize("pixel", [(12, 3), (5, 10), (18, 26)])
+def test_one_bounce_in_a_corner_is_the_integral_over_its_sides(pixel: tuple[int, int]) -> None:
+    found = bounces(continued=False)
+    distance, light = found.cells(*CORNER)
+    planes, fits, large = found.planes(distance)
+    direct = torch.zeros(2, 1, len(distance)).double()
+    direct[0] = 1.0
+    ratio = found.indirect(planes, fits, large, light, direct).reshape(2, 24, 32)
+    # Patches of two pixels leave 3 % where the corner is some patches away.
+    assert complex(*ratio[:, pixel[0], pixel[1]].tolist()) == pytest.approx(
+        integral(pixel), rel=0.03
+    )
+
+
+def test_what_was_added_is_removed() -> None:
+    found, (distance, light) = bounces(), CORNER
+    measured, brighter = found.added(distance, light)
+    shift = measured - distance
+    assert shift.square().mean().sqrt() > 0.02
+    assert (brighter > light).all()
+    left = found.removed(measured, brighter) - distance
+    assert left.square().mean() < 0.02 * shift.square().mean()  # After two rounds.
+    # With more rounds the geometry is that of the direct light.
+    left = found.removed(measured, brighter, rounds=6) - distance
+    assert left.square().mean() < 0.002 * shift.square().mean()
+
+
+def test_several_frequencies_are_removed_as_they_were_added() -> None:
+    found, (distance, light) = bounces(frequencies_hz=(20e6, 60e6)), CORNER
+    measured, brighter = found.added(distance, light)
+    left = found.removed(measured, brighter, rounds=6) - distance
+    assert left.square().mean() < 0.01 * (measured - distance).square().mean()
+
+
+def test_a_lone_wall_stays_as_it_is() -> None:
+    distance, light = walls(((0.2, 0.1, -0.9746794), 1.5))
+    found = bounces(light_half_angle_deg=60.0)
+    torch.testing.assert_close(found.removed(distance, light), distance, rtol=0, atol=1e-7)
+    torch.testing.assert_close(found.added(distance, light)[0], distance, rtol=0, atol=1e-7)
+
+
+def test_the_unit_of_the_amplitude_cancels() -> None:
+    distance, light = CORNER
+    expected = bounces().removed(distance, light)
+    found = bounces(gain=GAIN / 40).removed(distance, 40 * light)
+    torch.testing.assert_close(found, expected)
+
+
+def test_a_board_between_two_walls_hides_them_from_each_other() -> None:
+    found = bounces()
+    distance, light = walls(((0, 0, -1.0), 2.0), ((1.0, 0, 0), 0.9), ((-1.0, 0, 0), 0.9))
+    across = ray_directions(CAMERA)[..., 0] / ray_directions(CAMERA)[..., 2]
+    hidden = torch.where(across.abs() < 0.12, 1.2 / ray_directions(CAMERA)[..., 2], distance)
+
+    def free(image: Tensor) -> Tensor:
+        planes, _, _ = found.planes(found.cells(image, light)[0])
+        place, normal, _, _, area = found.surfaces(planes, found.cell_rays, found.solid)
+        first, second = (
+            part.reshape(-1, 24, 32)[:, 1::2, 1::2].reshape(-1, 192) for part in (place, normal)
+        )
+        return found.unhidden(first, second, area.reshape(24, 32)[1::2, 1::2].reshape(-1))
+
+    left, right = 6 * 16 + 1, 6 * 16 + 14
+    assert free(distance)[left, right]
+    assert not free(hidden)[left, right]
+
+
+def test_pixels_without_a_return_stay_without() -> None:
+    distance, light = (image.clone() for image in CORNER)
+    distance[3:6, 4:9] = torch.nan
+    found = bounces().removed(distance, light)
+    assert torch.equal(found.isnan(), distance.isnan())
+
+
+def test_scripted_it_removes_the_same() -> None:
+    found = SecondBounces(CAMERA, STATE)
+    frames = [image.float().repeat(2, 1, 1) for image in CORNER]
+    assert torch.equal(torch.jit.script(found)(*frames), found(*frames))
+
+
+def frames_of_walls(generator: Generator) -> list[tuple[Tensor, Tensor]]:
+    """Walls beside each other, with second bounces and a base error, at different distances."""
+    found, frames = bounces(), []
+    for k in range(6):
+        direct = walls((LEFT, 1.1 + 0.1 * k), (RIGHT, 1.6 - 0.1 * k))
+        distance, light = found.added(*direct)
+        distance = distance + 0.02 * torch.sin(3.0 * distance)
+        noise = 1e-3 * torch.randn(distance.shape, generator=generator).double()
+        frames.append((distance + noise, light))
+    return frames
+
+
+def base_error(distance: Tensor, _amplitude: Tensor) -> Tensor:
+    return torch.stack([torch.sin(3.0 * distance), torch.cos(3.0 * distance)])
+
+
+def test_the_gain_is_found_beside_a_base_error(generator: Generator) -> None:
+    found = bounces(gain=GAIN / 2)
+    fit = fit_gain(found, frames_of_walls(generator), base_error)
+    low, high = fit.interval
+    assert low < fit.gain < high
+    # The base error acts on what second bounces have lengthened, and its columns do not: its
+    # slope, 0.06.
+    assert fit.gain == pytest.approx(GAIN, rel=0.06, abs=2 * fit.standard_error)
+    assert fit.coefficients[0] == pytest.approx(0.02, abs=0.01)
+    assert found.gain == GAIN / 2
+
+
+def test_without_second_bounces_no_gain_is_found(generator: Generator) -> None:
+    frames = []
+    for k in range(6):
+        distance, light = walls(((0.2, 0.1 * k, -0.9), 1.0 + 0.1 * k))
+        noise = 1e-3 * torch.randn(distance.shape, generator=generator).double()
+        frames.append((distance + noise, light))
+    with pytest.raises(CalibrationDataError, match="Record walls with"):
+        fit_gain(bounces(), frames, base_error)
+
+
+def state_with_bounces() -> CalibrationState:
+    domain = replace(DOMAIN, width=32, height=24)
+    scene = {"second_bounces": STATE.to_mapping()}
+    return calibration(camera=CAMERA, domain=domain, scene=scene)
+
+
+def test_the_corrector_removes_them_after_its_own_error(tmp_path: Path) -> None:
+    state = state_with_bounces()
+    plain = state.model_copy(update={"scene": SceneLight()})
+    depth, light = (image.float() for image in CORNER)
+    ray_z = ray_directions(CAMERA)[..., 2].float()
+    slant = ray_z if state.depth_kind == "z" else torch.ones_like(ray_z)
+    corrected, valid = DepthCorrector.from_state(plain)(depth * slant, light)
+    found = DepthCorrector.from_state(state)(depth * slant, light)
+    expected = SecondBounces(CAMERA, STATE)(corrected / slant, light) * slant
+    torch.testing.assert_close(found[0], expected, rtol=0, atol=1e-5)
+    assert torch.equal(found[1], valid)
+    write("torchscript", state, tmp_path / "corrector.ts")
+
+
+@pytest.mark.parametrize("name", ["lut", "pt2", "c", "onnx"])
+def test_other_formats_refuse_them_in_words(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="export torchscript"):
+        write(name, state_with_bounces(), tmp_path / "corrector.pt2")
+
+
+def test_a_sensor_adds_what_is_removed() -> None:
+    content = {
+        "format": "tofcorr-sensor",
+        "version": 1,
+        "camera": CAMERA.section(),
+        "depth_kind": "radial",
+        "validity": {"radial_distance_m": (0.5, 4.0)},
+    }
+    plain = SensorModel(SensorFile.model_validate(content), torch.float64)
+    content["second_bounces"] = STATE.to_mapping()
+    sensor = SensorModel(SensorFile.model_validate(content), torch.float64)
+    distance, light = CORNER
+    expected, brighter = bounces().added(distance, light)
+    seen = sensor(distance, light, noise=False)
+    torch.testing.assert_close(seen.depth, expected)
+    torch.testing.assert_close(seen.amplitude, brighter)
+    assert torch.equal(plain(distance, light, noise=False).depth, distance)

@@ -1,0 +1,545 @@
+r"""Second bounces: light that reaches a pixel by further surfaces of the scene, found in the frame.
+
+With :math:`k = 2 \pi f / c`, a pixel measures the phasor :math:`M = D (1 + q)`: direct light D, of
+phase 2 k r, and a ratio q of light by further bounces. A matt patch j of the scene, of area
+:math:`A_j = \Omega_j r_j^2 / c_j`, sends the room the radiance that it sends the camera. So its
+measured phasor holds every order of bounce among the patches that the camera sees:
+
+.. math:: q_i = s \, \frac{l_i^2}{c_i} \sum_j A_j |M_j|
+    e^{\mathrm{i} (k (l_j + d_{ij} - l_i) + \arg(1 + q_j))}
+    \frac{\cos\theta_{ij} \cos\theta_{ji}}{d_{ij}^2 + A_j / \pi}
+
+l is the distance from the light, c the cosine of its incidence, d the distance of two patches. The
+area under d is that of a disk, seen from above its middle: the sum stays finite in a corner. The
+reflectivity of i cancels. The gain s is a constant of the camera.
+"""
+
+import math
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
+from tofcorr.options import FiniteNumber, NonNegativeNumber, Number, Options, PositiveNumber
+
+_PATCHES = (32, 24)
+"""Columns and rows of patches at most, if no size is given. Asked for: 768 of a frame of 4:3."""
+_FLAT = 1e-3
+"""Share of the distance by which a plane may miss its cells without noise. Chosen."""
+_ODD = 9.0
+"""Variance above which a window is no plane, in those of the noise: three deviations. Chosen."""
+_WIDE_PLANE = 0.03
+"""Share of the distance by which cells of one large plane may miss it: second bounces bend a wall
+by that much before they are removed. Set on `benchmarks/scene_light/bounces.py`, building seed."""
+_ALIKE = 0.8
+"""Least cosine between the normals of cells of one large plane. Set there."""
+_LEAST_FACE = 0.005
+"""Share of all cells that makes a large plane. Chosen: 15 of 64 x 48."""
+_FACES, _CANDIDATES = 12, 128
+"""Large planes that are looked for, and cells whose planes are tried. Chosen."""
+_STEEPEST = 0.05
+"""Least cosine of incidence with which a patch takes or sends light: 87 degrees. Chosen."""
+_SAMPLES = 4
+"""Places on half the way between two patches at which something may stand in between. Chosen."""
+_OFF_PLANE = 0.01
+"""Share of its distance by which a pixel may miss the plane of a cell whose light it gets. Chosen:
+three deviations of the noise of cameras."""
+
+
+class SecondBouncesOptions(Options):
+    """Light and patches of second bounces.
+
+    Attributes:
+        patch_px: Side of a patch in pixels, even; None: so many that there are 32 x 24 of them.
+        light_m: Position of the light in the camera's axes, metres.
+        light_half_angle_deg: How far off the optical axis light reaches; None: to the image's
+            corners.
+        continued: Whether planes at the border of the image go on beyond it.
+    """
+
+    patch_px: Annotated[int, Field(ge=2, multiple_of=2)] | None = None
+    light_m: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    light_half_angle_deg: Annotated[FiniteNumber, Field(gt=0, le=80)] | None = None
+    continued: bool = True
+
+
+Frequencies = Annotated[tuple[PositiveNumber, ...], Field(min_length=1, max_length=8)]
+
+
+class SecondBouncesState(SecondBouncesOptions):
+    """What the removal of second bounces takes.
+
+    Attributes:
+        frequencies_hz: Modulation frequencies. Of several the distance is taken as their mean with
+            the weights of least noise, f^2.
+        gain: One over pi times the amplitude that white paper has at 1 m, seen straight on.
+        gain_interval: Of 95 %; None: it was given.
+    """
+
+    frequencies_hz: Frequencies
+    gain: NonNegativeNumber
+    gain_interval: tuple[Number, Number] | None = None
+
+
+class SecondBounces(nn.Module):
+    """The light of second bounces in a camera's frames.
+
+    A frame is reduced to cells of half a patch. 2 x 2 cells are a patch that sends light.
+
+    Args:
+        camera: The intrinsics.
+        state: Frequencies, gain, patches and light.
+
+    Shape:
+        - Frames: `(H, W)`, distances along the ray in metres, NaN without a return. A batch
+          `(B, H, W)` in `forward`.
+    """
+
+    rays: Tensor
+    cell_rays: Tensor
+    solid: Tensor
+    light: Tensor
+    out_rays: Tensor
+    out_solid: Tensor
+    out_from: Tensor
+    candidates: Tensor
+    table: Tensor
+    corners: Tensor
+    shares: Tensor
+    wave_numbers: list[float]
+    weights: list[float]
+    pads: list[int]
+    constants: list[float]
+
+    def __init__(self, camera: CameraIntrinsics, state: SecondBouncesState) -> None:
+        super().__init__()
+        size = camera.height, camera.width
+        most = max(camera.width / _PATCHES[0], camera.height / _PATCHES[1])
+        self.cell: int = (state.patch_px or 2 * math.ceil(most / 2)) // 2
+        self.rows: int = 2 * math.ceil(size[0] / (2 * self.cell))
+        self.columns: int = 2 * math.ceil(size[1] / (2 * self.cell))
+        self.pads = [0, self.columns * self.cell - size[1], 0, self.rows * self.cell - size[0]]
+        self.gain: float = state.gain
+        self.wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in state.frequencies_hz]
+        total = sum(f * f for f in state.frequencies_hz)
+        self.weights = [f * f / total for f in state.frequencies_hz]
+        self.constants = [_FLAT, _ODD, _WIDE_PLANE, _ALIKE, _LEAST_FACE, _STEEPEST, _OFF_PLANE]
+        self.faces_sought: int = _FACES
+        self.samples: int = _SAMPLES
+        rays = ray_directions(camera)
+        slopes = rays[..., :2] / rays[..., 2:]
+        pitch = [float(slopes[..., i].diff(dim=1 - i).mean()) for i in (0, 1)]
+        padded = nn.functional.pad(rays.permute(2, 0, 1)[None], self.pads, mode="replicate")
+        cell_rays = nn.functional.avg_pool2d(padded, self.cell)[0].reshape(3, -1)
+        cell_rays = nn.functional.normalize(cell_rays, dim=0)
+        # Of a pixel on the plane z = 1; distortion changes it as it changes the pitch, a little.
+        solid = nn.functional.pad((pitch[0] * pitch[1] * rays[..., 2] ** 3)[None], self.pads)
+        solid = nn.functional.avg_pool2d(solid, self.cell).reshape(-1) * self.cell**2
+        self.register_buffer("rays", rays.permute(2, 0, 1).contiguous())
+        self.register_buffer("cell_rays", cell_rays)
+        self.register_buffer("solid", solid)
+        self.register_buffer("light", torch.tensor(state.light_m, dtype=torch.float64))
+        spaced = torch.linspace(0, len(solid) - 1, min(_CANDIDATES, len(solid)))
+        self.register_buffer("candidates", spaced.long())
+        self._lay_patches_beyond(state, pitch)
+        self._tabulate_patches()
+        self._share_cells(size)
+
+    def _lay_patches_beyond(self, state: SecondBouncesState, pitch: list[float]) -> None:
+        """Lay patches beyond the image, four cells wide, where light reaches."""
+        slopes = self.cell_rays[:2] / self.cell_rays[2]
+        low, high = slopes.amin(1), slopes.amax(1)
+        corner = float(self.rays[2].min())
+        half = state.light_half_angle_deg
+        cosine = corner if half is None else math.cos(math.radians(half))
+        reach = math.sqrt(1 / cosine**2 - 1) if state.continued else 0.0
+        width = [4 * self.cell * each for each in pitch]
+        lines = []
+        for axis in (0, 1):
+            more = max(0, math.ceil((reach - float(torch.maximum(-low, high)[axis])) / width[axis]))
+            inside = max(1, round(float(high[axis] - low[axis]) / width[axis] + 0.25))
+            places = torch.arange(-more, inside + more, dtype=torch.float64) - (inside - 1) / 2
+            lines.append((low + high)[axis] / 2 + places * width[axis])
+        y, x = torch.meshgrid(lines[1], lines[0], indexing="ij")
+        place = torch.stack([x.reshape(-1), y.reshape(-1)])
+        border = torch.tensor(width, dtype=torch.float64) / 4
+        outside = ((place < (low - border)[:, None]) | (place > (high + border)[:, None])).any(0)
+        ray = nn.functional.normalize(nn.functional.pad(place, (0, 0, 0, 1), value=1.0), dim=0)
+        kept = outside & (ray[2] >= cosine) & bool(state.continued)
+        held = place[:, kept].clamp(low[:, None], high[:, None])
+        nearest = torch.cdist(held.T.contiguous(), slopes.T.contiguous()).argmin(1)
+        self.register_buffer("out_rays", ray[:, kept])
+        self.register_buffer("out_solid", width[0] * width[1] * ray[2, kept] ** 3)
+        self.register_buffer("out_from", nearest)
+
+    def _tabulate_patches(self) -> None:
+        """Say which patch a direction meets, on an even grid over x / z and y / z."""
+        rays = nn.functional.avg_pool2d(self.cell_rays.reshape(3, self.rows, self.columns), 2)
+        slopes = (rays[:2] / rays[2]).reshape(2, -1)
+        low, high = slopes.amin(1), slopes.amax(1)
+        count = torch.tensor([self.columns, self.rows])
+        step = (high - low) / (count - 2).clamp(min=1)
+        at = [
+            low[i] + (torch.arange(int(count[i]), dtype=torch.float64) - 0.5) * step[i]
+            for i in (0, 1)
+        ]
+        y, x = torch.meshgrid(at[1], at[0], indexing="ij")
+        places = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
+        nearest = torch.cdist(places, slopes.T.contiguous()).argmin(1)
+        self.register_buffer("table", nearest.reshape(self.rows, self.columns))
+        self.table_at: list[float] = [*(low - step).tolist(), *step.clamp(min=1e-9).tolist()]
+
+    def _share_cells(self, size: tuple[int, int]) -> None:
+        """Say which four cells are around a pixel, and their shares in bilinear interpolation."""
+        ends = []
+        for count, cells in zip(size, (self.rows, self.columns), strict=True):
+            at = (torch.arange(count, dtype=torch.float64) + 0.5) / self.cell - 0.5
+            first = at.floor().clamp(0, cells - 2)
+            ends.append((first.long(), (at - first).clamp(0, 1)))
+        (row, down), (column, right) = ends
+        corners, shares = [], []
+        for i in (0, 1):
+            for j in (0, 1):
+                corners.append((row + i)[:, None] * self.columns + column + j)
+                across = right if j else 1 - right
+                shares.append((down if i else 1 - down)[:, None] * across)
+        self.register_buffer("corners", torch.stack(corners))
+        self.register_buffer("shares", torch.stack(shares).float())
+
+    def forward(self, radial: Tensor, amplitude: Tensor) -> Tensor:
+        """Return `removed` of a frame, or of each frame of a batch (B, H, W)."""
+        if radial.dim() == 2:
+            return self.removed(radial, amplitude)
+        if radial.shape[0] == 0:
+            return radial
+        frames = [self.removed(radial[i], amplitude[i]) for i in range(radial.shape[0])]
+        return torch.stack(frames)
+
+    def removed(self, radial: Tensor, amplitude: Tensor, rounds: int = 2) -> Tensor:
+        """Return the distances of the direct light, metres (H, W).
+
+        Args:
+            radial: Measured, without the camera's own error, metres (H, W).
+            amplitude: Measured, the camera's units (H, W).
+            rounds: How often the geometry is taken from the distances that were just found.
+        """
+        measured, strength = self.cells(radial, amplitude)
+        shift, planes, _ = self.found(measured, strength, rounds)
+        return radial - self.in_pixels(shift, radial, shift, planes)
+
+    def found(
+        self, measured: Tensor, strength: Tensor, rounds: int = 2
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what second bounces add to the cells' distances, and the planes of the cells.
+
+        Args:
+            measured: Distances of the cells (N,), metres.
+            strength: Amplitudes of the cells (N,).
+            rounds: How often the geometry is taken from the distances that were just found.
+
+        Returns:
+            Metres (N,); g of 1 / r = g . ray (3, N); whether a cell is on a large plane (N,).
+        """
+        turn = torch.zeros(2, len(self.wave_numbers), measured.shape[0]).to(measured)
+        turn[0] += 1.0
+        here, shift = measured, torch.zeros_like(measured)
+        planes, large = self.cell_rays, measured > 0
+        for _ in range(rounds):
+            planes, fits, large = self.planes(here)
+            ratio = self.indirect(planes, fits, large, strength, turn)
+            shift = self.shift(ratio)
+            here = measured - shift
+            turn = self.direct_and(ratio)
+            turn = turn / turn.square().sum(0).sqrt()
+        return shift, planes, large
+
+    def added(self, radial: Tensor, amplitude: Tensor, rounds: int = 4) -> tuple[Tensor, Tensor]:
+        """Return distances and amplitudes with second bounces, (H, W) each.
+
+        Args:
+            radial: True distances, metres (H, W).
+            amplitude: Of the direct light, the camera's units (H, W).
+            rounds: Bounces that are followed, after the direct light.
+        """
+        true, strength = self.cells(radial, amplitude)
+        planes, fits, large = self.planes(true)
+        turn = torch.zeros(2, len(self.wave_numbers), true.shape[0]).to(true)
+        turn[0] += 1.0
+        ratio = torch.zeros_like(turn)
+        for _ in range(rounds):
+            ratio = self.indirect(planes, fits, large, strength, turn)
+            turn = self.direct_and(ratio)
+        none = torch.zeros_like(true)
+        shift = self.in_pixels(self.shift(ratio), radial, none, planes)
+        factor = self.in_pixels(turn.square().sum(0).sqrt().mean(0), radial, none, planes)
+        return radial + shift, amplitude * factor
+
+    def direct_and(self, ratio: Tensor) -> Tensor:
+        """Return 1 + q, real and imaginary part (2, F, N)."""
+        return torch.stack([ratio[0] + 1.0, ratio[1]])
+
+    def shift(self, ratio: Tensor) -> Tensor:
+        """Return what ratios q (2, F, N) add to the distance, metres (N,)."""
+        total = torch.zeros_like(ratio[0, 0])
+        for f, k in enumerate(self.wave_numbers):
+            total = total + self.weights[f] * torch.atan2(ratio[1, f], ratio[0, f] + 1.0) / (2 * k)
+        return total
+
+    def cells(self, radial: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distance and amplitude of the cells (N,), float64; NaN where most are missing."""
+        seen = radial.isfinite() & (radial > 0) & amplitude.isfinite()
+        none = torch.zeros_like(radial)
+        images = [torch.where(seen, 1.0 / radial, none), torch.where(seen, amplitude, none)]
+        images = torch.stack([images[0], images[1], seen.to(radial.dtype)])
+        means = nn.functional.avg_pool2d(nn.functional.pad(images, self.pads), self.cell)
+        near, strength, share = means.double().reshape(3, -1).unbind(0)
+        share = torch.where(share > 0.5, share, torch.full_like(share, math.nan))
+        return share / near, strength / share
+
+    def in_pixels(self, values: Tensor, radial: Tensor, shift: Tensor, planes: Tensor) -> Tensor:
+        """Interpolate values of cells (N,): between those whose plane a pixel is on.
+
+        Args:
+            values: Of the cells.
+            radial: Distances of the pixels (H, W), metres.
+            shift: What the cells take off the distance before it is on their plane (N,), metres.
+            planes: g of the cells (3, N).
+        """
+        total, weight = torch.zeros_like(radial), torch.zeros_like(radial)
+        known = values.isfinite() & planes.isfinite().all(0)
+        table = torch.cat([values[None], shift[None], planes])
+        table = torch.where(known, table, torch.zeros_like(table)).to(radial.dtype)
+        rays = self.rays.to(radial.dtype)
+        for i in range(self.corners.shape[0]):
+            at = self.corners[i]
+            found = table.index_select(1, at.reshape(-1)).reshape(5, radial.shape[0], -1)
+            value, off, x, y, z = found.unbind(0)
+            off = (radial - off) * (x * rays[0] + y * rays[1] + z * rays[2]) - 1.0
+            share = self.shares[i].to(radial.dtype)
+            share = share / (1.0 + (off / self.constants[6]).square())
+            total, weight = total + share * value, weight + share
+        return total / weight.clamp(min=1e-12)
+
+    def planes(self, radial: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return g of 1 / r = g . ray of every cell (3, N), which fit a plane, and a large one.
+
+        A cell takes the best window that contains it: of 5 x 5 cells, or of 3 x 3 if those fit no
+        plane. If neither does, it takes the normal of a neighbour. Cells on one large plane take
+        that plane.
+        """
+        near = 1.0 / radial
+        wide, wide_misfit = self.windows(near, 2)
+        small, small_misfit = self.windows(near, 1)
+        scale = radial.square().square()
+        some = torch.where(small_misfit.isfinite(), small_misfit * scale, math.nan)
+        level = self.constants[1] * (some.nanmedian() + (self.constants[0] * radial).square())
+        flat = wide_misfit * scale < level
+        fits = flat | (small_misfit * scale < level)
+        planes = torch.where(fits, torch.where(flat, wide, small), math.nan)
+        image = nn.functional.pad(
+            planes.reshape(3, self.rows, self.columns), [2] * 4, value=math.nan
+        )
+        around = image.unfold(1, self.rows, 1).unfold(2, self.columns, 1).reshape(3, 25, -1)
+        met = (around * self.cell_rays[:, None]).sum(0)
+        off = (near / met - 1.0).abs().nan_to_num(math.inf, math.inf)
+        nearest = off.argmin(0)[None, None].expand(3, 1, -1)
+        beside = around.gather(1, nearest)[:, 0]
+        beside = beside * (near / (beside * self.cell_rays).sum(0))
+        return self.large_planes(near, torch.where(fits, planes, beside), fits)
+
+    def windows(self, near: Tensor, half: int) -> tuple[Tensor, Tensor]:
+        """Return g of the best of nine windows that contain a cell, and its variance (of 1 / r)."""
+        seen = near.isfinite()
+        near, ray = torch.where(seen, near, 0.0), self.cell_rays.double()
+        outer = (ray[:, None] * ray).reshape(9, -1) * seen
+        terms = torch.cat([outer, ray * near, near.square()[None], seen.to(near.dtype)[None]])
+        size = 2 * half + 1
+        image = terms.reshape(1, 14, self.rows, self.columns)
+        means = nn.functional.avg_pool2d(image, size, 1, half)[0].reshape(14, -1)
+        plane = solved(means[:9].reshape(3, 3, -1), means[9:12])
+        count = means[13] * size**2
+        misfit = (means[12] - (plane * means[9:12]).sum(0)).clamp(min=0) * size**2 / (count - 3.0)
+        misfit = torch.where(count > 3.0 * half + 2.5, misfit, math.inf)  # Twice its unknowns.
+        image = torch.cat([plane, misfit[None]]).reshape(4, self.rows, self.columns)
+        # Not around the border's cells: any two rows of cells across an edge are on one plane.
+        image = nn.functional.pad(image[:, 1:-1, 1:-1], [half + 1] * 4, value=math.inf)
+        best, least = torch.zeros_like(plane), torch.full_like(near, math.inf)
+        for down in range(0, size, half):
+            for right in range(0, size, half):
+                tried = image[:, down : down + self.rows, right : right + self.columns]
+                tried = tried.reshape(4, -1)
+                off = (near - (tried[:3] * ray).sum(0)).square() + tried[3]
+                better = off < least
+                best = torch.where(better, tried[:3], best)
+                least = torch.where(better, off, least)
+        return best, torch.where(seen, least, math.inf)
+
+    def large_planes(
+        self, near: Tensor, own: Tensor, fits: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Give cells that lie on one large plane that plane: the largest first."""
+        ray, size = self.cell_rays.double(), self.constants[4] * near.shape[0]
+        normal = own / own.square().sum(0).sqrt()
+        free, best = fits & own.isfinite().all(0), own
+        left = torch.full_like(near, math.inf)
+        seeds = own[:, self.candidates]
+        tried, toward = seeds.float(), normal[:, self.candidates].float()
+        alike = ((tried.T @ ray.float()) / near.float() - 1.0).abs() < self.constants[2]
+        alike = (alike & (toward.T @ normal.float() > self.constants[3])).float()
+        for _ in range(self.faces_sought):
+            most = (alike @ free.to(alike.dtype)).argmax()
+            member, plane, off = (alike[most] > 0) & free, seeds[:, most], left
+            for _again in range(2):
+                weight = torch.where(member, near.square().reciprocal(), 0.0)
+                rows = ray * weight
+                right = rows @ torch.where(member, near * weight, 0.0)
+                plane = solved((rows @ rows.T)[:, :, None], right[:, None])[:, 0]
+                facing = plane / plane.square().sum().sqrt()
+                off = ((plane @ ray) / near - 1.0).abs()
+                member = free & (off < self.constants[2]) & (facing @ normal > self.constants[3])
+            member = member & (member.sum() > size)
+            spread = nn.functional.max_pool2d(
+                member.to(near.dtype).reshape(1, self.rows, self.columns), 5, 1, 2
+            )
+            beside = (spread.reshape(-1) > 0) & (off < self.constants[2]) & (off < left)
+            chosen = member | (beside & ~fits)
+            best = torch.where(chosen, plane[:, None], best)
+            left = torch.where(chosen, off, left)
+            free = free & ~member
+        return best, fits | left.isfinite(), left.isfinite()
+
+    def surfaces(
+        self, planes: Tensor, rays: Tensor, solid: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return place (3, N), normal (3, N), distance and cosine of the light, and area."""
+        normal = -planes / planes.square().sum(0).sqrt()
+        radial = 1.0 / (planes * rays).sum(0)
+        place = rays * radial
+        to_light = self.light.double()[:, None] - place
+        away = to_light.square().sum(0).sqrt()
+        cosine = (normal * to_light).sum(0) / away
+        steep = (-(normal * rays).sum(0)).clamp(min=self.constants[5])
+        return place, normal, away, cosine, solid * radial.square() / steep
+
+    def indirect(
+        self, planes: Tensor, fits: Tensor, large: Tensor, amplitude: Tensor, turn: Tensor
+    ) -> Tensor:
+        """Return the ratios q of the cells, real and imaginary part (2, F, N).
+
+        Args:
+            planes: g of the cells (3, N).
+            fits: Which cells are on a plane, and send light (N,).
+            large: Which are on a large plane, that goes on beyond the image (N,).
+            amplitude: Of the cells (N,).
+            turn: What turns the amplitude into the phasor that a cell sends, without the way from
+                the light: real and imaginary part (2, F, N).
+        """
+        place, normal, away, cosine, area = self.surfaces(
+            planes, self.cell_rays.double(), self.solid.double()
+        )
+        seen = planes.isfinite().all(0) & amplitude.isfinite() & (cosine > self.constants[5])
+        sends = seen & fits
+        known = torch.where(sends, amplitude * area, 0.0)
+        light = turned(turn.nan_to_num() * known.nan_to_num(), self.wave_numbers, away.nan_to_num())
+        images = [place * area, normal * area, area[None], light.reshape(-1, place.shape[1])]
+        image = torch.where(sends, torch.cat(images), 0.0)
+        sums = 4.0 * nn.functional.avg_pool2d(
+            image.reshape(1, -1, self.rows, self.columns), 2
+        ).reshape(image.shape[0], -1)
+        whole = sums[6].clamp(min=1e-12)
+        facing = sums[3:6] / sums[3:6].square().sum(0).sqrt().clamp(min=1e-12)
+        middle, light = sums[:3] / whole, sums[7:].reshape(2, len(self.wave_numbers), -1)
+        free = self.unhidden(middle, facing, sums[6])
+        start = self.out_from
+        far_planes, beyond_rays = planes[:, start], self.out_rays.double()
+        far = self.surfaces(far_planes, beyond_rays, self.out_solid.double())
+        ahead = ((far_planes * beyond_rays).sum(0) > 0) & (sends & large)[start]
+        ahead = ahead & (far[3] > self.constants[5])
+        bright = (amplitude * away.square() / cosine)[start] * far[3] / far[2].square() * far[4]
+        bright = turn[:, :, start] * bright
+        beyond = turned(bright, self.wave_numbers, far[2]).flatten(0, 1)
+        table = torch.cat([far[0], far[1], far[4][None], beyond])
+        table = torch.where(ahead, table, 0.0)
+        dtype = self.shares.dtype
+        q = self.gathered(
+            torch.cat([place, normal]).nan_to_num().to(dtype),
+            torch.cat([middle, table[:3]], dim=1).to(dtype),
+            torch.cat([facing, table[3:6]], dim=1).to(dtype),
+            torch.cat([sums[6], table[6]]).to(dtype),
+            torch.cat([light, table[7:].reshape(2, len(self.wave_numbers), -1)], dim=2).to(dtype),
+            free.to(dtype),
+        ).to(place.dtype)
+        q = turned(q, [-k for k in self.wave_numbers], away) * (self.gain * away.square() / cosine)
+        return torch.where(seen, q, 0.0)
+
+    def unhidden(self, place: Tensor, normal: Tensor, area: Tensor) -> Tensor:
+        """Return which patches (P, P) nothing stands between, as far as the camera sees."""
+        x, y, z = place.float().unbind(0)
+        normal = normal.float()
+        offset, slack = (place.float() * normal).sum(0), -0.5 * area.float().sqrt()
+        low_x, low_y, step_x, step_y = self.table_at
+        free = torch.ones(place.shape[1], place.shape[1], dtype=torch.bool, device=place.device)
+        limit = torch.cat([normal, (offset + slack)[None]]).T.contiguous()
+        for sample in range(self.samples):  # On the nearer half of the way from i to j.
+            t = (sample + 0.5) / (2 * self.samples)
+            at_x, at_y = torch.lerp(x[:, None], x, t), torch.lerp(y[:, None], y, t)
+            at_z = torch.lerp(z[:, None], z, t).clamp(min=1e-3)
+            column = ((at_x / at_z - low_x) / step_x).int().clamp(0, self.columns - 1)
+            row = ((at_y / at_z - low_y) / step_y).int().clamp(0, self.rows - 1)
+            met = self.table.reshape(-1).index_select(0, (row * self.columns + column).reshape(-1))
+            plane = limit.index_select(0, met).reshape(at_x.shape[0], -1, 4)
+            nx, ny, nz, least = plane.unbind(-1)
+            free = free & (at_x * nx + at_y * ny + at_z * nz > least)
+        return free & free.T
+
+    def gathered(
+        self, here: Tensor, place: Tensor, normal: Tensor, area: Tensor, light: Tensor, free: Tensor
+    ) -> Tensor:
+        """Return the light of patches j that cells i get, (2, F, N).
+
+        Args:
+            here: Place and normal of the cells (6, N).
+            place: Of the patches (3, P), the image's first, then those beyond it.
+            normal: Of the patches (3, P).
+            area: Of the patches (P,).
+            light: That they send, times their area, (2, F, P).
+            free: Which patches of the image see each other (P', P').
+        """
+        count, high, wide = free.shape[0], self.rows // 2, self.columns // 2
+        at, up = here[:3], here[3:]
+        square = at.square().sum(0)[:, None] + place.square().sum(0) - 2.0 * (at.T @ place)
+        square = square.clamp(min=1e-6)
+        facing = (up.T @ place - (up * at).sum(0)[:, None]).clamp(min=0)
+        facing = facing * (at.T @ normal - (place * normal).sum(0)).clamp(min=0)
+        kernel = facing / (square * (square + area / math.pi))
+        seen = free.reshape(high, 1, wide, 1, count).expand(high, 2, wide, 2, count)
+        own = kernel[:, :count] * seen.reshape(-1, count)
+        kernel, ways = torch.cat([own, kernel[:, count:]], dim=1), square.sqrt()
+        found = []
+        for f, k in enumerate(self.wave_numbers):
+            c, s = kernel * torch.cos(k * ways), kernel * torch.sin(k * ways)
+            real, imaginary = light[0, f], light[1, f]
+            found.append(torch.stack([c @ real - s @ imaginary, c @ imaginary + s @ real]))
+        return torch.stack(found, dim=1)
+
+
+def turned(phasors: Tensor, wave_numbers: list[float], ways: Tensor) -> Tensor:
+    """Return phasors (2, F, N) after a way (N,) in metres more: times exp(i k way)."""
+    found = []
+    for f, k in enumerate(wave_numbers):
+        c, s = torch.cos(k * ways), torch.sin(k * ways)
+        real, imaginary = phasors[0, f], phasors[1, f]
+        found.append(torch.stack([c * real - s * imaginary, c * imaginary + s * real]))
+    return torch.stack(found, dim=1)
+
+
+def solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve symmetric equations (3, 3, N) x = (3, N) by determinants; NaN if they are singular."""
+    a, b, c = matrix.unbind(0)
+    rows = [torch.linalg.cross(b, c, dim=0), torch.linalg.cross(c, a, dim=0)]
+    rows.append(torch.linalg.cross(a, b, dim=0))
+    determinant = (a * rows[0]).sum(0)
+    return torch.stack([(row * right).sum(0) for row in rows]) / determinant
