@@ -37,11 +37,14 @@ def two_exposures(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def test_what_was_named_is_corrected_where_it_predicts_better_and_the_rest_is_left_out(
     two_exposures: Dataset, tmp_path: Path
 ) -> None:
-    named = diagnosed(tmp_path, "integration_time", "wiggling", "lens")
+    named = diagnosed(tmp_path, "integration_time", "wiggling", "lens", "mixed_pixels", "multipath")
     plain = tofcorr.train(two_exposures.first, "ea")
     found = tofcorr.train_with(named, two_exposures.first, "ea")
     effects = {one["effect"]: one for one in found.report["named"]["effects"]}
-    assert [name for name, one in effects.items() if one["kept"]] == ["integration_time"]
+    kept = [name for name, one in effects.items() if one["kept"]]
+    assert kept == ["integration_time", "mixed_pixels"]
+    assert found.options.runtime.flying_pixels is not None
+    assert "runtime.second_bounces" in effects["multipath"]["why"]
     assert effects["integration_time"]["p_value"] < 0.05
     assert effects["wiggling"]["with_mm"] > effects["wiggling"]["without_mm"] - 0.1
     assert effects["lens"]["why"] == "no single frame tells it, so no corrector can undo it"
@@ -104,7 +107,7 @@ def test_stray_light_is_taken_back_in_the_fit_and_in_the_corrector(tmp_path: Pat
     wall = simulated_wall(
         tmp_path / "recording",
         seed=34,
-        shots=(("checkerboard", 30),),
+        shots=(("checkerboard", 16),),
         effects=[{"name": "stray_light", **shares}],
         sensor=QUIET,
         robot={"tilt_deg": 45.0, "steepest_incidence_deg": 80.0},
@@ -113,7 +116,7 @@ def test_stray_light_is_taken_back_in_the_fit_and_in_the_corrector(tmp_path: Pat
     found = tofcorr.train_with(
         named, wall.first, {"name": "EA", "model": EA, "figures": False}, out=run
     )
-    plain = tofcorr.train(wall.first, "ea")
+    plain = tofcorr.train(wall.first, {"name": "EA", "model": EA})
     assert found.report["named"]["effects"][0]["kept"]
     off = [
         se3.apart(one.fit.solution.parameters.tool_from_camera, true_hand_eye(wall))[0]

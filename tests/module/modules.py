@@ -53,7 +53,7 @@ def conditions(leading: tuple[int, ...] = ()) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(7)
     value = 2.2 + torch.rand(leading, generator=generator, dtype=torch.float64)
     own = {"timestamp_s": value, "room_temperature_c": value}
-    return own | {"integration_time_us": 1e6 * value}
+    return own | {"integration_time_us": 1e6 * value, "ambient": value}
 
 
 def with_missing(depth: Tensor) -> Tensor:

@@ -56,7 +56,9 @@ def test_autocast_moves_no_point(kind: str) -> None:
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("kind", ["integration_time", "room_temperature", "warm_up"])
+@pytest.mark.parametrize(
+    "kind", ["integration_time", "room_temperature", "warm_up", "ambient_light"]
+)
 def test_conditions_agree_with_the_runtime_frame_by_frame(kind: str) -> None:
     module = module_of(kind)
     corrector = DepthCorrector.from_state(module.to_state())

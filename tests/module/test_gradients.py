@@ -130,9 +130,9 @@ def test_vmap_over_hand_eyes_agrees_with_a_loop() -> None:
 
 def test_the_loss_is_the_mean_squared_distance_to_the_planes(module: DepthCorrection) -> None:
     batch = wall_batch(module)
-    times, exposures, degrees = present(batch.conditions)[:, :3].unbind(1)
+    times, exposures, degrees, _, light = present(batch.conditions).unbind(1)
     given = {"timestamp_s": times, "integration_time_us": 1e6 * exposures}
-    given["room_temperature_c"] = degrees
+    given |= {"room_temperature_c": degrees, "ambient": light}
     points = module.points_tool(batch.radial_distance, batch.amplitude, **given)
     distance = (points * batch.normal_tool[:, None, None]).sum(-1)
     distance = distance + batch.offset_tool[:, None, None]

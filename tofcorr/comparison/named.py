@@ -28,6 +28,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, folds, opened
 from tofcorr.pixels.passes import FrameErrors, held_out_errors
 from tofcorr.pixels.sample import MaskOptions
+from tofcorr.scene_light.flying import FlyingPixelsOptions
 from tofcorr.scene_light.stray import StrayLightState
 from tofcorr.training.calibration import TrainingOptions, halves
 from tofcorr.training.run import Carried, Config, TrainingResult, carried_training, inspected
@@ -44,6 +45,8 @@ _TERM_OF = {
 }
 _CLOCK = "timestamp_offset"
 _STRAY = "stray_light"
+_MIXED = "mixed_pixels"
+_WHY_NOT = {"multipath": "second bounces are removed where runtime.second_bounces asks for it"}
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,11 @@ def _tried(
         found: The diagnosis.
         left_out: Global numbers of the frames that take no part.
     """
+    if effect == _MIXED:
+        runtime = best.options.runtime.model_copy(update={"flying_pixels": FlyingPixelsOptions()})
+        options = best.options.model_copy(update={"runtime": runtime})
+        why = "the corrector looks for pixels that mix two surfaces"
+        return best._replace(options=options), Tried(effect, kept=True, why=why)
     further = _with_effect(best, effect, found)
     if isinstance(further, str):
         return best, Tried(effect, kept=False, why=further)
@@ -191,7 +199,7 @@ def _with_effect(best: _Model, effect: str, found: Mapping[str, Any]) -> _Model 
         options = options.model_copy(update={"runtime": runtime})
         return _Model(data.without_stray_light(stray), options)
     if effect not in _TERM_OF:
-        return "no single frame tells it, so no corrector can undo it"
+        return _WHY_NOT.get(effect, "no single frame tells it, so no corrector can undo it")
     kind, finer = TERMS[_TERM_OF[effect]], effect in _POLYNOMIALS
     there = [term for term in options.model.terms if isinstance(term, kind)]
     if there and not finer:

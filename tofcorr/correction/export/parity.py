@@ -8,6 +8,7 @@ from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING
 from tofcorr.errors import ConfigError, ExportError
+from tofcorr.geometry.rays import ray_directions
 
 
 def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
@@ -22,6 +23,12 @@ def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
     limits = state.model().error.limits(state.domain)
     ends, amplitudes = limits.radial_distance, limits.amplitude or EVERYTHING
     depth, amplitude = (_around(one, shape, generator) for one in (ends, amplitudes))
+    if state.scene.second_bounces is not None:
+        # Which planes are found in noise depends on the last digit: two walls that meet.
+        rays = ray_directions(state.camera)
+        near = rays[..., 2] + rays[..., 0].abs()
+        depth = (sum(ends) / 2 * near.min() / near).float().repeat(shape[0], 1, 1)
+        amplitude = torch.full(shape, min(sum(amplitudes) / 2, 10**6))
     # Cells of 1 % of the pixels each: every kind of missing value, and both ends of the ranges.
     kind = torch.randint(0, 100, shape, generator=generator)
     for k, value in enumerate((torch.nan, 0.0, -1.0, torch.inf, -torch.inf, *ends)):
