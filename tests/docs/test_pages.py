@@ -31,8 +31,9 @@ OTHERS = [
     one for one in EVERY if one not in (*PAGES, *ADDING) and "```python" in one.read_text("utf-8")
 ]
 SLOW = ("README.md", "check.md", "choose.md", "deploy.md", "diagnose.md", "distance-sensor.md")
-SLOW += ("install.md", "your-simulator.md")
-"""Pages that take half a minute or more, and those that only repeat what others run."""
+SLOW += ("install.md", "your-simulator.md", "after-a-bump.md", "two-cameras.md", "robot-errors.md")
+SLOW += ("scene-light.md",)
+"""Pages that take many seconds, and those that only repeat what others run."""
 FILES = ("yaml", "json", "text")
 """Languages of blocks that are no programs."""
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
