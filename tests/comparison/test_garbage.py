@@ -30,6 +30,7 @@ def garbage(clean: Recording) -> Recording:
     return replace(clean, depth=np.array(clean.depth) + np.float32(0.5) * far)
 
 
+@pytest.mark.slow
 def test_garbage_hardly_changes_a_table(clean: Recording, garbage: Recording) -> None:
     """The table said 63 mm where the report of a training said 7."""
     evaluated = (tofcorr.evaluate(one, OPTIONS).sets[0] for one in (clean, garbage))

@@ -392,6 +392,9 @@ class DepthCorrection(FrameCorrection):
     def load(cls, path: Path | str) -> Self:
         """Read a module from a file that `save` wrote, or from the run folder of a training.
 
+        The module corrects every pixel alone. What else a run removes of a frame (stray light,
+        second bounces, flying pixels) `tofcorr.load_corrector` and exports of the module do.
+
         Raises:
             CalibrationDataError: There is no such file or run, or it is not one of these.
         """

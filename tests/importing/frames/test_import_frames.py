@@ -83,7 +83,7 @@ def before_one_wall() -> Recorded:
     return replace(recorded, depth_mm=depth.astype(np.uint16))
 
 
-@pytest.mark.parametrize("late", [0.0, 0.03])
+@pytest.mark.parametrize("late", [pytest.param(0.0, marks=pytest.mark.slow), 0.03])
 def test_of_a_constant_error_before_one_wall_and_a_late_clock_only_the_clock_is_named(
     before_one_wall: Recorded, tmp_path: Path, late: float
 ) -> None:
