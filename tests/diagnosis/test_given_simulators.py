@@ -161,6 +161,7 @@ def test_a_pixel_that_the_simulator_does_not_see_is_left_out(
     assert any("left out" in warning for warning in prepared.warnings)
 
 
+@pytest.mark.slow
 def test_other_cameras_and_depths_are_refused_in_a_sentence(
     nothing_missing: Recording, frames: Images, observations: Observations, rendered: Render
 ) -> None:

@@ -32,7 +32,7 @@ OTHERS = [
 ]
 SLOW = ("README.md", "check.md", "choose.md", "deploy.md", "diagnose.md", "distance-sensor.md")
 SLOW += ("install.md", "your-simulator.md", "after-a-bump.md", "two-cameras.md", "robot-errors.md")
-SLOW += ("scene-light.md", "live.md")
+SLOW += ("scene-light.md", "live.md", "robot-and-wall.md")
 """Pages that take many seconds, and those that only repeat what others run."""
 FILES = ("yaml", "json", "text")
 """Languages of blocks that are no programs."""

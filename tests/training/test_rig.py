@@ -25,6 +25,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [folder / "front", folder / "other"]
 
 
+@pytest.mark.slow
 def test_every_camera_has_its_run_and_the_rig_its_transforms(
     recordings: list[Path], tmp_path: Path, program: Program
 ) -> None:
