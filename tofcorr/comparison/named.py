@@ -76,10 +76,17 @@ class Tried:
 
 
 class _Model(NamedTuple):
-    """The recordings, with poses as they are believed, and what is fitted to them."""
+    """The recordings, with poses as they are believed, and what is fitted to them.
+
+    Attributes:
+        data: The recordings.
+        options: Of the fit.
+        error: Of each pose on images that were not fitted, mm; None: it was not measured.
+    """
 
     data: Dataset
     options: TrainingOptions
+    error: np.ndarray | None = None
 
 
 def train_with(
@@ -115,7 +122,7 @@ def train_with(
         held_out = np.setdiff1d(np.arange(data.num_frames), halves(usable, chosen, left_out)[0])
         best = _Model(data, chosen)
         for effect in named:
-            best, tried = _tried(best, effect, found, held_out)
+            best, tried = _tried(best, effect, found, data, held_out)
             said.append(tried)
         kept = {"model": best.options.model, "runtime": best.options.runtime}
         data, options = best.data, options.model_copy(update=kept)
@@ -149,7 +156,11 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 
 def _tried(
-    best: _Model, effect: str, found: Mapping[str, Any], left_out: np.ndarray
+    best: _Model,
+    effect: str,
+    found: Mapping[str, Any],
+    recorded: Dataset,
+    left_out: np.ndarray,
 ) -> tuple[_Model, Tried]:
     """Return the better of the models without and with an effect, and what was found.
 
@@ -157,6 +168,7 @@ def _tried(
         best: The model so far.
         effect: The effect's name.
         found: The diagnosis.
+        recorded: The recordings as given, which say what a pose is.
         left_out: Global numbers of the frames that take no part.
     """
     if effect == _MIXED:
@@ -168,26 +180,29 @@ def _tried(
     if isinstance(further, str):
         return best, Tried(effect, kept=False, why=further)
     comparison = SelectionOptions(models=(ComparedModel(name="any"),))
-    drawn = enumerate(folds(best.data, comparison.folds, comparison.seed))
+    drawn = enumerate(folds(recorded, comparison.folds, comparison.seed))
     tests = list(without_frames({str(k): test for k, test in drawn}, left_out.tolist()).values())
     try:
-        errors = [_held_out_error(one, best.data, tests, left_out) for one in (best, further)]
+        before = best.error
+        if before is None:
+            before = _held_out_error(best, recorded, tests, left_out)
+        after = _held_out_error(further, recorded, tests, left_out)
     except CalibrationDataError as error:  # Such as a condition that was not recorded.
         return best, Tried(effect, kept=False, why=str(error).removesuffix("."))
-    without, better = (float(error.mean()) for error in errors)
+    without, better = float(before.mean()), float(after.mean())
     # As `Ranking` compares models: folds share most of their poses.
-    overlap = len(tests) / (len(tests) - 1) / len(errors[0])
-    change = Estimate(errors[1] - errors[0], overlap)
+    overlap = len(tests) / (len(tests) - 1) / len(before)
+    change = Estimate(after - before, overlap)
     kept = change.significant and change.mean < 0
     why = f"held-out images are off by {without:.2f} mm without and by {better:.2f} mm with it"
     why += "" if kept else ", which is not significantly better"
     tried = Tried(effect, kept, why, without, better, change.p_value)
-    return (further if kept else best), tried
+    return (further._replace(error=after) if kept else best._replace(error=before)), tried
 
 
 def _with_effect(best: _Model, effect: str, found: Mapping[str, Any]) -> _Model | str:
     """Return the model that undoes an effect as well, or why there is none."""
-    data, options = best
+    data, options = best.data, best.options
     values = {one["name"]: one["value"] for one in found["fitted"] if one["cause"] == effect}
     if effect in (_CLOCK, _STRAY) and not values:
         return "it is one of several that may be there, and the diagnosis fitted another one"

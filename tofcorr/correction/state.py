@@ -92,7 +92,7 @@ class ResidualState(Options):
 
 
 class SceneLight(Options):
-    """What a corrector removes of a frame that comes of the scene, not of the camera.
+    """What a corrector removes of a frame besides the error of each pixel.
 
     Attributes:
         stray_light: Light that lens and sensor send to the wrong pixel, taken back before anything

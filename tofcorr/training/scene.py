@@ -97,10 +97,9 @@ def _second_bounces(
     values["frequencies_hz"] = wanted.frequencies_hz or (frequency,)
     if wanted.gain is not None:
         return SecondBouncesState.model_validate(values)
-    frames = [
-        (depth * DepthCorrector.from_state(state).radial_of_z, light)
-        for depth, light in zip(*_corrected(data, state), strict=True)
-    ]
+    depths, amplitudes = _corrected(data, state)
+    radial = depths * DepthCorrector.from_state(state).radial_of_z
+    frames = list(zip(radial, amplitudes, strict=True))
     # Half white, seen straight on, to begin with.
     bright = torch.cat([(d.square() * a).flatten() for d, a in frames]).nanmedian()
     values["gain"] = 1 / (2 * math.pi * float(bright))
