@@ -256,6 +256,13 @@ class DepthCorrector(nn.Module):
         torch.lerp(depth, error, self.weight, out=corrected)
 
 
+# What the file offers besides `forward`. Set here, not when it is compiled: TorchScript compiles a
+# class once, whoever asks first.
+if hasattr(torch, "jit"):  # Later versions of torch may lack it.
+    for _name in ("set_conditions", "points", "points_tool", "sigma", "metadata"):
+        torch.jit.export(getattr(DepthCorrector, _name))
+
+
 class RuntimeRange(nn.Module):
     """A calibrated range, in the form that is fastest for a chain of operations or compiled code.
 

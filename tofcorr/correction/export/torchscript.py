@@ -18,8 +18,6 @@ from tofcorr.files import staged_file
 
 _UNSUPPORTED = (3, 14)
 """From this Python on torch says that TorchScript is not supported and may break."""
-_METHODS = ("set_conditions", "points", "points_tool", "sigma", "metadata")
-"""What the file offers besides `forward`."""
 
 
 def export_torchscript(
@@ -48,8 +46,6 @@ def export_torchscript(
 def scripted(corrector: DepthCorrector) -> Any:  # noqa: ANN401 - a module of TorchScript
     """Return the corrector compiled by TorchScript, with every method that a file has."""
     jit = _torchscript()
-    for name in _METHODS:
-        jit.export(getattr(DepthCorrector, name))
     with warnings.catch_warnings():
         # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
         warnings.filterwarnings("ignore", message=".*torch.jit")
