@@ -4,7 +4,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofcorr.correction.export.registry import format_named
+from tofcorr.correction.export.registry import FORMATS, format_named
+from tofcorr.errors import ConfigError
 
 if TYPE_CHECKING:
     from tofcorr.correction.corrector import DepthCorrector
@@ -18,10 +19,15 @@ def export(
 
     Raises:
         ConfigError: There is no such format, it needs something that is not installed, or it
-            cannot hold the model.
+            cannot hold the model, or what of the scene's light is removed.
         ExportError: The export differs from the model, or cannot be written; there is no new file.
     """
     chosen = format_named(name)
     chosen.require_packages()
+    scene = [part for part, wanted in reference.scene if wanted is not None]
+    if chosen.scene is not None and not chosen.holds(scene):
+        lacking = " and ".join(part for part in scene if part not in chosen.scene)
+        others = ", ".join(one.name for one in FORMATS.values() if one.holds(scene))
+        raise ConfigError(f"The {chosen.name} export holds no {lacking}: export {others}.")
     module = import_module(f"tofcorr.correction.export.{chosen.name}")
     getattr(module, f"export_{chosen.name}")(corrector, path, reference)

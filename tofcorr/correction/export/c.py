@@ -24,7 +24,6 @@ from tofcorr.correction.corrector import DepthCorrector, RuntimeErrorModel, poly
 from tofcorr.correction.export.parity import (
     Correct,
     probe_frames,
-    refuse_second_bounces,
     require_parity,
 )
 from tofcorr.correction.model import AGREEMENT
@@ -53,9 +52,6 @@ def export_c(corrector: DepthCorrector, path: Path | str, reference: Calibration
             of the terms.
         ExportError: The compiled source differs from the float64 model; nothing is written.
     """
-    if reference.scene.stray_light is not None:
-        raise ConfigError("C takes no stray light back: export torchscript, pt2 or onnx.")
-    refuse_second_bounces(reference)
     path = Path(path)
     name = c_name(path.stem)
     if path.suffix != ".c" or name != path.stem:

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.parity import refuse_second_bounces, require_parity
+from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.loaded import LoadedCorrector
 from tofcorr.correction.lookup import FORMAT, digest_of, interpolate, read_lut
-from tofcorr.correction.state import CalibrationState, SceneLight
+from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING, Interval
 from tofcorr.errors import ConfigError
 from tofcorr.files import staged_file
@@ -33,14 +33,9 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
         reference: The calibration that is tabulated.
 
     Raises:
-        ConfigError: The model has a residual network, or flying pixels are to be found: no such
-            table can hold either.
+        ConfigError: The model has a residual network, which no such table can hold.
         ExportError: The table differs from the model by more than `TOLERANCE`; nothing is written.
     """
-    refuse_second_bounces(reference)
-    if reference.scene != SceneLight():
-        said = "A look-up table corrects every pixel alone: no flying pixels, no stray light"
-        raise ConfigError(f"{said}: export torchscript, pt2, onnx or c.")
     if reference.residual is not None:
         raise ConfigError(f"{reference.name}'s network needs torchscript, pt2 or onnx.")
     metadata = json.loads(corrector.metadata())

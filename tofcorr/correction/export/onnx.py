@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.parity import refuse_second_bounces, require_parity
+from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.export.registry import format_named
 from tofcorr.correction.loaded import LoadedCorrector
 from tofcorr.correction.state import CalibrationState
@@ -37,7 +37,6 @@ def export_onnx(corrector: DepthCorrector, path: Path | str, reference: Calibrat
         ConfigError: The optional packages are not installed.
         ExportError: onnxruntime's result differs from the float64 model; nothing is written.
     """
-    refuse_second_bounces(reference)
     with staged_file(path) as part:
         _write(corrector, part)
         require_parity(load_onnx(part), reference)

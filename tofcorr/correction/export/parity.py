@@ -7,7 +7,7 @@ from tofcorr.correction.loaded import Correct
 from tofcorr.correction.model import AGREEMENT
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import EVERYTHING
-from tofcorr.errors import ConfigError, ExportError
+from tofcorr.errors import ExportError
 from tofcorr.geometry.rays import ray_directions
 
 
@@ -45,16 +45,6 @@ def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
     frames = ((depth, walls), (amplitude, light))
     depth, amplitude = (torch.cat([images, own[None]]) for images, own in frames)
     return depth, amplitude
-
-
-def refuse_second_bounces(state: CalibrationState) -> None:
-    """Refuse a calibration that removes second bounces; for formats that cannot hold it.
-
-    Raises:
-        ConfigError: It does.
-    """
-    if state.scene.second_bounces is not None:
-        raise ConfigError("Second bounces are removed by TorchScript alone: export torchscript.")
 
 
 _OF_SUMS = 100.0

@@ -16,7 +16,7 @@ from tofcorr.correction.corrector import (
     check_frames,
     separated,
 )
-from tofcorr.correction.export.parity import refuse_second_bounces, require_parity
+from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.loaded import LoadedCorrector
 from tofcorr.correction.state import CalibrationState, with_calibration
 from tofcorr.errors import CalibrationDataError, ConfigError
@@ -45,7 +45,6 @@ def export_pt2(corrector: DepthCorrector, path: Path | str, reference: Calibrati
         ConfigError: `path` does not end in .pt2, or there is no C++ compiler.
         ExportError: The compiled module differs from the float64 model; nothing is written.
     """
-    refuse_second_bounces(reference)
     path = Path(path)
     if path.suffix != ".pt2":
         raise ConfigError(f"{path}: torch loads such a package only by a name that ends in .pt2.")

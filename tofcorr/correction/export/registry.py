@@ -4,6 +4,7 @@ A new format is a file in this folder and one line here. The file is called as t
 `export_<format>(corrector, path, reference)`, which writes `path` whole or not at all.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from importlib.util import find_spec
 
@@ -18,6 +19,8 @@ class Format:
         name: In `--format`, and of the file that writes it.
         ending: What its files usually end in.
         summary: For whom it is, in a few words.
+        scene: What of the scene's light it removes, as `scene` of a calibration names it; None: it
+            corrects no depth.
         packages: Packages that writing or reading it needs besides the required ones.
         extra: The extra of tofcorr that installs them.
         for_device: Whether the file is compiled for one device, `cpu` or `cuda`.
@@ -29,6 +32,7 @@ class Format:
     name: str
     ending: str
     summary: str
+    scene: tuple[str, ...] | None = None
     packages: tuple[str, ...] = ()
     extra: str = ""
     for_device: bool = False
@@ -46,22 +50,30 @@ class Format:
             extra = f"pip install 'tofcorr[{self.extra}]'"
             raise ConfigError(f"The {self.name} export needs {' and '.join(missing)}: {extra}.")
 
+    def holds(self, scene: Collection[str]) -> bool:
+        """Return whether it corrects depth, and removes all this of the scene's light."""
+        return self.scene is not None and set(scene) <= set(self.scene)
+
 
 _ONNX = ("onnx", "onnxscript", "onnxruntime")
+_FLYING = ("flying_pixels",)
+_NO_BOUNCES = ("stray_light", *_FLYING)
+_ALL = (*_NO_BOUNCES, "second_bounces")
 
 _FORMATS = (
-    Format("torchscript", ".ts", "any machine with torch", record="/code/", runs_code=True),
+    Format("torchscript", ".ts", "any machine with torch", _ALL, record="/code/", runs_code=True),
     Format(
         "pt2",
         ".pt2",
         "the fastest; compiled for this kind of processor",
+        _NO_BOUNCES,
         for_device=True,
         record="/aotinductor/",
         runs_code=True,
     ),
-    Format("onnx", ".onnx", "without torch", packages=_ONNX, extra="onnx"),
-    Format("c", ".c", "without any library: C99 for robots and controllers, compiled there"),
-    Format("lut", ".npz", "table for NumPy, to 0.1 mm", record="radial_of_z.npy"),
+    Format("onnx", ".onnx", "without torch", _NO_BOUNCES, packages=_ONNX, extra="onnx"),
+    Format("c", ".c", "without any library: C99 for robots, compiled there", _FLYING),
+    Format("lut", ".npz", "table for NumPy, to 0.1 mm", (), record="radial_of_z.npy"),
     Format("urdf", ".xacro", "the camera's pose as a fixed joint of a robot description"),
     Format("tf", ".yaml", "the camera's pose for ROS, with the commands that publish it"),
     Format("easy_handeye", ".yaml, or .calib for easy_handeye2", "the camera's pose for ROS"),
