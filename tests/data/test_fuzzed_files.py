@@ -25,7 +25,7 @@ def targets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fuzz.Target]:
 
 
 @pytest.mark.filterwarnings("ignore")  # What is drawn to be odd: numbers of other types.
-@pytest.mark.parametrize("examples", [60, MANY])
+@pytest.mark.parametrize("examples", [30, MANY])
 @pytest.mark.parametrize("name", FILES)
 def test_a_changed_file_opens_or_is_refused_in_words(
     targets: dict[str, fuzz.Target], name: str, examples: int, tmp_path: Path

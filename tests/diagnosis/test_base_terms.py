@@ -26,6 +26,7 @@ from tofcorr.simulation.simulator import simulate
 
 DEMO = Path(__file__).parents[2] / "configs" / "simulate" / "demo.yaml"
 KINDS = sorted(TERMS)
+OF_EACH_SORT = ("amplitude_polynomial", "fixed_pattern", "periodic", "warm_up")
 NEEDS = {
     "periodic": "modulation_frequency_hz",
     "integration_time": "integration_time_us",
@@ -66,7 +67,10 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return Recording.open(path)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [k if k in OF_EACH_SORT else pytest.param(k, marks=pytest.mark.slow) for k in KINDS],
+)
 def test_every_kind_of_term_can_be_the_base_of_a_diagnosis(kind: str, demo: Recording) -> None:
     found = diagnose(demo, config=_base(kind) | {"catalogue": ["wiggling", "lens"]})
     assert np.isfinite([found.gap.before, found.gap.after, found.gap.floor]).all()

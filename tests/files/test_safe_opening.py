@@ -85,7 +85,7 @@ def test_the_corrector_built_anew_is_that_of_the_file(tmp_path: Path) -> None:
         assert torch.equal(own.nan_to_num(-1), theirs.nan_to_num(-1))
 
 
-@pytest.mark.parametrize("closed", ["2>&-", ">&-", ">&- 2>&- <&-"])
+@pytest.mark.parametrize("closed", [pytest.param("2>&-", marks=pytest.mark.slow), ">&- 2>&- <&-"])
 def test_closed_streams_leave_the_work_as_it_is(closed: str, tmp_path: Path) -> None:
     """What was said went into the next file opened, or ended the command without a word."""
     model, out = save_corrector(tmp_path / "corrector.ts"), tmp_path / "out"
