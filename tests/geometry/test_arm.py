@@ -35,7 +35,7 @@ def gantry(tmp_path: Path) -> Path:
 
 def test_a_pose_is_the_product_of_the_joints(gantry: Path) -> None:
     arm = Arm.read(gantry, "floor", "hand")
-    assert (arm.names, arm.turns) == (("rail", "wrist"), (False, True))
+    assert (arm.names, arm.turns) == (("rail", "wrist"), [False, True])
     found = arm.poses(torch.tensor([[0.3, 0.7]], dtype=torch.float64))[0]
     mast = se3.exp(torch.tensor([0, 0, 0, 0, 0, 1.5], dtype=torch.float64))[:3, :3]
     turn = se3.exp(0.7 * torch.tensor([0, 0, 0, 0, 0.6, 0.8], dtype=torch.float64))[:3, :3]
@@ -45,8 +45,8 @@ def test_a_pose_is_the_product_of_the_joints(gantry: Path) -> None:
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_motions_are_the_derivatives_of_poses(backwards: bool) -> None:
-    arm = ArmOptions().arm()
-    angles, tool = torch.randn(3, 6).double(), se3.exp(torch.randn(3, 6).double())
+    arm = ArmOptions().arm(1.0)
+    angles, tool = arm.placed(torch.randn(3, 6).double()), se3.exp(torch.randn(3, 6).double())
     posed = PosedArm(arm, (1, 2, 4), angles, tool, backwards)
     offsets = torch.randn(3).double()
     slope = torch.autograd.functional.jacobian(posed.poses, offsets)
@@ -58,12 +58,23 @@ def test_motions_are_the_derivatives_of_poses(backwards: bool) -> None:
 def test_a_corrected_description_at_angles_is_the_old_one_at_true_angles(
     gantry: Path, tmp_path: Path
 ) -> None:
-    arm, offsets = Arm.read(gantry, tip="hand"), {"rail": 0.01, "wrist": -0.004}
+    arm = Arm.read(gantry, tip="hand", tolerance=0.1)
+    assert arm.names == ("rail", "mast z", "wrist")
+    offsets = {"rail": 0.01, "mast z": 0.02, "wrist": -0.004}
     file = tmp_path / "corrected.urdf"
     file.write_text(corrected_description(gantry, arm, offsets))
     angles = torch.randn(4, 2).double()
-    true = angles + torch.tensor([*offsets.values()], dtype=torch.float64)
+    true = arm.placed(angles) + torch.tensor([*offsets.values()], dtype=torch.float64)
     assert torch.allclose(Arm.read(file, tip="hand").poses(angles), arm.poses(true), atol=1e-9)
+
+
+def test_a_simulated_arm_of_other_lengths_is_that_of_a_longer_description(tmp_path: Path) -> None:
+    file = tmp_path / "longer.urdf"
+    text = ArmOptions().file.read_text()
+    file.write_text(text.replace("0 0 0.43", "0 0 0.4307").replace('"0 0.11 0"', '"0 0.109 0"'))
+    angles = torch.randn(4, 6).double()
+    exact = ArmOptions(lengths_mm=(0.0, -1.0, 0.7)).exact(angles)
+    assert torch.allclose(exact, Arm.read(file).poses(angles), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,7 @@ _PRIOR = "What other cameras of the type have in common: a file that tofcorr poo
 _NAMED = "A diagnosis: what it names is corrected too, where held-out images are better with it."
 _NO_FIGURES = "Write no page, and draw no figures for TensorBoard."
 _WALL = "What is known: nothing; all frames show one wall, and poses are right; or its plane."
+_LENGTHS = "Standard deviation of lengths of the robot's links: estimate their errors too."
 _DRIFTED = "Offset or departure from a plane above which the camera counts as drifted."
 
 
@@ -137,6 +138,7 @@ def pool_command(runs: tuple[Path, ...], out: Path) -> None:
 @click.argument("recordings", nargs=-1, required=True, type=FOLDER)
 @config_options(_TRAINING, "train", "The model and the training", "planes=unknown", "ea")
 @option("--urdf", "The robot: estimate offsets of its joints too.", type=FOLDER)
+@option("--length-tolerance-mm", _LENGTHS, type=float)
 @out_option("Folder with a run for each camera, made anew.")
 @force_option
 @option("--no-figures", "Write no pages, and draw no figures for TensorBoard.", is_flag=True)
@@ -147,12 +149,14 @@ def rig_command(
     no_figures: bool,
     **given: Any,  # noqa: ANN401
 ) -> None:
-    """Fit several cameras of one robot together: their errors, poses, and walls that they share.
+    """Fit cameras of one robot or cell together: their errors, poses, and walls that they share.
 
     A recording belongs to the camera that its `frames` in recording.yaml name; without a name, to
     one called as its folder. OUT holds a run folder for each camera, as `tofcorr train` makes it,
-    and rig.yaml with the transforms between the cameras and the walls. With --urdf the recordings
-    need joint angles; the offsets of the joints are estimated too, and robot.urdf has them.
+    and rig.yaml with the transforms between the cameras and the walls. Cameras that stand still see
+    a target moved by hand; the first one's planes are measured. With --urdf the recordings need
+    joint angles; the offsets of the joints are estimated too, and robot.urdf has them. With
+    --length-tolerance-mm so are the errors of lengths of links.
     """
     from tofcorr.training.rig import rig
 

@@ -45,23 +45,29 @@ class Together(Parameters):
         others: The further cameras.
         planes: The walls; None: they are known.
         offsets: What is added to each joint angle that is estimated, shape (J,), radians or metres.
+        sigmas: Standard deviations of their priors, shape (J,).
         total: The sum of all steps from the start.
     """
 
     others: tuple[Parameters, ...] = ()
     planes: Planes | None = None
     offsets: Float[Tensor, "J"]
+    sigmas: Float[Tensor, "J"]
     total: Float[Tensor, "P"]
 
     @classmethod
     def start(
-        cls, cameras: Sequence[Parameters], planes: Planes | None, offsets: Float[Tensor, "J"]
+        cls,
+        cameras: Sequence[Parameters],
+        planes: Planes | None,
+        offsets: Float[Tensor, "J"],
+        sigmas: Float[Tensor, "J"],
     ) -> "Together":
         """Return unknowns from which no step was taken."""
         first, *others = cameras
         size = sum(one.size for one in cameras) + (0 if planes is None else planes.size)
         total = torch.zeros(size + len(offsets), dtype=torch.float64)
-        shared = {"planes": planes, "offsets": offsets, "total": total}
+        shared = {"planes": planes, "offsets": offsets, "sigmas": sigmas, "total": total}
         return cls(**vars(first), others=tuple(others), **shared)
 
     @property
@@ -188,6 +194,6 @@ def estimate_walls(
         most_steps: Steps after which it ends in any case.
     """
     view, planes = View(moments, walls), Planes(walls.normal_world, walls.offset)
-    together = Together.start([start], planes, walls.offset.new_zeros(0))
+    together = Together.start([start], planes, *walls.offset.new_zeros(2, 0))
     end = estimate_together([view], together, prior, most_steps)
     return end.cameras[0], end.walls_of(view)

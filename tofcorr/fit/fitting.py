@@ -36,7 +36,7 @@ from tofcorr.estimation.joint import Together, View, estimate_together, estimate
 from tofcorr.estimation.linear import Curvature, NormalEquations, solvable
 from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.planes import Planes, Walls, joint_image_equations, within_prior
+from tofcorr.estimation.planes import Planes, joint_image_equations, within_prior
 from tofcorr.estimation.regularisation import (
     penalties_of,
     smoothness,
@@ -56,7 +56,7 @@ from tofcorr.estimation.uncertainty import (
 from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.problem import Core, Fit, FitOptions, Problem, Shift, build_model
 from tofcorr.fit.residual import fit_residual
-from tofcorr.fit.walls import recorded_walls
+from tofcorr.fit.walls import lone_walls, recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights
 from tofcorr.geometry.rays import plane_precision
 from tofcorr.pixels.dataset import Dataset, Frames, thread_number
@@ -182,14 +182,11 @@ def fit_of_moments(problem: Problem, moments: ImageMoments, most_steps: int) -> 
     model = ErrorModel(options, problem.domain)
     moments = with_condition_terms(model, moments, dataset.conditions(frames))
     start, found = problem.start(moments), None
-    columns = "normal_world", "offset", "world_from_tool"
-    normal, offset, pose = (dataset.column(name)[frames] for name in columns)
-    view = View(moments, Walls(normal, offset, torch.arange(len(frames)), pose))
     if problem.estimates_walls:
         found = recorded_walls(dataset, frames)
-        view = View(moments, found.walls)
+    view = View(moments, found.walls if found else lone_walls(dataset, frames))
     planes = found and Planes(found.walls.normal_world, found.walls.offset)
-    together = Together.start([start], planes, offset.new_zeros(0))
+    together = Together.start([start], planes, *start.coefficients.new_zeros(2, 0))
     end = estimate_together([view], together, most_steps=most_steps)
     best, walls = end.cameras[0], end.walls_of(view)
     refuse_diverged(best)

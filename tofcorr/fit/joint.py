@@ -7,7 +7,9 @@ record at one pose of the robot share its error: they are one unit of the jackkn
 
 *What a joint's offset cannot be told from.* The offset of the last joint is the same as a turn of
 the camera about its axis; that of the first joint the same as a turn of all walls, if these are
-unknown. Such an offset stays zero, and is named; hand-eye transform or walls contain it.
+unknown. Such an offset stays zero, and is named; hand-eye transform or walls contain it. Errors of
+lengths of links are offsets too. Whether one is determined is asked as of a joint, which knows
+nothing of it before; then the maker's tolerance is its prior.
 """
 
 from collections.abc import Sequence
@@ -24,7 +26,7 @@ from tofcorr.estimation.joint import Together, View, estimate_together
 from tofcorr.estimation.linear import NormalEquations, solvable
 from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.planes import Planes, Walls, marginal
+from tofcorr.estimation.planes import Planes, marginal
 from tofcorr.estimation.solvers import minimise
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA, Covariance, effective_variance, jackknife
 from tofcorr.fit.fitting import (
@@ -40,6 +42,7 @@ from tofcorr.fit.fitting import (
     within_loss,
 )
 from tofcorr.fit.problem import Core, Fit, Problem, Shift
+from tofcorr.fit.walls import lone_walls
 from tofcorr.fit.weighting import PixelWeights
 from tofcorr.geometry import se3
 from tofcorr.geometry.arm import Arm, PosedArm
@@ -77,7 +80,7 @@ class JointFit:
             each of the `fits` is on the safe side, as of any training.
         shared: The numbers of each camera's walls among all walls; None: the walls are known.
         arm: The robot's arm; None: its poses are right.
-        chosen: Places of the joints whose offsets were estimated.
+        chosen: Places of the joints and lengths whose offsets were estimated.
         undetermined: Of the others, by place: what the offset cannot be told from.
     """
 
@@ -95,24 +98,25 @@ class JointFit:
 
         A twist moves the transform T to T exp(twist): it is in the axes of the second camera.
         """
-        transforms = [fit.solution.parameters.tool_from_camera for fit in self.fits]
+        cameras, places = self.together.cameras, self.together.places()
+        transforms = [one.tool_from_camera for one in cameras]
         found = se3.inverse(transforms[first]) @ transforms[second]
-        places = self.together.places()
-        both = torch.cat([places[one][:6] for one in (first, second)])
+        slopes = {first: -adjoint(se3.inverse(found)), second: torch.eye(6).to(found)}
+        # The first camera around a cell is where it is by definition.
+        free = [one for one in slopes if cameras[one].hand_eye_is_free]
+        both = torch.cat([places[one][:6] for one in free])
         matrix = self.covariance.matrix[both][:, both]
-        left = [self.fits[one].hand_eye_covariance for one in (first, second)]
-        scatter = [self.fits[one].covariance.matrix[:6, :6] for one in (first, second)]
+        left = [self.fits[one].hand_eye_covariance for one in free]
+        scatter = [self.fits[one].covariance.matrix[:6, :6] for one in free]
         # What is left of the noise's shift and of errors that the models lack is each camera's own.
         matrix = matrix + torch.block_diag(*left) - torch.block_diag(*scatter)
-        slope = torch.cat([-adjoint(se3.inverse(found)), torch.eye(6).to(found)], dim=1)
+        slope = torch.cat([slopes[one] for one in free], dim=1)
         return found, slope @ matrix @ slope.T
 
 
 def adjoint(transform: Tensor) -> Tensor:
     """Return A (6, 6) with T exp(twist) T^-1 = exp(A twist)."""
-    moved = transform @ se3.GENERATORS.to(transform) @ se3.inverse(transform)
-    turns = torch.stack([moved[:, 2, 1], moved[:, 0, 2], moved[:, 1, 0]])
-    return torch.cat([moved[:, :3, 3].T, turns])
+    return se3.vee(transform @ se3.GENERATORS.to(transform) @ se3.inverse(transform)).T
 
 
 def fit_together(problems: Sequence[Problem], arm: Arm | None = None) -> JointFit:
@@ -121,8 +125,8 @@ def fit_together(problems: Sequence[Problem], arm: Arm | None = None) -> JointFi
     Args:
         problems: What to fit, a camera each; without residual networks. Walls are estimated in all
             of them or in none.
-        arm: The robot that carries them; its joints' offsets are estimated as well. None: the
-            recorded poses are right.
+        arm: The robot that carries them; offsets of its joints, and of its lengths if it has some,
+            are estimated as well. None: the recorded poses are right.
 
     Raises:
         CalibrationDataError: A camera cannot be fitted alone, or its recordings lack joint angles.
@@ -141,15 +145,18 @@ def fit_together(problems: Sequence[Problem], arm: Arm | None = None) -> JointFi
             view = replace(one.view, walls=walls, weight=weight, moments=one.core.moments)
             cameras[k] = replace(one, view=view)
         zero = torch.zeros(len(joints), dtype=torch.float64)
-        together = Together.start([_found(one) for one in cameras], planes, zero)
-        undetermined = _undetermined(cameras, together, variances[0])
+        # Nothing is known of lengths either, until it is known which are determined.
+        wide = torch.full_like(zero, OFFSET_SIGMA)
+        together = Together.start([_found(one) for one in cameras], planes, zero, wide)
+        undetermined = _undetermined(cameras, together, variances[0], arm)
         chosen = tuple(k for k in joints if k not in undetermined)
+        sigma = wide if arm is None else wide.minimum(arm.tolerance)[list(chosen)]
         arms = [one.view.arm and replace(one.view.arm, chosen=chosen) for one in cameras]
         cameras = [
             replace(one, view=replace(one.view, arm=own))
             for one, own in zip(cameras, arms, strict=True)
         ]
-        together = Together.start(together.cameras, planes, zero[: len(chosen)])
+        together = Together.start(together.cameras, planes, zero[: len(chosen)], sigma)
         coupled = shared is not None and len(torch.cat(shared).unique()) < sum(map(len, shared))
         if coupled or chosen:
             prior = _prior(cameras, together, variances[0], smoothness=True)[0]
@@ -205,12 +212,7 @@ def _alone(problem: Problem, arm: Arm | None, joints: Sequence[int]) -> _Camera:
         problem, core = on_walls(problem, moments)
         refuse_diverged(core.solution.parameters)
     data, frames = problem.dataset, problem.frames
-    if problem.walls is not None:
-        walls = problem.walls.walls
-    else:  # Every image has a plane of its own.
-        names = "normal_world", "offset", "world_from_tool"
-        normal, offset, pose = (data.column(name)[frames] for name in names)
-        walls = Walls(normal, offset, torch.arange(len(frames)), pose)
+    walls = problem.estimated or lone_walls(data, frames)
     posed = None if arm is None else posed_arm(arm, joints, data, frames)
     view = View(core.moments, walls, posed)
     noise = known_noise(problem, weights)
@@ -230,11 +232,12 @@ def posed_arm(arm: Arm, chosen: Sequence[int], data: Dataset, frames: Frames) ->
         if recording.frames.joint_angles is None:
             said = f"{recording.path / TABLE_FILE}: columns 'joint_1', 'joint_2', ... are missing"
             raise CalibrationDataError(f"{said}; a fit of the robot's joints needs them.")
-        if (number := recording.frames.joint_angles.shape[1]) != len(arm.names):
+        names = [name for name, long in zip(arm.names, arm.is_length, strict=True) if not long]
+        if (number := recording.frames.joint_angles.shape[1]) != len(names):
             said = f"{recording.path / TABLE_FILE}: there are {number} joint angles, the URDF has"
-            raise CalibrationDataError(f"{said} {len(arm.names)}: {', '.join(arm.names)}.")
+            raise CalibrationDataError(f"{said} {len(names)}: {', '.join(names)}.")
     at, path = torch.as_tensor(np.asarray(frames)), data.first.path
-    angles, pose = (data.column(name)[at] for name in ("joint_angles", "world_from_tool"))
+    angles, pose = arm.placed(data.column("joint_angles")[at]), data.column("world_from_tool")[at]
     backwards = data.first.frame_names.eye_to_hand
     tool = se3.inverse(arm.poses(angles)) @ (se3.inverse(pose) if backwards else pose)
     off = float((tool - tool[:1]).abs().amax())
@@ -302,12 +305,12 @@ def _shared_walls(
 
 
 def _undetermined(
-    cameras: Sequence[_Camera], together: Together, variance: float
+    cameras: Sequence[_Camera], together: Together, variance: float, arm: Arm | None
 ) -> dict[int, str]:
     """Return the joints whose offsets nothing determines, and what they cannot be told from."""
     places = together.places()
     joints, found = places[-1], dict[int, str]()
-    if not len(joints):
+    if arm is None:
         return found
     prior, _ = _prior(cameras, together, variance, smoothness=True)
     images = together.all_equations([one.view for one in cameras]).total().plus(prior)
@@ -321,15 +324,16 @@ def _undetermined(
         kept = (free & ~known).nonzero()[:, 0]
         every = torch.zeros(together.size, dtype=torch.float64)
         every[kept] = torch.linalg.inv(precision[kept][:, kept]).diagonal()
-        return every[joints] / OFFSET_SIGMA**2
+        return every[joints] / together.sigmas**2
 
     nothing = torch.zeros_like(free)
     # Half of the variance is then the prior's.
     while (here := share(nothing)).max() > 1 / 2:
         worst = int(here.argmax())
-        groups = {"a turn of the camera about its axis": torch.cat([p[:6] for p in places[:-2]])}
-        groups |= {"a turn of all walls about its axis": places[-2]}
-        groups |= {"those of other joints together": joints}
+        turn, axis = ("turn", "about its axis") if arm.turns[worst] else ("shift", "along it")
+        groups = {f"a {turn} of the camera {axis}": torch.cat([p[:6] for p in places[:-2]])}
+        groups |= {f"a {turn} of all walls {axis}": places[-2]}
+        groups |= {"those of others together": joints}
         found[worst] = ""
         for words, group in groups.items():
             known = nothing.clone()
@@ -354,13 +358,13 @@ def _prior(
         smoothness: Whether the priors on undetermined directions are left out.
     """
     size, places = together.size, together.places()
-    joints, one = places[-1], torch.eye(len(places[-1]), dtype=torch.float64)
-    gradient, hessian = one.new_zeros(size), one.new_zeros(size, size)
-    of_joints = one.new_zeros(size, len(joints))
-    of_joints[joints] = variance / OFFSET_SIGMA * one
-    scores, loss = [of_joints], variance * (together.offsets / OFFSET_SIGMA).square().sum()
-    gradient[joints] = variance * together.offsets / OFFSET_SIGMA**2
-    hessian[joints[:, None], joints] = variance / OFFSET_SIGMA**2 * one
+    joints, gradient = places[-1], together.total.new_zeros(size)
+    hessian, of_joints = gradient.new_zeros(size, size), gradient.new_zeros(size, len(joints))
+    of_joints[joints] = (variance / together.sigmas).diag()
+    known = variance / together.sigmas**2
+    scores, loss = [of_joints], (known * together.offsets**2).sum()
+    gradient[joints] = known * together.offsets
+    hessian[joints, joints] = known
     for camera, own, there in zip(cameras, together.cameras, places[:-2], strict=False):
         prior = camera.core.smoothness if smoothness else camera.core.total_prior
         if prior is None:
@@ -369,7 +373,7 @@ def _prior(
         loss = loss + weight * found.loss
         gradient[there] += weight * found.gradient
         hessian[there[:, None], there] += weight * found.hessian
-        rows = one.new_zeros(size, prior.factor.shape[0])
+        rows = gradient.new_zeros(size, prior.factor.shape[0])
         rows[there] = weight * prior.scores
         scores.append(rows)
     return NormalEquations(loss, gradient, hessian), scores

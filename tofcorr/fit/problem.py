@@ -411,6 +411,8 @@ class Fit(Core):
         that the model lacks.
         """
         matrix = self.covariance.matrix[:6, :6]
+        if not self.solution.parameters.hand_eye_is_free:
+            return torch.zeros(6, 6).to(matrix)
         for one in (self.noise_shift, self.misfit):
             matrix = matrix if one is None else matrix + torch.outer(one.left, one.left)
         return matrix

@@ -2,15 +2,17 @@
 
 The chain is a product of fixed transforms and of joint motions,
 T = F_0 exp(a_1 q_1) F_1 ... exp(a_J q_J) F_J, with a_j the unit twist of joint j in its own frame.
+The length of a link is a sliding joint whose q is zero: its error is an offset, as of any joint.
 """
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
@@ -26,25 +28,51 @@ class Arm:
     """A chain of joints from a base link to a tip link.
 
     Attributes:
-        names: Of the joints that move, from base to tip.
-        turns: Which of them turn, in radians; the others slide, in metres.
+        names: Of the joints that move, from base to tip, and of lengths, such as `elbow z`.
         fixed: The transforms before, between and after them, shape (J + 1, 4, 4).
         twists: The unit twist of each joint in its own frame, shape (J, 6).
+        tolerance: Standard deviation of each length, metres; infinite for joints, shape (J,).
     """
 
     names: tuple[str, ...]
-    turns: tuple[bool, ...]
     fixed: Float[Tensor, "J1 4 4"]
     twists: Float[Tensor, "J 6"]
+    tolerance: Float[Tensor, "J"]
+
+    @property
+    def turns(self) -> list[bool]:
+        """Which joints turn, in radians; the others and the lengths are in metres."""
+        return self.twists[:, 3:].any(dim=1).tolist()
+
+    @property
+    def is_length(self) -> Bool[Tensor, "J"]:
+        """Which of them are lengths, for which no angle is recorded."""
+        return self.tolerance.isfinite()
+
+    def placed(
+        self, angles: Float[Tensor, "*N M"], lengths: Float[Tensor, "L"] | float = 0.0
+    ) -> Float[Tensor, "*N J"]:
+        """Return what is recorded of the joints, with errors of the lengths in their places."""
+        full = angles.new_zeros(*angles.shape[:-1], len(self.names))
+        full[..., ~self.is_length] = angles
+        full[..., self.is_length] = torch.as_tensor(lengths).to(angles)
+        return full
 
     @classmethod
-    def read(cls, path: Path | str, base: str | None = None, tip: str | None = None) -> "Arm":
+    def read(
+        cls,
+        path: Path | str,
+        base: str | None = None,
+        tip: str | None = None,
+        tolerance: float = math.inf,
+    ) -> "Arm":
         """Read the chain between two links of a robot description.
 
         Args:
             path: A URDF file; expand xacro before.
             base: Link where the chain begins; None, or no link of this name: the root.
             tip: Link where it ends; None, or no link of this name: the only link without children.
+            tolerance: Of lengths, metres: numbers in an `origin` that are larger are lengths.
 
         Raises:
             ConfigError: The file is no URDF, the tip is not determined, or the chain cannot move.
@@ -63,24 +91,30 @@ class Arm:
         while link in parents and link != base and len(chain) <= len(parents):
             chain.insert(0, joints[link])
             link = parents[link]
-        fixed, twists, names = [torch.eye(4, dtype=torch.float64)], list[Tensor](), list[str]()
+        one, moves = torch.eye(6, dtype=torch.float64), list[tuple[str, Tensor, Tensor, float]]()
+        before = still = one[:4, :4]
         for joint in chain:
-            fixed[-1] = fixed[-1] @ origin_of(joint, path)
-            kind = joint.get("type", "")
+            origin, (name, kind) = (
+                origin_of(joint, path),
+                (joint.get(k, "") for k in ("name", "type")),
+            )
+            for k in (origin[:3, 3].abs() > tolerance).nonzero()[:, 0].tolist():
+                moves.append((f"{name} {'xyz'[k]}", before, one[k], tolerance))
+                before = still
+            before = before @ origin
             if kind in _MOVING:
                 axis = _numbers(joint.find("axis"), "xyz", path, (1.0, 0.0, 0.0))
-                twist = torch.zeros(6, dtype=torch.float64)
-                twist[_MOVING[kind] :][:3] = torch.nn.functional.normalize(axis, dim=0)
-                twists.append(twist)
-                names.append(joint.get("name", ""))
-                fixed.append(torch.eye(4, dtype=torch.float64))
+                twist = torch.nn.functional.normalize(axis, dim=0) @ one[_MOVING[kind] :][:3]
+                moves.append((name, before, twist, math.inf))
+                before = still
             elif kind != "fixed":
-                said = f"joint {joint.get('name')} is of type '{kind}'"
+                said = f"joint {name} is of type '{kind}'"
                 raise ConfigError(f"{path}: {said}; known: {', '.join(_MOVING)}, fixed.")
-        if not names:
+        if all(math.isfinite(slack) for *_, slack in moves):
             raise ConfigError(f"{path}: no joint moves between '{base}' and '{tip}'.")
-        turns = tuple(bool(twist[3:].any()) for twist in twists)
-        return cls(tuple(names), turns, torch.stack(fixed), torch.stack(twists))
+        names, fixed, twists, tolerances = zip(*moves, strict=True)
+        parts = torch.stack([*fixed, before]), torch.stack(twists)
+        return cls(names, *parts, before.new_tensor(tolerances))
 
     def _frames(self, angles: Float[Tensor, "N J"]) -> Float[Tensor, "N J1 4 4"]:
         """Return the frame of each joint after its motion, and last that of the tip."""
@@ -99,8 +133,7 @@ class Arm:
         """Return M_j with dT / dq_j = T M_j: how each joint moves the tip, in the tip's frame."""
         frames = self._frames(angles)
         joint_from_tip = se3.inverse(frames[:, :-1]) @ frames[:, -1:]
-        moves = (self.twists[..., None, None] * se3.GENERATORS.to(angles)).sum(1)
-        return se3.inverse(joint_from_tip) @ moves @ joint_from_tip
+        return se3.inverse(joint_from_tip) @ se3.hat(self.twists) @ joint_from_tip
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +143,7 @@ class PosedArm:
     Attributes:
         arm: The chain.
         chosen: Places of the joints whose offsets are asked for.
-        angles: Of all joints at each frame, as recorded, shape (N, J).
+        angles: Of all joints at each frame, as recorded, and zero for lengths, shape (N, J).
         tip_from_tool: At each frame, shape (N, 4, 4).
         backwards: Whether `tool` is the robot's base and `world` its tip (eye-to-hand).
     """

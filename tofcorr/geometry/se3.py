@@ -50,9 +50,8 @@ def exp(twist: Tensor) -> Tensor:
     Returns:
         Transforms, shape (..., 4, 4).
     """
-    matrix = (twist[..., None, None] * GENERATORS.to(twist)).sum(-3)
     # In float64, whose products no program asks for in fewer digits.
-    found = torch.linalg.matrix_exp(matrix.double()).to(twist)
+    found = torch.linalg.matrix_exp(hat(twist).double()).to(twist)
     return assemble(found[..., :3, :3], found[..., :3, 3])
 
 
@@ -69,12 +68,23 @@ GENERATORS = _generators()
 """The matrices that the entries of a twist multiply, translations first, shape (6, 4, 4)."""
 
 
+def hat(twist: Tensor) -> Tensor:
+    """Return the matrices (..., 4, 4) of twists (..., 6)."""
+    return (twist[..., None, None] * GENERATORS.to(twist)).sum(-3)
+
+
+def vee(matrix: Tensor) -> Tensor:
+    """Return the twists (..., 6) of matrices (..., 4, 4); inverse of `hat`."""
+    shared = matrix[..., None, :, :] * GENERATORS.to(matrix)
+    return shared.sum((-2, -1)) / GENERATORS.abs().sum((-2, -1)).to(matrix)
+
+
 def small_motion(twist: Tensor) -> Tensor:
     """Return exp of twists (F, 6) to second order, shape (F, 4, 4).
 
     Exact to 1e-6 m at 10 cm, and to 1e-7 at 10 mrad.
     """
-    matrix = (twist[:, :, None, None] * GENERATORS.to(twist)).sum(1)
+    matrix = hat(twist)
     return torch.eye(4).to(twist) + matrix + matrix @ matrix / 2
 
 

@@ -1,5 +1,6 @@
 """All options of the simulator: what `configs/simulate/*.yaml` holds."""
 
+import math
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -119,21 +120,28 @@ class ConditionOptions(Options):
     recorded: tuple[Annotated[str, among(COLUMN_OF, "optional column")], ...] = tuple(COLUMN_OF)
 
 
+def _filled(values: tuple[float, ...], number: int) -> Tensor:
+    return torch.tensor([*values, *[0.0] * number][:number], dtype=torch.float64)
+
+
 class ArmOptions(Options):
     """The robot's arm: its joint angles are recorded, and its joints may have offsets.
 
     The world is the frame of its base. Recorded poses are those of its description at the recorded
-    angles; the true ones have the offsets.
+    angles; the true ones have the offsets, and links of other lengths.
 
     Attributes:
         urdf: File of its description; null: an arm of six axes with a reach of 0.85 m.
         offsets_deg: What is added to each recorded angle, from the base on (of a sliding joint,
             as many 17.5 mm); those that are not given are zero.
+        lengths_mm: What each link is longer, from the base on: a length is a number of a joint's
+            `origin` that is not zero; those that are not given are zero.
         home_deg: Angles from which each pose is looked for; those that are not given are zero.
     """
 
     urdf: str | None = None
     offsets_deg: tuple[Number, ...] = ()
+    lengths_mm: tuple[Number, ...] = ()
     home_deg: tuple[Number, ...] = (0.0, -40.0, 100.0, -60.0, 20.0, 0.0)
 
     @property
@@ -142,14 +150,20 @@ class ArmOptions(Options):
         shipped = files("tofcorr.simulation").joinpath("arm.urdf")
         return Path(str(shipped) if self.urdf is None else self.urdf)
 
-    def arm(self) -> Arm:
-        """Return the chain of joints."""
-        return Arm.read(self.file)
+    def arm(self, tolerance_mm: float = math.inf) -> Arm:
+        """Return the chain of joints, and of lengths above a tolerance."""
+        return Arm.read(self.file, tolerance=tolerance_mm / 1000)
 
     def radians(self, degrees: tuple[float, ...], number: int) -> Tensor:
         """Return angles of all joints, shape (J,), radians."""
-        given = torch.tensor([*degrees, *[0.0] * number][:number], dtype=torch.float64)
-        return torch.deg2rad(given)
+        return torch.deg2rad(_filled(degrees, number))
+
+    def exact(self, angles: Tensor) -> Tensor:
+        """Return the true base_from_tip at recorded angles (N, J), shape (N, 4, 4)."""
+        long = self.arm(0.0)
+        lengths = _filled(self.lengths_mm, int(long.is_length.sum())) / 1000
+        offsets = self.radians(self.offsets_deg, angles.shape[1])
+        return long.poses(long.placed(angles + offsets, lengths))
 
 
 class RobotOptions(Options):

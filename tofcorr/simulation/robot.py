@@ -76,8 +76,7 @@ def draw_plan(
     if robot.arm is not None:
         arm = robot.arm.arm()
         angles, _ = joint_angles(arm, commanded, robot.arm)
-        offsets = robot.arm.radians(robot.arm.offsets_deg, len(arm.names))
-        commanded, exact = arm.poses(angles), arm.poses(angles + offsets)
+        commanded, exact = arm.poses(angles), robot.arm.exact(angles)
     reached = [pose @ se3.exp(draw_slip(robot, generator)) for pose in exact]
     if num_frames is not None and num_frames > len(stops):
         said = f"{num_frames} frames are asked for, but the options plan {len(stops)}"
@@ -140,9 +139,7 @@ def joint_angles(arm: Arm, base_from_tip: Tensor, options: ArmOptions) -> tuple[
     damping = torch.eye(len(arm.names), dtype=torch.float64) / 1000
     for _ in range(60):  # Poses within reach take 10 to 40.
         off = se3.log(se3.inverse(arm.poses(angles)) @ base_from_tip)
-        moves = arm.motions(angles)
-        turns = torch.stack([moves[..., 2, 1], moves[..., 0, 2], moves[..., 1, 0]], dim=-2)
-        slope = torch.cat([moves[..., :3, 3].mT, turns], dim=-2)
+        slope = se3.vee(arm.motions(angles)).mT
         normal = slope.mT @ slope + damping * off.square().sum(1)[:, None, None].clamp(max=1)
         step = torch.linalg.lstsq(normal, slope.mT @ off[..., None]).solution[..., 0]
         angles = angles + step.clamp(-0.5, 0.5)

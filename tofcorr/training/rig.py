@@ -1,12 +1,13 @@
-"""`tofcorr.rig`: calibrate several cameras of one robot together, and the robot's own errors."""
+"""`tofcorr.rig`: calibrate cameras of one robot or cell together, and the robot's own errors."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,11 +20,14 @@ from tofcorr.estimation.uncertainty import worst_axes
 from tofcorr.files import refuse_existing, staged_folder, write_json
 from tofcorr.fit.joint import JointFit, fit_together
 from tofcorr.fit.problem import Problem
+from tofcorr.geometry import se3
 from tofcorr.geometry.arm import Arm
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import (
     Dataset,
+    HandEyeOptions,
+    PlaneChoice,
     Recordings,
     opened,
     resolved_planes,
@@ -69,7 +73,7 @@ class RigResult:
                 (staged / name).mkdir()
                 result.write_into(staged / name)
             write_json(staged / RIG_FILE, self.report)
-            found = {key: self.report[key] for key in ("transforms", "walls", "joints")}
+            found = {key: self.report[key] for key in ("transforms", "walls", "joints", "lengths")}
             if self.robot is not None:
                 (staged / ROBOT_FILE).write_text(self.robot, encoding="utf-8")
             (staged / "rig.yaml").write_text(dump_yaml(found), encoding="utf-8")
@@ -83,7 +87,7 @@ class RigResult:
     @property
     def details(self) -> str:
         """All that was found together, and all that each camera's training says of itself."""
-        number = len(self.report["transforms"]) + len(self.report["joints"])
+        number = sum(len(self.report[key]) for key in ("transforms", "joints", "lengths"))
         texts = [f"{name}\n{one.details}" for name, one in self.cameras.items()]
         return "\n".join(
             [*self._first(len(self.cameras) + 1, number), *self.report["warnings"], *texts]
@@ -101,7 +105,7 @@ class RigResult:
             f"Verdict: {report['verdict']}. {report['reason']}",
             *at_most(cameras, aligned(rows)),
             *at_most(others, transforms),
-            *at_most(max(others, 3), _joint_lines(report["joints"])),
+            *at_most(max(others, 3), _offset_lines(report)),
         ]
 
 
@@ -110,12 +114,14 @@ def rig(
     config: Config = "ea",
     *,
     urdf: Path | str | None = None,
+    length_tolerance_mm: float | None = None,
     out: Path | str | None = None,
     force: bool = False,
 ) -> RigResult:
-    """Fit the error models and hand-eye transforms of several cameras of one robot together.
+    """Fit the error models and hand-eye transforms of cameras of one robot, or cell, together.
 
-    Walls in unknown places are those of all cameras that see them. Recordings belong to one camera
+    Walls in unknown places are those of all cameras that see them. Cameras that stand still are
+    related by a target that is moved by hand, see `around_cell`. Recordings belong to one camera
     if their `frames` in recording.yaml give it the same name. A recording whose camera has the
     usual name, `camera`, is of a camera called as its folder.
 
@@ -124,30 +130,43 @@ def rig(
         config: As for `tofcorr.train`, for every camera; without a residual network.
         urdf: Description of the robot. The offsets of its joints are estimated as well; the
             recordings need the columns `joint_1`, `joint_2`, ...
+        length_tolerance_mm: Standard deviation that the robot's maker states of lengths of links;
+            they are estimated as well. None: those of the URDF are right.
         out: Folder with a run folder for each camera, written whole or not at all; nothing may be
             there yet. None writes nothing; `RigResult.save` does later.
         force: Fit whatever the recordings look like, and write correctors whatever the verdicts.
 
     Raises:
         ConfigError: The configuration is wrong, or the URDF is not that of the recordings.
-        CalibrationDataError: A camera cannot be calibrated, no robot moves it, or `out` exists.
+        CalibrationDataError: A camera cannot be calibrated, nothing relates it, or `out` exists.
     """
     options = resolve_options(TrainingOptions, config)
     if options.residual is not None:
         raise ConfigError(
             "rig: expected `residual: null`: a network is fitted to one camera alone."
         )
+    if length_tolerance_mm is not None and (urdf is None or not length_tolerance_mm > 0):
+        said = f"a positive number, and the robot's URDF, got {length_tolerance_mm:g}, {urdf}"
+        raise ConfigError(f"rig: a tolerance of lengths needs {said}.")
     if out is not None:
         refuse_existing(Path(out))
     with timed_stages("rig", written=out is not None) as (stage, seconds):
         with stage("read"):
             named = _by_camera(recordings)
+            still = not all(data.moves for data in named.values())
+            named = around_cell(named, options.planes) if still else named
             everything = [one for data in named.values() for one in data.recordings]
-            arm = None if urdf is None else _arm(urdf, next(iter(named.values())))
+            tolerance = math.inf if length_tolerance_mm is None else length_tolerance_mm / 1000
+            arm = None if urdf is None else _arm(urdf, next(iter(named.values())), tolerance)
             planes = resolved_planes(options.planes, everything)
             options = options.model_copy(update={"planes": planes})
+            fixed = {"hand_eye": HandEyeOptions(estimate="no")} if still else {}
+            first = options.model_copy(update=fixed)
         with stage("inspect"):
-            seen = {name: inspected(data, options, force=force) for name, data in named.items()}
+            seen = {
+                name: inspected(data, options if k else first, force=force)
+                for k, (name, data) in enumerate(named.items())
+            }
         with stage("fit"):
             problems, monitors = list[Problem](), {name: RunMonitor() for name in seen}
             for name, (data, own, _, left_out) in seen.items():
@@ -194,27 +213,73 @@ def _by_camera(recordings: Recordings) -> dict[str, Dataset]:
                     f"{said}. Name them: `frames: {{camera: NAME}}` in recording.yaml."
                 )
         named.setdefault(name, []).append(one)
-    found = {name: Dataset(tuple(own)) for name, own in named.items()}
-    for data in found.values():
-        if not data.moves:
-            said = "no robot moves this camera, so that nothing relates it to others"
-            raise CalibrationDataError(
-                f"{data.first.path}: {said}. Calibrate it by `tofcorr train`."
+    return {name: Dataset(tuple(own)) for name, own in named.items()}
+
+
+def around_cell(named: Mapping[str, Dataset], planes: PlaneChoice = "auto") -> dict[str, Dataset]:
+    """Return recordings of cameras that stand still as those of one tool before a wall.
+
+    While a target is moved by hand, a camera that stands still sees what one sees that moves before
+    a wall. The planes that the first camera saw say how; it is the tool. What cameras saw at one
+    station (`pose_id`), they saw from one pose of the tool.
+
+    Raises:
+        CalibrationDataError: There is one camera, some move, stations have no names, the first
+            camera lacks one of them, or its planes were not measured.
+    """
+    first = next(iter(named.values()))
+    moving = next((data for data in named.values() if data.moves), None)
+    if moving or len(named) < 2:
+        said = "a camera that stands still goes with others that do, or alone with `tofcorr train`"
+        raise CalibrationDataError(f"{(moving or first).first.path}: {said}.")
+    if resolved_planes(planes, first.recordings) == "unknown":
+        said = "the first camera's planes were not measured: errors of depth and places look alike"
+        raise CalibrationDataError(f"{first.first.path}: {said}. Give another camera first.")
+    known = first.plane_covariance()
+    poses = se3.inverse(se3.world_from_plane(first.column("normal_world"), first.column("offset")))
+    places, placed = dict[str, int](), dict[str, Dataset]()
+    for name, data in named.items():
+        data.require("pose_id", "a fit of cameras that stand still")
+        stations = [station for one in data.recordings for station in one.frames.pose_id]
+        places = places or {station: number for number, station in enumerate(stations)}
+        if lone := sorted({*stations} - {*places}):
+            said = f"{first.first.path} has no frame of pose_id '{lone[0]}', whose plane is needed"
+            raise CalibrationDataError(f"{data.first.path}: {said}. Record it there too.")
+        at = [places[station] for station in stations]
+        pose = poses[at]
+        columns = {
+            "world_from_tool": pose,
+            "normal_world": pose.new_tensor([0, 0, 1]).expand(len(at), 3),
+            "offset": pose.new_zeros(len(at)),
+        }
+        if known is not None:
+            columns["plane_covariance"] = se3.inverse(pose).mT @ known[at] @ se3.inverse(pose)
+        recordings = [
+            replace(
+                one,
+                planes="recorded",
+                frames=replace(one.frames, plane_covariance=None),
+                tool_from_camera=np.eye(4) if data is first else one.tool_from_camera,
+                frame_names=one.frame_names.model_copy(update={"tool": next(iter(named))}),
             )
-    return found
+            for one in data.recordings
+        ]
+        numbers = {key: value.numpy() for key, value in columns.items()}
+        placed[name] = Dataset(tuple(recordings)).with_columns(**numbers)
+    return placed
 
 
-def _arm(urdf: Path | str, data: Dataset) -> Arm:
+def _arm(urdf: Path | str, data: Dataset, tolerance: float) -> Arm:
     """Return the robot's chain between the links that the recording names."""
     frames = data.first.frame_names
     base, tip = (frames.tool, frames.world) if frames.eye_to_hand else (frames.world, frames.tool)
-    return Arm.read(urdf, base, tip)
+    return Arm.read(urdf, base, tip, tolerance)
 
 
 def _report(joint: JointFit, cameras: Mapping[str, TrainingResult]) -> dict[str, Any]:
     """Return the content of rig.json: millimetres and degrees, intervals of 95 %."""
-    freedom, names = joint.covariance.degrees_of_freedom, list(cameras)
-    quantile = student_quantile(39 / 40, freedom)
+    names = list(cameras)
+    quantile = student_quantile(39 / 40, joint.covariance.degrees_of_freedom)
     transforms = [
         _transform(joint, names, pair, quantile) for pair in combinations(range(len(names)), 2)
     ]
@@ -228,6 +293,7 @@ def _report(joint: JointFit, cameras: Mapping[str, TrainingResult]) -> dict[str,
             f"{loosest['child']} is known in {loosest['parent']} to {known} (95 %, worst axis)."
         )
     walls, warnings = _walls(joint, names)
+    joints, lengths = _offsets(joint, quantile)
     warnings += [f"Warning, {name}: {text}" for name in names for text in reports[name]["warnings"]]
     return {
         "format": "tofcorr-rig",
@@ -249,7 +315,8 @@ def _report(joint: JointFit, cameras: Mapping[str, TrainingResult]) -> dict[str,
         },
         "transforms": transforms,
         "walls": walls,
-        "joints": _joints(joint, quantile),
+        "joints": joints,
+        "lengths": lengths,
         "warnings": warnings,
     }
 
@@ -294,20 +361,24 @@ def _walls(joint: JointFit, names: list[str]) -> tuple[list[dict[str, Any]], lis
     return walls, [f"Warning: {name} {said}" for name in alone if len(names) > 1]
 
 
-def _joints(joint: JointFit, quantile: float) -> list[dict[str, Any]]:
-    """Return the offset of each joint, with its interval, or what it cannot be told from."""
-    found, place = list[dict[str, Any]](), joint.together.places()[-1]
-    variances, offsets = joint.covariance.matrix.diagonal()[place], joint.together.offsets
-    for number, name in enumerate(() if joint.arm is None else joint.arm.names):
-        assert joint.arm is not None
-        unit, per_unit = ("deg", math.degrees(1)) if joint.arm.turns[number] else ("mm", 1e3)
-        one: dict[str, Any] = {"joint": name, "unit": unit, "offset": 0.0, "ci95": None}
+def _offsets(joint: JointFit, quantile: float) -> tuple[list[dict[str, Any]], ...]:
+    """Return errors of joints, and of lengths: an interval, or what each cannot be told from."""
+    found, arm = (list[dict[str, Any]](), list[dict[str, Any]]()), joint.arm
+    variances = joint.covariance.matrix.diagonal()[joint.together.places()[-1]].clamp(min=0)
+    for number, name in enumerate(() if arm is None else arm.names):
+        assert arm is not None
+        unit, per_unit = ("deg", math.degrees(1)) if arm.turns[number] else ("mm", 1e3)
+        one = {"joint": name, "unit": unit, "offset": 0.0, "ci95": None, "determined": False}
         one["same_as"] = joint.undetermined.get(number)
         if number in joint.chosen:
             k = joint.chosen.index(number)
-            half = quantile * math.sqrt(max(float(variances[k]), 0.0))
-            one |= {"offset": per_unit * float(offsets[k]), "ci95": per_unit * half}
-        found.append(one)
+            offset, spread = (
+                per_unit * float(x[k]) for x in (joint.together.offsets, variances.sqrt())
+            )
+            one |= {"offset": offset, "ci95": quantile * spread}
+            # Else more than half of the variance is the tolerance's.
+            one["determined"] = 2 * float(variances[k]) < float(arm.tolerance[number]) ** 2
+        found[int(arm.is_length[number])].append(one)
     return found
 
 
@@ -318,17 +389,20 @@ def _transform_line(one: Mapping[str, Any]) -> str:
     return f"{one['child']} in {one['parent']}, mm: {place}; turn ± {turn:.3f} deg (95 %)"
 
 
-def _joint_lines(joints: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the offsets that are determined in one line, and each other in a sentence."""
-    known = [
-        f"{one['joint']} {one['offset']:+.3f} ± {one['ci95']:.3f} {one['unit']}"
-        for one in joints
-        if one["ci95"] is not None
-    ]
-    lines = [f"joint offsets (95 %): {', '.join(known)}"] if known else []
-    for one in joints:
+def _offset_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return the offsets that are determined in a line for each kind, and what of the others."""
+    lines = list[str]()
+    for what, key in (("joint offsets (95 %)", "joints"), ("errors of lengths (95 %)", "lengths")):
+        for head, determined in ((what, True), ("hardly better known than the tolerance", False)):
+            values = [
+                f"{one['joint']} {one['offset']:+.3f} ± {one['ci95']:.3f} {one['unit']}"
+                for one in report[key]
+                if one["ci95"] is not None and one["determined"] is determined
+            ]
+            lines += [f"{head}: {', '.join(values)}"] if values else []
+    for one in (*report["joints"], *report["lengths"]):
         if one["ci95"] is None:
-            same = one["same_as"]
-            why = f"is the same as {same}" if same else "is not determined: the poses hardly use it"
+            unseen = "is not determined: the images hardly show it"
+            why = f"is the same as {one['same_as']}" if one["same_as"] else unseen
             lines.append(f"The offset of {one['joint']} {why}; 0 is used.")
     return lines

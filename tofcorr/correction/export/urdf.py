@@ -7,6 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+import torch
 from jinja2 import Template
 
 from tofcorr.correction.corrector import DepthCorrector
@@ -53,7 +54,7 @@ def export_urdf(corrector: DepthCorrector, path: Path | str, reference: Calibrat
 
 
 def corrected_description(urdf: Path | str, arm: Arm, offsets: Mapping[str, float]) -> str:
-    """Return a robot's description with offsets of joints in their origins.
+    """Return a robot's description with offsets of joints, and of lengths, in the joints' origins.
 
     Angles as the controller reports them then give the true poses: origin exp(axis (q + offset)) is
     a new origin, times exp(axis q).
@@ -61,17 +62,23 @@ def corrected_description(urdf: Path | str, arm: Arm, offsets: Mapping[str, floa
     Args:
         urdf: The description.
         arm: The chain that it holds.
-        offsets: By joint, radians or metres.
+        offsets: By joint or length, radians or metres.
     """
     parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
     root = ET.fromstring(read_text(Path(urdf)), parser)
+    still = torch.eye(4, dtype=torch.float64)
+    moves = {
+        name: se3.exp(offset * arm.twists[arm.names.index(name)])
+        for name, offset in offsets.items()
+    }
     for joint in root.findall("joint"):
         name = joint.get("name", "")
-        if name not in offsets:
+        keys = [*(f"{name} {axis}" for axis in "xyz"), name]
+        if moves.keys().isdisjoint(keys):
             continue
-        turned = se3.exp(offsets[name] * arm.twists[arm.names.index(name)])
+        x, y, z, turned = (moves.get(one, still) for one in keys)
         origin = joint.find("origin")
-        pose = (origin_of(joint, urdf) @ turned).numpy()
+        pose = (x @ y @ z @ origin_of(joint, urdf) @ turned).numpy()
         origin = ET.SubElement(joint, "origin") if origin is None else origin
         origin.set("xyz", " ".join(decimals(pose[:3, 3])))
         origin.set("rpy", " ".join(decimals(roll_pitch_yaw(pose[:3, :3]))))
