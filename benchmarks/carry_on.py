@@ -10,7 +10,9 @@ the mount bumped by 8 mm and 1 degree, with a constant of 3 to 8 mm more, and as
 is mounted elsewhere. `bump`: of 80 frames after a bump some are used, drawn at random or by advice,
 each the one that the update of all expects to tell most. `pool`: a camera type is known from 6
 units; a new one is calibrated from few poses, with the type and without, and compared on held-out
-views. Draws are independent; shares have Wilson intervals.
+views. Then ten frames of another unit in place of the first, and of the first one bumped and warmer
+or only bumped, are named with the type and without. Draws are independent; shares have Wilson
+intervals.
 """
 
 import json
@@ -347,6 +349,7 @@ def pooled(seed: int, count: int, units: int, repeatability: float, out: Path | 
     for number in tqdm(range(count), desc="types", disable=None):
         with tempfile.TemporaryDirectory() as folder:
             lines += one_type(number, seed, units, repeatability, Path(folder))
+    named, lines = ([one for one in lines if (key in one)] for key in ("said", "poses"))
     rows = []
     for poses in POSES:
         own = [one for one in lines if one["poses"] == poses]
@@ -362,7 +365,13 @@ def pooled(seed: int, count: int, units: int, repeatability: float, out: Path | 
         "type better",
     )
     click.echo(table(head, rows))
-    write(lines, out)
+    rows = []
+    for state, way in dict.fromkeys((one["state"], one["way"]) for one in named):
+        own = Counter(one["said"] for one in named if (one["state"], one["way"]) == (state, way))
+        said = ", ".join(f"{name} {number}" for name, number in own.most_common())
+        rows.append((state, way, own.total(), said))
+    click.echo(table(("what happened", "prior", "draws", "named as"), rows))
+    write([*lines, *named], out)
 
 
 def one_type(
@@ -370,9 +379,10 @@ def one_type(
 ) -> list[Values]:
     """Calibrate units of a type, and then one more from few poses; return a line for each."""
     rng = np.random.default_rng([seed, 38, number])
-    base = drawn_camera(rng, repeatability)
+    base, drawn = drawn_camera(rng, repeatability), list[Values]()
     for unit in range(units):
-        recorded(another_camera(base, rng, 10.0), rng, 30, folder / f"recording_{unit}")
+        drawn.append(another_camera(base, rng, 10.0))
+        recorded(drawn[-1], rng, 30, folder / f"recording_{unit}")
         train(folder / f"recording_{unit}", QUIET, out=folder / f"run_{unit}")
     pool([folder / f"run_{unit}" for unit in range(units)], out=folder / "type")
     new = another_camera(base, rng, 10.0)
@@ -399,6 +409,24 @@ def one_type(
             for name, prior in priors.items()
         }
         lines.append({"draw": number, "poses": poses, "rms_mm": found})
+    return lines + replaced(base, drawn[0], np.random.default_rng([seed, 99, number]), folder)
+
+
+def replaced(base: Values, first: Values, rng: np.random.Generator, folder: Path) -> list[Values]:
+    """Name what ten frames show of the first unit of a type, or of another in its place."""
+    lines = []
+    for state in ("another camera", "bumped and warmer", "bumped"):
+        now = another_camera(base, rng, 10.0) if state == "another camera" else first
+        now = later(now, "bumped", rng, 10)
+        if state == "bumped and warmer":
+            sign = float(rng.choice([-1, 1]))
+            now["sensor"]["delays"]["constant_mm"] += sign * float(rng.uniform(3, 8))
+        options = SimulatorOptions.from_mapping(now, "drawn")
+        recording = moved_planes(simulate(options, folder / state.replace(" ", "_")), rng)
+        for way, prior in (("none", None), ("type", folder / "type")):
+            given: Values = {"planes": "unknown", "figures": False, "prior": prior}
+            said = update(folder / "run_0", recording, **given).report["update"]["explanations"]
+            lines.append({"state": state, "way": way, "said": said[0]["changed"], "all": said})
     return lines
 
 

@@ -335,7 +335,9 @@ def _locked(path: Path) -> Iterator[bool]:
 def _leftovers(folder: Path) -> Iterator[Path]:
     """Yield what killed runs of this user left in a folder, which other users may share."""
     with suppress(OSError):
-        for path in sorted(one for one in folder.iterdir() if _OURS.fullmatch(one.name)):
+        # Names alone: folders of thousands of files are looked through for every file written.
+        found = [one.name for one in os.scandir(folder) if _OURS.fullmatch(one.name)]
+        for path in [folder / name for name in sorted(found)]:
             with suppress(OSError):
                 own = not hasattr(os, "getuid") or path.lstat().st_uid == os.getuid()
                 if own and not path.is_symlink():

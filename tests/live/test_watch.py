@@ -22,7 +22,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.files import being_written
 from tofcorr.live.calibration import LiveCalibration
-from tofcorr.live.watch import Watched, serve, watch
+from tofcorr.live.watch import LivePage, Watched, serve, watch
 
 IMAGES = ("depth", "amplitude")
 
@@ -149,9 +149,11 @@ def test_columns_are_known_by_their_names(growing: Growing) -> None:
     other = Watched(growing.folder)
     assert other.poll() == 2
     assert other.page.said == []
-    for one, two in zip(present(same.live).frames, present(other.live).frames, strict=True):
+    lives = present(same.live), present(other.live)
+    for one, two in zip(*(live.frames for live in lives), strict=True):
         np.testing.assert_array_equal(one.row.world_from_tool, two.row.world_from_tool)
-        torch.testing.assert_close(one.moments.gram, two.moments.gram)
+    grams = [[one.moments.gram for one in live._sums.values()] for live in lives]
+    torch.testing.assert_close(*grams)
     growing.append("frames.csv", f"{shuffled(growing.rows[1])}\n".encode())
     for name, image in growing.images.items():
         growing.append(f"{name}.npy", image[2].tobytes())
@@ -248,6 +250,9 @@ def test_only_this_machine_is_answered(growing: Growing) -> None:
     assert list(answers.values()) == [200, 403, 404]
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", server.server_port), timeout=2)
+    for port in (server.server_port, 99_999):
+        with pytest.raises(tofcorr.ConfigError, match=f"cannot have port {port} .*--port"):
+            serve(LivePage("another"), port)
     server.shutdown()
     server.server_close()
 

@@ -275,7 +275,7 @@ def watch_command(
     and limits; or, with --depth, a bag. The options after --depth are those of tofcorr import
     rosbag. Ctrl-C ends it, and writes the calibration to --run.
     """
-    from tofcorr.live.watch import Watched, serve, watch
+    from tofcorr.live.watch import LivePage, Watched, serve, watch
     from tofcorr.training.advice import Workspace
 
     more = {key: given.pop(key) for key in ("wanted_mm", "wanted_deg", "folder")}
@@ -286,11 +286,13 @@ def watch_command(
         from tofcorr.importing.rosbag.growing import GrowingBag
 
         bag = GrowingBag(source, partial(opened, source, given, grows=True))
-    watched = Watched(source, options, bag, **more)
-    if once:
+    page = LivePage(source.name)
+    # A port that cannot be had is said before anything is written.
+    server = None if once else serve(page, port)
+    watched = Watched(source, options, bag, page, **more)
+    if server is None:
         watched.poll()
     else:
-        server = serve(watched.page, port)
         address = f"http://127.0.0.1:{server.server_port}/"
         click.echo(f"{address} shows {source}; Ctrl-C ends it.")
         if not no_browser:
@@ -300,7 +302,7 @@ def watch_command(
         except KeyboardInterrupt:
             server.shutdown()
             server.server_close()
-    click.echo("\n".join([watched.page.state["verdict"], *watched.page.said]))
+    click.echo("\n".join([page.state["verdict"], *page.said]))
     if watched.live is None:
         raise CalibrationDataError(watched.note)
     if run is not None:

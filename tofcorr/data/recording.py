@@ -278,12 +278,13 @@ def pose_numbers(recording: Recording) -> np.ndarray:
         axis=1,
     )
     named = np.full(count, "") if table.pose_id is None else table.pose_id
-    moves, numbers = recording.moves, dict[str, int]()
-    pose, first = np.empty(count, dtype=int), 0
+    numbers, pose, first = dict[str, int](), np.empty(count, dtype=int), 0
+    # Nothing says that the target stood still where no pose is recorded.
+    steps = np.abs(np.diff(place, axis=0, prepend=place[:1])).max(axis=1)
+    near = (steps <= 2 * STANDSTILL) & recording.moves
     for frame in range(count):
         # Compared with the first of the stretch: a slow robot moves less from frame to frame.
-        # Nothing says that the target stood still where no pose is recorded.
-        same = moves and np.abs(place[frame] - place[first]).max() <= STANDSTILL
+        same = near[frame] and np.abs(place[frame] - place[first]).max() <= STANDSTILL
         if not (same and table.target[frame] == table.target[first]):
             first = frame
         name = f"pose {named[frame]}" if named[frame] != "" else f"stretch {first}"

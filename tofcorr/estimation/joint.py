@@ -155,7 +155,7 @@ def estimate_together(
     views: Sequence[View],
     start: Together,
     prior: NormalEquations | None = None,
-    most_steps: int = 100,
+    solver: SolverOptions | None = None,
 ) -> Together:
     """Minimise the loss over the unknowns of all cameras and what they share.
 
@@ -164,15 +164,15 @@ def estimate_together(
         start: The unknowns of each camera, fitted alone, and what is shared as recorded.
         prior: A prior's normal equations at the start, on all unknowns or on the first of them;
             None: there is no prior.
-        most_steps: Steps after which it ends in any case.
+        solver: How far; None: 100 steps at most.
     """
     # Keeps undetermined directions where they started: a prior of 100 mm and 100 mrad, weighed
     # against residuals of 1 mm, in square metres. That is too weak to move what the images do
     # determine, however far off the walls were recorded.
     ridge = torch.eye(start.size, dtype=torch.float64) / 100**2
     held = NormalEquations(ridge.new_zeros(()), ridge.new_zeros(start.size), ridge).plus(prior)
-    options = SolverOptions(max_iterations=most_steps)
-    end = minimise(_JointObjective(views, held), start, options).parameters
+    solver = solver or SolverOptions(max_iterations=100)
+    end = minimise(_JointObjective(views, held), start, solver).parameters
     assert isinstance(end, Together)
     return end
 
@@ -195,5 +195,5 @@ def estimate_walls(
     """
     view, planes = View(moments, walls), Planes(walls.normal_world, walls.offset)
     together = Together.start([start], planes, *walls.offset.new_zeros(2, 0))
-    end = estimate_together([view], together, prior, most_steps)
+    end = estimate_together([view], together, prior, SolverOptions(max_iterations=most_steps))
     return end.cameras[0], end.walls_of(view)

@@ -202,7 +202,7 @@ class MomentObjective:
     def image_losses(self, parameters: Parameters) -> Float[Tensor, "N"]:
         """Return the sum of squared residuals of each image, shape (N,)."""
         p = residual_vectors(self.moments, parameters)
-        return torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
+        return (p * (self.moments.gram @ p[:, :, None])[:, :, 0]).sum(dim=1)
 
     def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
         """Return the loss, differentiable."""

@@ -115,12 +115,14 @@ def marginal_hessian(
 ) -> Float[Tensor, "P P"]:
     """Return the curvature (P, P) of the loss minimised over the walls."""
     hessian = joint_image_equations(moments, parameters, walls).hessian.sum(dim=0)
-    return hessian if walls is None else marginal(hessian, torch.arange(parameters.size))
+    return marginal(hessian, torch.arange(parameters.size))
 
 
 def marginal(hessian: Float[Tensor, "Q Q"], own: Int[Tensor, "P"]) -> Float[Tensor, "P P"]:
     """Return the curvature of some unknowns of a loss minimised over the others: Schur's."""
     others = torch.ones(len(hessian), dtype=torch.bool)
     others[own] = False
+    if not bool(others.any()):
+        return hessian
     cross = hessian[own][:, others]
     return hessian[own][:, own] - cross @ Curvature(hessian[others][:, others]).inverse @ cross.T

@@ -29,11 +29,10 @@ from tofcorr.estimation.moments import (
     HAND_EYE_SYMBOLS,
     LEAST_RESIDUAL,
     ImageMoments,
-    MomentObjective,
     Parameters,
     Prior,
 )
-from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian
+from tofcorr.estimation.planes import Walls, joint_image_equations, marginal
 
 PRIOR_SIGMA = 0.1
 """Standard deviation of the wide prior on every unknown: 100 mm, 100 mrad (5.7 degrees).
@@ -121,7 +120,9 @@ def jackknife(
     return Covariance(matrix, shift)
 
 
-def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
+def effective_variance(
+    moments: ImageMoments, optimum: Parameters, each: NormalEquations | None = None
+) -> float:
     r"""Return the effective variance of a residual, which allows for correlated pixels.
 
     Were the pixels independent, the score :math:`g_i` of image i at the optimum would have the
@@ -133,14 +134,21 @@ def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
 
     It is at least the mean squared residual.
 
+    Args:
+        moments: Moments of the images fitted.
+        optimum: The parameters at the optimum.
+        each: The images' normal equations there, with any unknowns after the others; None: they are
+            formed.
+
     Returns:
         The variance in the unit of the loss: square metres where pixels have weight 1.
     """
-    each = MomentObjective(moments).image_equations(optimum)
+    each, own = each or joint_image_equations(moments, optimum, None), slice(optimum.size)
+    gradient, hessian = each.gradient[:, own], each.hessian[:, own, own]
     least = max(float(each.loss.sum() / moments.count.sum().clamp(min=1)), LEAST_RESIDUAL**2)
-    whitening = Curvature(each.hessian.sum(dim=0)).basis
-    scores = each.gradient @ whitening
-    shares = whitening.T @ each.hessian @ whitening
+    whitening = Curvature(hessian.sum(dim=0)).basis
+    scores = gradient @ whitening
+    shares = whitening.T @ hessian @ whitening
     freedom = float(shares.diagonal(dim1=1, dim2=2).sum() - shares.square().sum())
     return max(float(scores.square().sum()) / freedom, least) if freedom > 0 else least
 
@@ -218,10 +226,11 @@ def observability(
             moments, with the walls.
     """
     names = [*HAND_EYE_SYMBOLS[: optimum.twist_size], *moments.symbols]
-    variance = effective_variance(moments, optimum)
+    each = joint_image_equations(moments, optimum, walls)
+    variance = effective_variance(moments, optimum, each)
     # Curvature that is only rounding is removed: a singular direction is then exactly singular.
     if hessian is None:
-        hessian = marginal_hessian(moments, optimum, walls)
+        hessian = marginal(each.hessian.sum(dim=0), torch.arange(optimum.size))
     root = Curvature(hessian).root
     precision = root @ root.mT / variance
     if prior is not None:

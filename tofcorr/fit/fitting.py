@@ -44,7 +44,7 @@ from tofcorr.estimation.regularisation import (
     total_weight,
     with_strengths,
 )
-from tofcorr.estimation.solvers import Solution, Watcher, minimise
+from tofcorr.estimation.solvers import Solution, SolverOptions, Watcher, minimise
 from tofcorr.estimation.uncertainty import (
     PRIOR_SIGMA,
     Covariance,
@@ -161,33 +161,30 @@ def estimate(problem: Problem, moments: ImageMoments) -> tuple[Problem, Core, Co
     return problem, core, covariance
 
 
-def fit_of_moments(problem: Problem, moments: ImageMoments, most_steps: int) -> Fit:
-    """Return the fit of moments alone, quickly: for few steps, all unknowns and walls at once.
+def fit_of_moments(problem: Problem, moments: ImageMoments) -> Fit:
+    """Return the fit of moments alone, quickly: all unknowns and walls at once.
 
     What the images do not determine stays near the start, and the noise's shift is left in.
 
     Args:
         problem: What to fit, without penalties; it starts where it is resumed.
         moments: Of its frames, with exactly the model's image columns.
-        most_steps: Of the solver.
 
     Raises:
         CalibrationDataError: The frames do not determine the model, or are of fewer than 3 poses.
     """
-    dataset, frames, options = (
-        problem.dataset,
-        problem.frames,
-        with_time_constants(problem, moments),
-    )
+    dataset, frames = problem.dataset, problem.frames
+    options = with_time_constants(problem, moments)
     model = ErrorModel(options, problem.domain)
     moments = with_condition_terms(model, moments, dataset.conditions(frames))
-    start, found = problem.start(moments), None
-    if problem.estimates_walls:
-        found = recorded_walls(dataset, frames)
+    start = problem.start(moments)
+    found = recorded_walls(dataset, frames) if problem.estimates_walls else None
     view = View(moments, found.walls if found else lone_walls(dataset, frames))
     planes = found and Planes(found.walls.normal_world, found.walls.offset)
     together = Together.start([start], planes, *start.coefficients.new_zeros(2, 0))
-    end = estimate_together([view], together, most_steps=most_steps)
+    # Chosen: what is left shows in no digit, and from the last fit it takes one or two steps.
+    quick = SolverOptions(max_iterations=25, tolerance=1 / 1000)
+    end = estimate_together([view], together, solver=quick)
     best, walls = end.cameras[0], end.walls_of(view)
     refuse_diverged(best)
     seen, estimated = walls.seen_by(moments), None if found is None else walls

@@ -88,16 +88,14 @@ def recorded_walls(dataset: Dataset, frames: Frames) -> FoundWalls:
         needed = "at least 3 images of each wall (target and plane in frames.csv)"
         said = f"planes: unknown needs {needed}, '{names[numbers[place]]}' has {count[place]}"
         raise CalibrationDataError(f"{dataset.first.path}: {said}. Record more, or measure.")
-    own = lone_walls(dataset, frames)
-    planes = own.normal_world[first], own.offset[first]
-    walls = Walls(*planes, torch.from_numpy(index), own.world_from_tool)
+    normal, offset, pose = dataset.planes_and_poses(frames)
+    walls = Walls(normal[first], offset[first], torch.from_numpy(index), pose)
     return FoundWalls(of_frame, names, walls, numbers)
 
 
 def lone_walls(dataset: Dataset, frames: Frames) -> Walls:
     """Return a wall for each frame, as recorded."""
-    columns = "normal_world", "offset", "world_from_tool"
-    normal, offset, pose = (dataset.column(name)[frames] for name in columns)
+    normal, offset, pose = dataset.planes_and_poses(frames)
     return Walls(normal, offset, torch.arange(len(pose)), pose)
 
 

@@ -1,18 +1,20 @@
 """`tofcorr.LiveCalibration`: a calibration that grows frame by frame.
 
 A frame is kept as its moments, which hold all that the loss needs, and a lattice of its pixels,
-which gives the ranges and the noise: 11 kB for ever, and 64 kB that become fewer beyond 256 frames,
-in place of 2.5 MB of a VGA image. A linear map takes moments to other ranges. So the finished
-calibration is that of `tofcorr.train` on the same frames, in any order.
+which gives the ranges and the noise: some 10 and 64 kB in place of 2.5 MB of a VGA image. A linear
+map takes moments to other ranges. So the finished calibration is that of `tofcorr.train` on the
+same frames, in any order.
 
 What `add` returns is a quick fit of the moments alone (`fit.fitting.fit_of_moments`), on ranges
-that are a little wider than any frame's so that they seldom change.
+that are a little wider than any frame's so that they seldom change. Of many frames it takes some,
+evenly spread over the recording, and expects of all what their number makes of it. The others may
+stay on disk: neither time nor memory of `add` then grows with the number of frames.
 """
 
 # Long: one class, told in order from a frame to what is known with it.
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -53,17 +55,17 @@ from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance, wo
 from tofcorr.files import refuse_existing, staged_folder
 from tofcorr.fit.fitting import fit, fit_of_moments, with_condition_terms
 from tofcorr.fit.problem import Fit, Problem
-from tofcorr.fit.walls import recorded_walls
+from tofcorr.fit.walls import lone_walls, recorded_walls
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.geometry.rays import plane_in_frame, planes_through, ray_directions
 from tofcorr.live.frames import (
     FRAME_FORM,
     KeptFrame,
+    Sums,
     frame_of,
     is_of_frames,
     mapped,
-    nominal_domain,
     of_images,
     suitable,
     values_of_frame,
@@ -71,13 +73,26 @@ from tofcorr.live.frames import (
 )
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, thread_number
-from tofcorr.pixels.lattice import condition_ranges, covered_domain, joined, lattice_in, most_pixels
+from tofcorr.pixels.lattice import (
+    condition_ranges,
+    covered_domain,
+    joined,
+    lattice_in,
+    most_pixels,
+    scattered,
+)
 from tofcorr.pixels.sample import usable_pixels
-from tofcorr.training.advice import Workspace, choose_views, draw_pool, predicted_precision
+from tofcorr.training.advice import (
+    Workspace,
+    choose_views,
+    domain_of_views,
+    draw_pool,
+    predicted_precision,
+)
 from tofcorr.training.calibration import TrainingOptions
 from tofcorr.training.run import Config, calibration_state
 
-_START, _FILE = "tofcorr-live", "frame-{:06d}.pt"
+_START = "tofcorr-live"
 START_FILE = "live.pt"
 """What a folder of a live calibration begins with."""
 
@@ -144,8 +159,13 @@ class LiveCalibration:
         wanted_deg: The same of the rotation, degrees.
         space: Where the camera may go, turned by `roll_deg` from the frames; None: to the distances
             and tilts of the frames so far, which takes about twice as many poses in the end.
-        folder: Where every frame's sums are written as it comes, so that `resume` loses nothing;
-            None: they are in memory alone.
+        folder: Where every frame's sums are written as it comes, so that `resume` loses nothing and
+            memory does not grow; None: all are in memory.
+
+    Attributes:
+        options: Those of the fit.
+        camera: The intrinsics.
+        known: How well the calibration is known now; None before the first frame.
 
     Raises:
         ConfigError: The configuration needs all pixels at once.
@@ -171,7 +191,6 @@ class LiveCalibration:
         space: Workspace | None = None,
         folder: Path | str | None = None,
     ) -> None:
-        self.options = suitable(resolve_options(TrainingOptions, config))
         self.wanted_mm, self.wanted_deg, self.space = wanted_mm, wanted_deg, space
         self._folder = None if folder is None else Path(folder)
         if isinstance(camera, Recording):
@@ -187,17 +206,20 @@ class LiveCalibration:
                 tool_from_camera=se3.nearest_rigid(guess),
             )
         self._frames: dict[int, KeptFrame] = {}
-        # What the ranges are is not part of what it holds.
-        camera, terms = self._like.camera, of_images(self.options.model)
-        domain = nominal_domain(camera.height, camera.width)
-        design = Design(ErrorModel(terms, domain), domain, ray_directions(camera))
+        # Of the frames that `add` looks at; without a folder of all.
+        self._sums: dict[int, Sums] = {}
+        # The ranges that scale them: any before the first frame.
+        self.camera = self._like.camera
+        self._domain = domain_of_views(self.camera, Workspace(nearest=1.0, farthest=2.0))
+        self.options = suitable(resolve_options(TrainingOptions, config), self._domain)
+        self._terms = of_images(self.options.model)
+        model = ErrorModel(self._terms, self._domain)
+        design = Design(model, self._domain, ray_directions(self.camera))
         self._accumulator = MomentAccumulator(design)
-        # The ranges that scale the moments of all frames.
-        self._domain: Domain | None = None
         # The last fit, of how many frames, and the planes of the walls that it found.
-        self._known: Known | None = None
+        self.known: Known | None = None
         self._fitted = 0
-        self._planes: dict[str, dict[str, Any]] = {}
+        self._planes: dict[str, tuple[np.ndarray, float]] = {}
         if self._folder is not None:
             refuse_existing(self._folder)
             start = {"header": self._like.header.to_mapping(), "config": self.options.to_mapping()}
@@ -213,10 +235,9 @@ class LiveCalibration:
         Raises:
             CalibrationDataError: The folder holds none, or a frame of it is damaged.
         """
-        live, folder = cls.started(folder), Path(folder)
-        live._folder = folder
-        for file in sorted(folder.glob("frame-*.pt")):
-            live._read(file)
+        live = cls.started(folder)
+        for file in sorted(Path(folder).glob("frame-*.pt")):
+            live._include(file)
         if live._frames:
             live._learn(max(live._frames))
         return live
@@ -235,7 +256,9 @@ class LiveCalibration:
         where = str(folder / START_FILE)
         header = Header.from_mapping(start.pop("header"), where, CalibrationDataError)
         space = start.pop("space")
-        return cls(header.recording(folder), space=space and Workspace(**space), **start)
+        live = cls(header.recording(folder), space=space and Workspace(**space), **start)
+        live._folder = folder
+        return live
 
     def take(self, file: Path) -> Known:
         """Take a frame that another process wrote, `frame-*.pt`, and say what is known with it.
@@ -244,22 +267,23 @@ class LiveCalibration:
             CalibrationDataError: The file is damaged.
         """
         with thread_number(1):
-            return self._taught(self._read(file))
+            return self._taught(self._include(file))
 
-    def _read(self, file: Path) -> int:
+    def _include(self, file: Path) -> int:
         """Add the frame of a file to those that are fitted, and return its number."""
+        like, row, sums = self._read(file)
+        self._like = replace(self._like, **like)
+        self._widen(sums.domain)
+        number = int(file.stem.removeprefix("frame-"))
+        self._take(number, row, sums.on(self._domain, self._terms))
+        return number
+
+    def _read(self, file: Path) -> tuple[dict[str, Any], FrameRow, Sums]:
+        """Return what the file of a frame says of all frames, its row, and its sums."""
         values = read_values(file, FRAME_FORM)
         if values is None:
             raise CalibrationDataError(f"{file}: is damaged; remove it to go on without it.")
-        self._like = replace(self._like, **values.pop("like"))
-        number = int(file.stem.removeprefix("frame-"))
-        self._take(number, frame_of(values))
-        return number
-
-    @property
-    def camera(self) -> CameraIntrinsics:
-        """The intrinsics."""
-        return self._like.camera
+        return values.pop("like"), *frame_of(values)
 
     @property
     def frames(self) -> list[KeptFrame]:
@@ -269,18 +293,13 @@ class LiveCalibration:
     @property
     def tool_from_camera(self) -> np.ndarray:
         """The hand-eye transform as far as it is known, shape (4, 4)."""
-        fitted = None if self._known is None or not self._known.is_determined else self._known.fit
+        fitted = None if self.known is None or not self.known.is_determined else self.known.fit
         guess = self._like.tool_from_camera
         return guess if fitted is None else fitted.optimum.tool_from_camera.numpy()
 
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self._frames)
-
-    @property
-    def known(self) -> Known | None:
-        """How well the calibration is known now; None before the first frame."""
-        return self._known
 
     def add(
         self,
@@ -354,18 +373,23 @@ class LiveCalibration:
         number = self._next
         images = self._images(number, depth=depth, amplitude=amplitude, mask=mask)
         with thread_number(1):  # Threads would wait longer than they compute.
-            frame = self._summed(row, images, "recorded" if plane_is_known else "estimated")
+            row, sums = self._summed(row, images, "recorded" if plane_is_known else "estimated")
             if self._folder is not None:
                 like = {"planes": self._like.planes, "amplitude": self._like.amplitude}
-                file, values = self._folder / _FILE.format(number), values_of_frame(frame)
-                save_values(file, FRAME_FORM, {"like": like, **values}, CalibrationDataError)
-            self._take(number, frame)
+                values = {"like": like, **values_of_frame(row, sums)}
+                save_values(self._file(number), FRAME_FORM, values, CalibrationDataError)
+            self._take(number, row, sums)
             return self._taught(number)
+
+    def _file(self, number: int) -> Path:
+        """Return the file of a frame."""
+        assert self._folder is not None
+        return self._folder / f"frame-{number:06d}.pt"
 
     @property
     def _next(self) -> int:
         """Number of the next frame."""
-        return max(self._frames, default=-1) + 1
+        return next(reversed(self._frames), -1) + 1
 
     def remove(self, frame: int) -> Known | None:
         """Take a frame out again, and say what is known without it; None: it was the only one.
@@ -376,10 +400,11 @@ class LiveCalibration:
         if frame not in self._frames:
             raise CalibrationDataError(f"There is no frame {frame} to remove.")
         if self._folder is not None:
-            (self._folder / _FILE.format(frame)).unlink()
+            self._file(frame).unlink()
         del self._frames[frame]
-        self._known = self._learn(max(self._frames)) if self._frames else None
-        return self._known
+        self._sums.pop(frame, None)
+        self.known = self._learn(max(self._frames)) if self._frames else None
+        return self.known
 
     def next_pose(
         self,
@@ -395,12 +420,12 @@ class LiveCalibration:
             candidates: How many poses are compared.
             seed: Of the candidates.
         """
-        if self._known is None or self._known.fit is None:
+        if self.known is None or self.known.fit is None:
             return None
-        found, random = self._known.fit, np.random.default_rng([seed, len(self)])
-        lattice, frames = joined([one.lattice for one in self.frames]), np.arange(len(self))
-        dataset = self._dataset(self._order())
-        if not self._known.is_determined:
+        found, random = self.known.fit, np.random.default_rng([seed, len(self)])
+        dataset, frames, order = self._to_fit()
+        lattice = joined([one.lattice for one in self._kept(order[k] for k in frames)])
+        if not self.known.is_determined:
             # Where the fit stands says nothing yet: the guess does.
             guess = torch.from_numpy(self.tool_from_camera)
             zero = torch.zeros_like(found.optimum.coefficients)
@@ -432,10 +457,11 @@ class LiveCalibration:
         """
         order = self._order()
         dataset, frames = self._dataset(order, found=False), np.arange(len(order))
-        lattice = joined([self._frames[k].lattice for k in order])
-        domain, moments = covered_domain(dataset, frames, lattice), self._moments(dataset, order)
-        assert self._domain is not None
-        change = columns_on(of_images(self.options.model), domain, self._domain)
+        every = [one.thinned(most_pixels(len(order))) for one in self._kept(order)]
+        lattice = joined([one.lattice for one in every])
+        moments = _seen(every, dataset, frames)
+        domain = covered_domain(dataset, frames, lattice)
+        change = columns_on(self._terms, domain, self._domain)
         moments = replace(moments, gram=mapped(moments.gram, change))
         return fit(dataset, frames, self.options, domain, moments=moments, lattice=lattice)
 
@@ -457,36 +483,27 @@ class LiveCalibration:
 
     def _images(self, number: int, **given: Any) -> dict[str, np.ndarray | None]:  # noqa: ANN401
         """Return the images of one frame (1, H, W) as the recording format has them."""
-        size, images = (self._like.camera.height, self._like.camera.width), {}
-        for name, image in given.items():
-            images[name] = None
-            if image is not None:
-                kind = IMAGE_ARRAYS[name]
-                images[name] = np.array(image, dtype=kind.dtype)[None]
-                if images[name].shape[1:] != size:
-                    got = f"got {images[name].shape[1:]}"
-                    raise CalibrationDataError(f"{name}: expected shape {size}, {got}.")
-                kind.check(images[name], [number], self._like.path)
-        return images
+        size = self.camera.height, self.camera.width
+        for name in [name for name, image in given.items() if image is not None]:
+            kind = IMAGE_ARRAYS[name]
+            given[name] = np.array(given[name], dtype=kind.dtype)[None]
+            if (got := given[name].shape[1:]) != size:
+                raise CalibrationDataError(f"{name}: expected shape {size}, got {got}.")
+            kind.check(given[name], [number], self._like.path)
+        return given
 
     def _summed(
-        self,
-        row: FrameRow,
-        images: Mapping[str, np.ndarray | None],
-        planes: Literal["estimated", "recorded"],
-    ) -> KeptFrame:
-        """Return what is kept of a frame."""
+        self, row: FrameRow, images: dict[str, Any], planes: Literal["estimated", "recorded"]
+    ) -> tuple[FrameRow, Sums]:
+        """Return what is kept of a frame, its row with the plane where its wall starts."""
         before = self._like.planes, self._like.amplitude is None
         if self._frames and before != (planes, images["amplitude"] is None):
             said = "give amplitude and plane with every frame, or with none"
             raise CalibrationDataError(f"This frame differs from those before: {said}.")
         known: Any = None if images["amplitude"] is None else True  # The image itself is not kept.
         self._like = replace(self._like, planes=planes, amplitude=known)
-        data = usable_pixels(
-            Dataset((replace(self._like, frames=FrameTable.of([row]), **images),)),
-            self.options,
-            robust=False,
-        )
+        own = replace(self._like, frames=FrameTable.of([row]), **images)
+        data = usable_pixels(Dataset((own,)), self.options, robust=False)
         # Radial distances were recorded in float32, which holds them without loss.
         exact = self._like.depth_kind == "radial" and data.exclude is None
         dtype = torch.float32 if exact else torch.float64
@@ -494,11 +511,20 @@ class LiveCalibration:
         lattice = lattice_in(batch, data.ray_directions())
         # What is known of the frames scales the condition terms, which the sums do not hold.
         domain = replace(covered_domain(data, [0], lattice), conditions={})
-        model = ErrorModel(of_images(self.options.model), domain)
-        moments = self._accumulator.on(model, domain)(batch)
+        self._widen(domain)
+        moments = self._accumulator(batch)
         if planes == "estimated":
             row = self._on_its_wall(row, moments)
-        return KeptFrame.of(row, domain, moments, lattice)
+        return row, Sums(self._domain, moments, lattice)
+
+    def _widen(self, domain: Domain) -> None:
+        """Let the ranges of all frames hold others."""
+        both = self._domain.joined(domain) if self._frames else domain
+        if both != self._domain:
+            self._domain = wider(both)
+            model = ErrorModel(self._terms, self._domain)
+            self._accumulator = self._accumulator.on(model, self._domain)
+            self._sums = {k: one.on(self._domain, self._terms) for k, one in self._sums.items()}
 
     def _on_its_wall(self, row: FrameRow, moments: ImageMoments) -> FrameRow:
         """Return the row with the plane where its target's wall starts: that of its first frame."""
@@ -519,97 +545,105 @@ class LiveCalibration:
             numbers: Those of the frames.
             found: Whether walls are where the last fit found them; else where they start.
         """
-        planes = self._planes if found else {}
-        rows = [self._frames[k].row for k in numbers]
-        table = FrameTable.of([replace(one, **planes.get(one.target, {})) for one in rows])
-        like, size = self._like, (self._like.camera.height, self._like.camera.width)
-        nothing = np.broadcast_to(np.float32(np.nan), (len(rows), *size))
+        table = FrameTable.of([self._frames[k].row for k in numbers])
+        for name, plane in self._planes.items() if found else ():
+            at = table.target == name
+            table.normal_world[at], table.offset[at] = plane
+        like, size = self._like, (self.camera.height, self.camera.width)
+        nothing = np.broadcast_to(np.float32(np.nan), (len(numbers), *size))
         amplitude = None if like.amplitude is None else nothing
-        return Dataset(
-            (replace(like, frames=table, depth=nothing, amplitude=amplitude, mask=None),)
-        )
+        like = replace(like, frames=table, depth=nothing, amplitude=amplitude, mask=None)
+        return Dataset((like,))
 
-    def _moments(self, dataset: Dataset, numbers: list[int]) -> ImageMoments:
-        """Return the moments of frames, which see the planes of their data set."""
-        columns = "normal_world", "offset", "world_from_tool"
-        normal, offset = plane_in_frame(*(dataset.column(name) for name in columns))
-        moments = concatenate([self._frames[k].moments for k in numbers])
-        return replace(moments, normal_tool=normal, offset_tool=offset)
+    def _kept(self, numbers: Iterable[int]) -> Iterator[Sums]:
+        """Yield the sums of frames, on the ranges of all."""
+        for k in numbers:
+            kept = self._sums.get(k)
+            yield kept or self._read(self._file(k))[2].on(self._domain, self._terms)
 
     def _order(self) -> list[int]:
         """Return the frames' numbers in the order of their time stamps."""
         return sorted(self._frames, key=lambda k: (self._frames[k].row.timestamp, k))
 
-    def _take(self, number: int, frame: KeptFrame) -> None:
-        """Add a frame to those that are fitted, on ranges that hold it."""
-        before, terms = self._domain, of_images(self.options.model)
-        if before is None or before.joined(frame.domain) != before:
-            here = wider(frame.domain if before is None else before.joined(frame.domain))
-            if self._frames and before is not None:
-                change = columns_on(terms, here, before)
-                self._frames = {k: one.on(here, change) for k, one in self._frames.items()}
-            self._domain = here
-        assert self._domain is not None
-        change = columns_on(terms, self._domain, frame.domain)
-        self._frames[number] = frame.on(self._domain, change)
-        count = len(self._frames)
-        fewer = most_pixels(count) < most_pixels(count - 1)
-        for k in self._frames if fewer else [number]:
-            one = self._frames[k]
-            self._frames[k] = replace(one, lattice=one.lattice.thinned(count))
+    def _to_fit(self) -> tuple[Dataset, np.ndarray, list[int]]:
+        """Return all frames, which of them `add` fits, and their numbers."""
+        order = self._order()
+        return self._dataset(order), np.flatnonzero(self._is_fitted(np.array(order))), order
+
+    def _is_fitted(self, numbers: np.ndarray) -> np.ndarray:
+        """Return which frames `add` fits: a part of all, evenly spread over them."""
+        parts = 1 << (-(-len(self) // _MOST_FITTED) - 1).bit_length()
+        return scattered(numbers) * parts < 2**32
+
+    def _take(self, number: int, row: FrameRow, sums: Sums) -> None:
+        """Add a frame to those that are fitted, its sums on the ranges of all."""
+        self._frames[number] = KeptFrame.of(row, sums.domain, sums.lattice)
+        self._sums[number], count = sums, len(self)
+        most, numbers = most_pixels(count), np.array([*self._sums])
+        fewer = most < most_pixels(count - 1)
+        for k in numbers if fewer else [number]:
+            self._sums[k] = self._sums[k].thinned(most)
+        if self._folder is not None:
+            for k in numbers[~self._is_fitted(numbers)][: -_MOST_COMPARED - 1]:
+                del self._sums[k]
 
     def _taught(self, number: int) -> Known:
         """Say what is odd about a new frame, and what is known with it."""
         odd, further = tuple(self._odd(number)), len(self._frames) - self._fitted
-        if self._known is not None and further < _ONE_OF * len(self._frames):
-            self._known = replace(self._known, frame=number, odd=odd, gained=0.0)
+        if self.known is not None and further < _ONE_OF * len(self._frames):
+            self.known = replace(self.known, frame=number, odd=odd, gained=0.0)
         else:
-            self._known = replace(self._learn(number), odd=odd)
-        return self._known
+            self.known = replace(self._learn(number), odd=odd)
+        return self.known
 
     def _learn(self, number: int) -> Known:
         """Fit the moments of all frames, and say how well the calibration is known."""
-        order, before = self._order(), self._known
-        dataset, frames = self._dataset(order), np.arange(len(order))
-        assert self._domain is not None
-        here = self._domain
+        before, (dataset, frames, order) = self.known, self._to_fit()
+        here, poses = self._domain, dataset.pose_groups()
         if any(is_of_frames(term) for term in self.options.model.terms):
             here = replace(here, conditions=condition_ranges(dataset.conditions()))
         problem = Problem(dataset, frames, self.options, here, resumed=self._last_on(here))
         self._fitted, self._planes = len(order), {}
-        self._known = Known(self.next_pose, number, int(problem.poses().max()) + 1)
+        self.known = Known(self.next_pose, number, int(poses.max()) + 1)
         try:
             with solvable(self._like.path, "fit"):
-                moments = self._moments(dataset, order)
-                found = fit_of_moments(problem, moments, _MOST_STEPS)
+                sums = self._kept(order[k] for k in frames)
+                found = fit_of_moments(problem, _seen(sums, dataset, frames))
         except CalibrationDataError:  # So few frames do not determine it.
-            return self._known
-        self._known = self._judged(replace(self._known, fit=found), before)
-        if found.walls is not None and self._known.is_determined:
+            return self.known
+        share = len(np.unique(poses[frames])) / self.known.poses
+        self.known = self._judged(replace(self.known, fit=found), before, share)
+        if found.walls is not None and self.known.is_determined:
             walls, names = found.walls.walls, [found.walls.names[k] for k in found.walls.numbers]
-            both = zip(names, walls.normal_world.numpy(), walls.offset.tolist(), strict=True)
-            self._planes = {name: {"normal_world": n, "offset": d} for name, n, d in both}
-        return self._known
+            planes = zip(walls.normal_world.numpy(), walls.offset.tolist(), strict=True)
+            self._planes = dict(zip(names, planes, strict=True))
+        return self.known
 
     def _last_on(self, domain: Domain) -> Parameters | None:
         """Return where the last fit stands, for some ranges; None: it was not determined.
 
         A fit that starts from anywhere may stay there, whatever further frames say.
         """
-        last = None if self._known is None or not self._known.is_determined else self._known.fit
+        last = None if self.known is None or not self.known.is_determined else self.known.fit
         if last is None or last.domain == domain:
             return last and last.optimum
         change = columns_on(last.options, last.domain, domain)
         return replace(last.optimum, coefficients=change.T @ last.optimum.coefficients)
 
-    def _judged(self, now: Known, before: Known | None) -> Known:
-        """Return the same with intervals, and what they gained on those before."""
+    def _judged(self, now: Known, before: Known | None, share: float) -> Known:
+        """Return the same with intervals, and what they gained on those before.
+
+        Args:
+            now: Its fit is of a share of the poses; the intervals are those that all will have.
+            before: What was known before.
+            share: Of the poses.
+        """
         found = now.fit
         assert found is not None
         # Of few poses the scatter between them may be small by chance, but not what they determine.
         expected = posterior_covariance(found.observability.precision)[:6, :6]
         both = zip(worst_axes(found.hand_eye_covariance), worst_axes(expected), strict=True)
-        quantile = student_quantile(39 / 40, found.covariance.degrees_of_freedom)
+        quantile = student_quantile(39 / 40, found.covariance.degrees_of_freedom) * share**0.5
         shift, turn = (quantile * max(pair) for pair in both)
         free = {name for one in found.observability.undetermined for name in one.shares}
         # No less is known of a mount that nobody has measured.
@@ -618,7 +652,8 @@ class LiveCalibration:
         shift, turn, gained = 1e3 * shift, math.degrees(turn), 0.0
         if before is not None and math.isfinite(shift):
             gained = 1 - max(shift / before.translation_mm, turn / before.rotation_deg)
-        spread = found.covariance.matrix.diagonal().clamp(min=0).sqrt()[found.optimum.twist_size :]
+        spread = (share * found.covariance.matrix.diagonal().clamp(min=0)).sqrt()
+        spread = spread[found.optimum.twist_size :]
         return replace(
             now,
             translation_mm=shift,
@@ -631,8 +666,9 @@ class LiveCalibration:
 
     def _odd(self, number: int) -> list[str]:
         """Return what is odd about a frame, a sentence each."""
-        row, others = self._frames[number].row, [k for k in sorted(self._frames) if k != number]
-        said = self._apart([*others[-_MOST_COMPARED:], number])
+        newest = [*self._frames][-_MOST_COMPARED - 1 :]
+        row, others = self._frames[number].row, [k for k in newest if k != number]
+        said = self._apart([*others, number])
         earlier = [one for k in others if (one := self._frames[k].row).timestamp <= row.timestamp]
         last = max(earlier, key=lambda one: one.timestamp, default=row)
         moved = np.abs(row.world_from_tool - last.world_from_tool).max()
@@ -643,15 +679,16 @@ class LiveCalibration:
     def _apart(self, numbers: list[int]) -> list[str]:
         """Return what sets the last of some frames apart from the others, a sentence each."""
         # A wrong frame spoils the fit: it is judged by the one without it.
-        last, here = None if self._known is None else self._known.fit, self._domain
-        if last is None or here is None or len(numbers) < _ENOUGH_TO_COMPARE:
+        last = None if self.known is None else self.known.fit
+        if last is None or len(numbers) < _ENOUGH_TO_COMPARE:
             return []
-        here = replace(here, conditions=last.domain.conditions)
+        here = replace(self._domain, conditions=last.domain.conditions)
         best = self._last_on(here)
         if best is None:
             return []
         dataset, model = self._dataset(numbers), ErrorModel(last.options, here)
-        moments = self._moments(dataset, numbers)
+        every = np.arange(len(numbers))
+        moments = _seen(self._kept(numbers), dataset, every)
         moments = with_condition_terms(model, moments, dataset.conditions())
         # Of each image's plane nothing is known, but for one ray, which shows no tilt.
         ridge = moments.count[:, None, None] * torch.eye(3).double() / 1e9
@@ -659,7 +696,7 @@ class LiveCalibration:
             (MomentObjective(own).image_losses(best).clamp(min=0) / own.count).sqrt().numpy()
             for own in (within_prior(moments, best, ridge), moments)
         )
-        every, said = np.arange(len(numbers)), list[str]()
+        said = list[str]()
 
         def is_outlying(sizes: np.ndarray) -> bool:
             return any(one["frame"] == every[-1] for one in outlying_images(every, sizes))
@@ -676,13 +713,19 @@ class LiveCalibration:
         return said
 
 
-# Steps of the solver for what `add` returns. Chosen: from the last fit it takes three to five.
-_MOST_STEPS = 25
+def _seen(sums: Iterable[Sums], dataset: Dataset, frames: np.ndarray) -> ImageMoments:
+    """Return the moments of frames of a data set, which see its planes."""
+    return lone_walls(dataset, frames).seen_by(concatenate([one.moments for one in sums]))
+
+
+# Most frames that `add` fits. Chosen: the scatter between half as many is known to 12 %, and the
+# intervals to 6 %; their fit takes as long as the sums of a VGA frame.
+_MOST_FITTED = 256
 # Frames from which on one is compared with the others, and the most of these, the newest. Chosen:
 # the spread of fewer is chance (of eight, a clean one was called odd), and more tell no more.
 _ENOUGH_TO_COMPARE, _MOST_COMPARED = 12, 99
 # Share of the frames that are new before they are fitted once more. Chosen: an interval shrinks by
-# a quarter of a percent with them, and what a frame costs does not grow with their number.
-_ONE_OF = 1 / 200
+# a percent with them.
+_ONE_OF = 1 / 50
 # Time between frames of a stream, seconds: no robot moves and stands still again within it. Chosen.
 _STREAM_S = 0.2

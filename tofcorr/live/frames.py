@@ -16,7 +16,6 @@ from tofcorr.error_terms.model import ErrorModelOptions, columns_on
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.robust import robust_scale
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.pixels.lattice import Lattice
 from tofcorr.training.calibration import TrainingOptions
 
@@ -24,35 +23,60 @@ FRAME_FORM = "tofcorr-live-frame"
 
 
 @dataclass(frozen=True)
-class KeptFrame:
-    """What is kept of a frame.
+class Sums:
+    """What is kept of the pixels of a frame.
 
     Attributes:
-        row: What is known of it besides its images.
-        domain: The ranges that scale the columns of its moments; when it comes, its own.
+        domain: The ranges that scale the columns of its moments.
         moments: Of its pixels; their plane is nobody's.
         lattice: Some of its pixels.
-        noise: Typical standard deviation of a distance, metres, from neighbours; 1 if unknown.
     """
 
-    row: FrameRow
     domain: Domain
     moments: ImageMoments
     lattice: Lattice
+
+    def on(self, domain: Domain, terms: ErrorModelOptions) -> "Sums":
+        """Return the same on other ranges, for some terms."""
+        if domain == self.domain:
+            return self
+        gram = mapped(self.moments.gram, columns_on(terms, domain, self.domain))
+        return replace(self, domain=domain, moments=replace(self.moments, gram=gram))
+
+    def thinned(self, most: int) -> "Sums":
+        """Return the same with so many pixels at most."""
+        return replace(self, lattice=self.lattice.thinned(most))
+
+
+@dataclass(frozen=True)
+class KeptFrame:
+    """What is known of a frame besides its sums.
+
+    Attributes:
+        row: Its row of `frames.csv`.
+        noise: Typical standard deviation of a distance, metres, from neighbours; 1 if unknown.
+        distance: Median over its pixels, metres.
+        brightness: Median amplitude; NaN without any.
+        seen: The share of usable pixels of each of nine parts of the image, row by row.
+    """
+
+    row: FrameRow
     noise: float
+    distance: float
+    brightness: float
+    seen: tuple[float, ...]
 
     @classmethod
-    def of(
-        cls, row: FrameRow, domain: Domain, moments: ImageMoments, lattice: Lattice
-    ) -> "KeptFrame":
-        """Return what is kept, with the noise that the pixels show."""
+    def of(cls, row: FrameRow, domain: Domain, lattice: Lattice) -> "KeptFrame":
+        """Return what the pixels of a frame show."""
         between = lattice.difference[lattice.difference.isfinite()]
-        return cls(row, domain, moments, lattice, robust_scale(between) if len(between) else 1.0)
-
-    def on(self, domain: Domain, change: Tensor) -> "KeptFrame":
-        """Return it with other ranges, given the change of the columns (`columns_on`)."""
-        moments = replace(self.moments, gram=mapped(self.moments.gram, change))
-        return replace(self, domain=domain, moments=moments)
+        place, distance = lattice.place, lattice.radial_distance[0]
+        part = 3 * (3 * place // (domain.width * domain.height))
+        part = part + 3 * (place % domain.width) // domain.width
+        usable = part.bincount(distance.isfinite().double(), 9) / part.bincount(minlength=9)
+        noise = robust_scale(between) if len(between) else 1.0
+        medians = float(distance.nanmedian()), float(lattice.amplitude.nanmedian())
+        return cls(row, noise, *medians, tuple(usable.tolist()))
 
 
 def seen_from(
@@ -72,34 +96,29 @@ def seen_from(
     return distance, math.degrees(math.acos(min(1.0, abs(facing)))), roll
 
 
-def coverage(
-    frames: list[KeptFrame], camera: CameraIntrinsics, tool_from_camera: np.ndarray
-) -> dict[str, list[float]]:
+def coverage(frames: list[KeptFrame], tool_from_camera: np.ndarray) -> dict[str, list[float]]:
     """Return what frames cover, by what it is of.
 
     Returns:
         Of each frame `distance` (m), `tilt` (degrees) and `brightness` (the amplitude), medians
         over it; `image`: the share of usable pixels of each of nine parts, row by row.
     """
-    light = [float(one.lattice.amplitude.nanmedian()) for one in frames]
-    seen = torch.zeros(3, 3).double()
-    for one in frames:
-        place = one.lattice.place
-        part = 3 * place // (camera.width * camera.height), 3 * (place % camera.width)
-        part = part[0], part[1] // camera.width
-        usable = one.lattice.radial_distance[0].isfinite().double()
-        every = torch.zeros(3, 3).double().index_put(part, torch.ones(1).double(), accumulate=True)
-        seen += torch.zeros(3, 3).double().index_put(part, usable, accumulate=True) / every
+    axes = np.array([one.row.world_from_tool[:3] for one in frames]) @ tool_from_camera[:, 2]
+    facing = (axes * [one.row.normal_world for one in frames]).sum(axis=1)
     return {
-        "distance": [float(one.lattice.radial_distance.nanmedian()) for one in frames],
-        "tilt": [seen_from(x.row.world_from_tool, x.row, tool_from_camera)[1] for x in frames],
-        "brightness": [one for one in light if math.isfinite(one)],
-        "image": (seen / max(1, len(frames))).flatten().tolist(),
+        "distance": [one.distance for one in frames],
+        "tilt": np.degrees(np.arccos(np.abs(facing).clip(max=1))).tolist(),
+        "brightness": [one.brightness for one in frames if math.isfinite(one.brightness)],
+        "image": np.mean([one.seen for one in frames], axis=0).tolist(),
     }
 
 
-def suitable(options: TrainingOptions) -> TrainingOptions:
-    """Refuse what needs the pixels of all frames at once.
+def suitable(options: TrainingOptions, domain: Domain) -> TrainingOptions:
+    """Return the options, if they need the pixels of no two frames at once.
+
+    Args:
+        options: Of the fit.
+        domain: Any ranges.
 
     Raises:
         ConfigError: The message names it.
@@ -113,27 +132,11 @@ def suitable(options: TrainingOptions) -> TrainingOptions:
     }
     for name in [name for name, given in asked.items() if given]:
         raise ConfigError(f"{name} looks at all frames at once; train on the recording for it.")
-    one = nominal_domain(4, 4)
-    ranges = "radial_distance", "amplitude", "normalised_amplitude"
-    other = replace(one, **dict.fromkeys(ranges, Interval(1.5, 3.0)))
     try:
-        columns_on(of_images(options.model), one, other)
+        columns_on(of_images(options.model), domain, wider(domain))
     except CalibrationDataError as error:
         raise ConfigError(str(error)) from None
     return options
-
-
-def nominal_domain(height: int, width: int) -> Domain:
-    """Return ranges for an image of which nothing is known yet."""
-    one = Interval(1.0, 2.0)
-    return Domain(
-        height=height,
-        width=width,
-        radial_distance=one,
-        amplitude=one,
-        normalised_amplitude=one,
-        modulation_frequency=1e7,
-    )
 
 
 def is_of_frames(term: Any) -> bool:  # noqa: ANN401 - options of any term
@@ -168,20 +171,19 @@ def mapped(gram: Tensor, functions: Tensor) -> Tensor:
 _DOMAIN = TypeAdapter(Domain)
 
 
-def values_of_frame(frame: KeptFrame) -> dict[str, Any]:
+def values_of_frame(row: FrameRow, sums: Sums) -> dict[str, Any]:
     """Return a frame as plain values and tensors."""
-    row = {
+    cells = {
         name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
-        for name, value in vars(frame.row).items()
+        for name, value in vars(row).items()
         if value is not None
     }
-    sums = {"moments": vars(frame.moments), "lattice": vars(frame.lattice)}
-    return {"row": row, "domain": _DOMAIN.dump_python(frame.domain, mode="json"), **sums}
+    pixels = {"moments": vars(sums.moments), "lattice": vars(sums.lattice)}
+    return {"row": cells, "domain": _DOMAIN.dump_python(sums.domain, mode="json"), **pixels}
 
 
-def frame_of(values: dict[str, Any]) -> KeptFrame:
+def frame_of(values: dict[str, Any]) -> tuple[FrameRow, Sums]:
     """Return the frame that `values_of_frame` wrote."""
     row = {k: v.numpy() if isinstance(v, Tensor) else v for k, v in values["row"].items()}
-    moments, lattice = ImageMoments(**values["moments"]), Lattice(**values["lattice"])
-    domain = _DOMAIN.validate_python(values["domain"])
-    return KeptFrame.of(FrameRow(**row), domain, moments, lattice)
+    pixels = ImageMoments(**values["moments"]), Lattice(**values["lattice"])
+    return FrameRow(**row), Sums(_DOMAIN.validate_python(values["domain"]), *pixels)

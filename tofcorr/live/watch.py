@@ -27,7 +27,7 @@ from matplotlib.image import imsave
 from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray
 from tofcorr.data.recording import HEADER_FILE, Header, Recording, read_header
 from tofcorr.data.table import TABLE_FILE, FrameRow, read_lines, read_table
-from tofcorr.errors import CalibrationDataError, TofcorrError
+from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
 from tofcorr.files import being_written, reading
 from tofcorr.live.calibration import START_FILE, Known, LiveCalibration
 from tofcorr.live.frames import coverage, seen_from
@@ -78,7 +78,9 @@ class LivePage:
         shift, turn = (_finite(x) for x in (known.translation_mm, known.rotation_deg))
         self._history.append((known.poses, shift, turn))
         if len(self._history) > _MOST_POINTS:
-            del self._history[1:-1:2]
+            # The one whose neighbours are nearest to each other.
+            poses = np.array([one[0] for one in self._history])
+            del self._history[1 + int((poses[2:] - poses[:-2]).argmin())]
         if known.fit is not None and shift is not None:
             self._ellipses.append(_ellipse(known))
             if len(self._ellipses) > _MOST_ELLIPSES:
@@ -109,7 +111,7 @@ class LivePage:
             state |= {
                 "wanted": [live.wanted_mm, live.wanted_deg],
                 "weakest": known.weakest,
-                "cover": _bars(coverage(live.frames, live.camera, live.tool_from_camera)),
+                "cover": _bars(coverage(live.frames, live.tool_from_camera)),
             }
         self._show(state)
         if live is not None:
@@ -129,6 +131,7 @@ class Watched:
             folder of a `LiveCalibration`.
         config: As of `LiveCalibration`; a folder of one has its own.
         bag: Reads `source` if that is a bag.
+        page: Shows it; None: a new one.
         more: What else `LiveCalibration` takes: `wanted_mm`, `wanted_deg`, `folder`.
 
     Raises:
@@ -140,9 +143,10 @@ class Watched:
         source: Path,
         config: Config = "ea",
         bag: "GrowingBag | None" = None,
+        page: LivePage | None = None,
         **more: Any,  # noqa: ANN401
     ) -> None:
-        self.source, self.page = source, LivePage(source.name)
+        self.source, self.page = source, page or LivePage(source.name)
         self.live: LiveCalibration | None = None
         self.note = ""
         self._begin = partial(LiveCalibration, config=config, **more)
@@ -308,9 +312,17 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def serve(page: LivePage, port: int = 0) -> ThreadingHTTPServer:
-    """Return a server of the page on 127.0.0.1, which runs in a thread; `shutdown` ends it."""
+    """Return a server of the page on 127.0.0.1, which runs in a thread; `shutdown` ends it.
+
+    Raises:
+        ConfigError: The port cannot be had.
+    """
     text = page_text("tofcorr.live", "watch.html.j2", {}, {}, source=page.title)
-    server = ThreadingHTTPServer((_LOCAL[0], port), partial(_Handler, page, text))
+    try:
+        server = ThreadingHTTPServer((_LOCAL[0], port), partial(_Handler, page, text))
+    except (OSError, OverflowError) as error:
+        said = f"The page cannot have port {port} ({getattr(error, 'strerror', error)})"
+        raise ConfigError(f"{said}; choose another, or 0 for any free one (--port).") from None
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return server

@@ -1,11 +1,13 @@
 """Recordings of one camera as one data set: numbering, planes, splits, ranges, and threads."""
 
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from operator import attrgetter
 from os import PathLike
 from pathlib import Path
@@ -15,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from pydantic import Field, NonNegativeInt, field_validator
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 from tofcorr.data.recording import (
@@ -135,6 +137,12 @@ class Dataset:
         """Return a column of numbers of all frames' tables, shape (N, ...), float64."""
         every = [getattr(recording.frames, name) for recording in self.recordings]
         return torch.from_numpy(np.concatenate(every))
+
+    def planes_and_poses(self, frames: Frames | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the planes of frames, normals (N, 3) and offsets (N,), and world_from_tool."""
+        chosen = slice(None) if frames is None else torch.as_tensor(np.asarray(frames))
+        names = "normal_world", "offset", "world_from_tool"
+        return tuple(self.column(name)[chosen] for name in names)  # type: ignore[return-value]
 
     def with_columns(self, **values: np.ndarray) -> "Dataset":
         """Return the data set with other values in columns of its tables, of shape (N, ...)."""
@@ -329,6 +337,12 @@ Result = TypeVar("Result")
 _at_once: ContextVar[int] = ContextVar("threads at once", default=0)
 
 
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """Return the libraries that threads share the work of, with so many modules imported."""
+    return ThreadpoolController()
+
+
 @contextmanager
 def thread_number(threads: int | None) -> Iterator[None]:
     """Let so many threads share an operation of torch, NumPy or SciPy, while a block runs.
@@ -344,7 +358,9 @@ def thread_number(threads: int | None) -> Iterator[None]:
     if threads is not None:
         torch.set_num_threads(threads)
     try:
-        with nullcontext() if threads is None else threadpool_limits(threads, user_api="blas"):
+        # Which libraries are loaded is searched for again where a module was imported.
+        blas = _libraries(len(sys.modules))
+        with nullcontext() if threads is None else blas.limit(limits=threads, user_api="blas"):
             yield
     finally:
         torch.set_num_threads(usual)  # Last: a limit on products may set it too.

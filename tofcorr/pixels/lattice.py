@@ -6,6 +6,7 @@ show, so that a calibration that grows frame by frame sees what one of the finis
 """
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -56,25 +57,31 @@ class Lattice:
         pick = torch.as_tensor(np.asarray(chosen))
         return replace(self, **{name: getattr(self, name)[pick] for name in _IMAGES})
 
-    def thinned(self, frames: int) -> "Lattice":
-        """Return the pixels that are kept of each of so many frames.
-
-        They are among those that are kept of fewer frames, whatever these are.
-        """
-        most = most_pixels(frames)
+    def thinned(self, most: int) -> "Lattice":
+        """Return so many pixels at most, which are among those of any larger number."""
         if most >= len(self.place):
             return self
-        # Multiples of the golden ratio, less their whole parts, spread numbers evenly (Knuth).
-        kept = (self.place * 2654435769 % 2**32).argsort()[:most].sort().values
+        kept = scattered(self.place).argsort()[:most].sort().values
         images = {name: getattr(self, name)[:, kept] for name in _IMAGES}
         return Lattice(place=self.place[kept], **images)
+
+
+NumbersT = TypeVar("NumbersT", Tensor, np.ndarray)
+
+
+def scattered(numbers: NumbersT) -> NumbersT:
+    """Return numbers from 0 to 2^32 that spread evenly, whichever successive integers are given."""
+    # Multiples of the golden ratio, less their whole parts (Knuth).
+    return numbers * 2654435769 % 2**32
 
 
 _IMAGES = ("radial_distance", "amplitude", "difference", "brightness")
 
 
 def joined(parts: list[Lattice]) -> Lattice:
-    """Return the pixels of all frames of several lattices of one camera."""
+    """Return the pixels of all frames of several lattices of one camera: those of the smallest."""
+    least = min(len(one.place) for one in parts)
+    parts = [one.thinned(least) for one in parts]
     images = {name: torch.cat([getattr(one, name) for one in parts]) for name in _IMAGES}
     return replace(parts[0], **images)
 
@@ -86,9 +93,9 @@ def most_pixels(frames: int) -> int:
 
 def lattice_of(dataset: Dataset, frames: Frames | None = None) -> Lattice:
     """Return the lattice of frames, in increasing order: one pass over the images."""
-    rays, count = dataset.ray_directions(), dataset.num_frames if frames is None else len(frames)
-    batches = dataset.batches(frames)
-    return joined([*in_threads(lambda one: lattice_in(one, rays).thinned(count), batches)])
+    rays, batches = dataset.ray_directions(), dataset.batches(frames)
+    most = most_pixels(dataset.num_frames if frames is None else len(frames))
+    return joined([*in_threads(lambda one: lattice_in(one, rays).thinned(most), batches)])
 
 
 def lattice_in(batch: FrameBatch, rays: Rays) -> Lattice:
@@ -108,7 +115,7 @@ def lattice_in(batch: FrameBatch, rays: Rays) -> Lattice:
     near = rays.flatten(0, 1)[three]
     between, mean = neighbour_differences(distance, amplitude, valid, near)
     return Lattice(
-        place=three[:, 1],
+        place=three[:, 1].clone(),  # Without its neighbours.
         radial_distance=torch.where(valid, distance, torch.nan)[..., 1].float(),
         amplitude=amplitude[..., 1].float(),
         difference=torch.where(inside, between[..., 0], torch.nan).float(),
@@ -187,10 +194,8 @@ def spread_pixels(dataset: Dataset, frames: Frames, lattice: Lattice, most: int)
         one[:, ::step].double() for one in (lattice.radial_distance, lattice.amplitude)
     )
     frame, at = distance.isfinite().nonzero(as_tuple=True)
-    place, chosen = lattice.place[::step][at], torch.as_tensor(np.asarray(frames))
-    width = dataset.first.camera.width
-    columns = "normal_world", "offset", "world_from_tool"
-    normal, offset = plane_in_frame(*(dataset.column(name)[chosen] for name in columns))
+    place, width = lattice.place[::step][at], dataset.first.camera.width
+    normal, offset = plane_in_frame(*dataset.planes_and_poses(frames))
     pixels = Pixels(
         distance[frame, at],
         amplitude[frame, at],

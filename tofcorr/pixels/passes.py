@@ -238,8 +238,7 @@ def held_out_errors(
 
 def _planes_in_tool(dataset: Dataset) -> Tensor:
     """Return the planes n . x + d = 0 of a data set's frames in the tool frame, (N, 4)."""
-    names = "normal_world", "offset", "world_from_tool"
-    normal, offset = plane_in_frame(*(dataset.column(name) for name in names))
+    normal, offset = plane_in_frame(*dataset.planes_and_poses())
     return torch.cat([normal, offset[:, None]], dim=1)
 
 

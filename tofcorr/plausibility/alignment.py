@@ -71,8 +71,8 @@ class Scene:
     def __init__(
         self, data: Dataset, frames: np.ndarray, rays: np.ndarray, stored: np.ndarray
     ) -> None:
-        names = "world_from_tool", "normal_world", "offset"
-        self.poses, self.normal, self.offset = (data.column(one).numpy()[frames] for one in names)
+        own = (one.numpy() for one in data.planes_and_poses(frames))
+        self.normal, self.offset, self.poses = own
         self.moves, self.rays = data.moves, rays
         self.guess = np.asarray(data.first.tool_from_camera, dtype=np.float64)
         self.distance = stored / rays[..., 2] if data.first.depth_kind == "z" else stored

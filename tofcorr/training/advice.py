@@ -277,8 +277,7 @@ def draw_pool(
         the camera to the wall.
     """
     hand_eye, ranges = fit.solution.parameters.tool_from_camera, fit.domain.radial_distance
-    names = "world_from_tool", "normal_world", "offset"
-    world_from_tool, *plane = (dataset.column(name)[frames] for name in names)
+    *plane, world_from_tool = dataset.planes_and_poses(frames)
     camera = world_from_tool @ hand_eye
     distance = along_axis(camera, (plane[0], plane[1]))
     # A fit that took the camera to the wall says nothing of where poses should be.
@@ -533,7 +532,7 @@ def plan_poses(
     pool = draw_views(start, wall, hand_eye, workspace, brightness, rays, random)
     if pool is None:
         raise ConfigError("No view lies on the wall: allow shorter distances, or less tilt.")
-    domain = _domain(camera, workspace)
+    domain = domain_of_views(camera, workspace)
     design = Design(ErrorModel(model, domain), domain, rays)
     # An image counts for so many independent pixels: they share the errors of pose and target. Set
     # on the configurations demo, set2 and set3, where it counts for 140 to 330.
@@ -550,7 +549,7 @@ def plan_poses(
     )
 
 
-def _domain(camera: CameraIntrinsics, workspace: Workspace) -> Domain:
+def domain_of_views(camera: CameraIntrinsics, workspace: Workspace) -> Domain:
     """Return ranges that scale the variables; any that contain the views serve."""
     grazing = math.cos(math.radians(_STEEPEST_INCIDENCE_DEG))
     dark, far = grazing * math.exp(workspace.log_dark), workspace.farthest / grazing

@@ -232,11 +232,11 @@ def poses_figure(
     from tofcorr.pages.drawing import BLUE, RED, panels
 
     data, hand_eye = calibration.data, calibration.fit.solution.parameters.tool_from_camera
-    columns = [data.column(name) for name in ("world_from_tool", "normal_world", "offset")]
+    *columns, poses = data.planes_and_poses()
     first = int(calibration.train[0])
     walls = [torch.cat([one, one[first].expand(len(advised), *one.shape[1:])]) for one in columns]
-    cameras = torch.cat([columns[0], advised]) @ hand_eye
-    place, way = before_walls(cameras, (walls[1], walls[2]))
+    cameras = torch.cat([poses, advised]) @ hand_eye
+    place, way = before_walls(cameras, (walls[0], walls[1]))
     fitted, tested = (
         np.isin(np.arange(data.num_frames), k) for k in (calibration.train, calibration.test)
     )

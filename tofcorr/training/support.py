@@ -39,8 +39,7 @@ class Support:
     def __init__(self, dataset: Dataset, frames: Frames, tool_from_camera: Tensor) -> None:
         from scipy.stats import circstd  # Slow to import.
 
-        names = "world_from_tool", "normal_world", "offset"
-        world_from_tool, normal_world, offset = (dataset.column(name)[frames] for name in names)
+        normal_world, offset, world_from_tool = dataset.planes_and_poses(frames)
         world_from_camera = world_from_tool @ tool_from_camera
         normal, offset = plane_in_frame(normal_world, offset, world_from_camera)
         distance, roll = -offset / normal[:, 2], _roll(world_from_camera, normal_world).numpy()
