@@ -44,6 +44,8 @@ class Frame:
         truth: Distance along the middle of the pixel, metres (H, W).
         error: What mixing changes of the distance, without noise, metres (H, W).
         flying: Whether the pixel is flying (H, W).
+        mixed: Whether it takes light of two surfaces (H, W).
+        light: Amplitude of the surface along the middle of the pixel, if it filled it (H, W).
     """
 
     distance: np.ndarray
@@ -51,6 +53,8 @@ class Frame:
     truth: np.ndarray
     error: np.ndarray
     flying: np.ndarray
+    mixed: np.ndarray
+    light: np.ndarray
 
 
 def matrix() -> Any:  # noqa: ANN401 - three rows
@@ -217,6 +221,19 @@ def smooth(light: Any, owner: np.ndarray) -> np.ndarray:  # noqa: ANN401 - compl
     return result
 
 
+def unmixed(light: np.ndarray, owner: np.ndarray, mixed: np.ndarray) -> np.ndarray:
+    """Amplitudes (H, W) of mixed pixels from the nearest unmixed pixel of the same panel."""
+    from scipy.ndimage import distance_transform_edt
+
+    result = light.copy()
+    for own in np.unique(owner):
+        known = (owner == own) & ~mixed
+        if known.any():
+            place: Any = distance_transform_edt(~known, return_distances=False, return_indices=True)
+            result = np.where(owner == own, light[tuple(place)], result)
+    return result
+
+
 def frame_of(kind: str, seed: int, spread: float, bounces: int = 0, paths: int = 1) -> Frame:
     """Render one frame and add noise; a seed always gives the same."""
     generator = np.random.default_rng([seed, list(SCENES).index(kind)])
@@ -228,6 +245,7 @@ def frame_of(kind: str, seed: int, spread: float, bounces: int = 0, paths: int =
     error = metres * np.angle(phasor[..., :-1].sum(-1) * np.exp(-1j * truth / metres))
     clean = phasor[..., :-1].sum(-1) + smooth(phasor[..., -1], owner)
     scale = np.median(np.abs(clean))
+    mixed = other > OTHER_LIGHT
     noise = generator.standard_normal((2, *clean.shape)) * NOISE / metres * scale
     noisy = clean + noise[0] + 1j * noise[1]
     return Frame(
@@ -235,7 +253,9 @@ def frame_of(kind: str, seed: int, spread: float, bounces: int = 0, paths: int =
         amplitude=1000 * np.abs(noisy) / scale,
         truth=truth,
         error=error,
-        flying=(other > OTHER_LIGHT) & (np.abs(error) > FLYING * NOISE * scale / np.abs(clean)),
+        flying=mixed & (np.abs(error) > FLYING * NOISE * scale / np.abs(clean)),
+        mixed=mixed,
+        light=1000 / scale * unmixed(np.abs(phasor[..., :-1].sum(-1)), owner, mixed),
     )
 
 

@@ -6,6 +6,7 @@ light alone and all bounces come from separate runs, so that what further bounce
 for the noise of the paths.
 """
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -259,7 +260,9 @@ SCENES: dict[str, Callable[[Draw, int], Scene]] = {
 }
 
 
-def rendered(name: str, seed: int, views: int, baseline: float = 0.0) -> list[Frame]:
+def rendered(
+    name: str, seed: int, views: int, baseline: float = 0.0, poses: np.ndarray | None = None
+) -> list[Frame]:
     """Return the frames of a scene.
 
     Args:
@@ -267,9 +270,12 @@ def rendered(name: str, seed: int, views: int, baseline: float = 0.0) -> list[Fr
         seed: Of dimensions, reflectivities, poses and paths.
         views: Number of frames.
         baseline: Of the light, metres to the right of the camera.
+        poses: world_from_camera (views, 4, 4); None: those of the scene.
     """
     key = f"bounces 1 {name} {seed} {views} {baseline} {PATHS} {FREQUENCY}"
-    array = cached(key, lambda: _rendered(name, seed, views, baseline))
+    if poses is not None:
+        key += hashlib.sha256(poses.round(9).tobytes()).hexdigest()
+    array = cached(key, lambda: _rendered(name, seed, views, baseline, poses))
     return [
         Frame(
             name=name,
@@ -283,9 +289,12 @@ def rendered(name: str, seed: int, views: int, baseline: float = 0.0) -> list[Fr
     ]
 
 
-def _rendered(name: str, seed: int, views: int, baseline: float) -> np.ndarray:
+def _rendered(
+    name: str, seed: int, views: int, baseline: float, poses: np.ndarray | None
+) -> np.ndarray:
     start_renderer()
-    parts, poses = SCENES[name](np.random.default_rng([seed, *name.encode()]), views)
+    parts, usual = SCENES[name](np.random.default_rng([seed, *name.encode()]), views)
+    poses = np.stack(usual) if poses is None else poses
     return np.stack([_frame(parts, pose, seed + i, baseline) for i, pose in enumerate(poses)])
 
 

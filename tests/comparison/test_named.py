@@ -18,11 +18,13 @@ TIMES = {"integration_time_us": [400.0, 1000.0], "frame_interval_s": 20.0}
 LATE = {"name": "timestamp_offset", "offset_s": 0.04}
 
 
-def diagnosed(folder: Path, *names: str, values: Mapping[str, float] | None = None) -> Path:
+def diagnosed(
+    folder: Path, *names: str, values: Mapping[str, float] | None = None, **more: object
+) -> Path:
     """Write what `train_with` reads of a diagnosis that named effects."""
     fitted = [{"cause": names[0], "name": name, "value": v} for name, v in (values or {}).items()]
     content = {"format": "tofcorr-diagnosis", "cause_sets": [[one] for one in names]}
-    (folder / "diagnosis.json").write_text(json.dumps(content | {"fitted": fitted}))
+    (folder / "diagnosis.json").write_text(json.dumps(content | {"fitted": fitted} | more))
     return folder
 
 
@@ -37,14 +39,19 @@ def two_exposures(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def test_what_was_named_is_corrected_where_it_predicts_better_and_the_rest_is_left_out(
     two_exposures: Dataset, tmp_path: Path
 ) -> None:
-    named = diagnosed(tmp_path, "integration_time", "wiggling", "lens", "mixed_pixels", "multipath")
+    light = {"gain": 2e-3, "gain_interval": [1e-3, 3e-3], "light_half_angle_deg": 40.0}
+    names = "integration_time", "wiggling", "lens", "mixed_pixels", "multipath"
+    named = diagnosed(tmp_path, *names, second_bounces=light | {"frequencies_hz": [20e6]})
     plain = tofcorr.train(two_exposures.first, "ea")
     found = tofcorr.train_with(named, two_exposures.first, "ea")
     effects = {one["effect"]: one for one in found.report["named"]["effects"]}
     kept = [name for name, one in effects.items() if one["kept"]]
-    assert kept == ["integration_time", "mixed_pixels"]
-    assert found.options.runtime.flying_pixels is not None
-    assert "runtime.second_bounces" in effects["multipath"]["why"]
+    assert kept == ["integration_time", "mixed_pixels", "multipath"]
+    runtime = found.options.runtime
+    assert runtime.flying_pixels is not None
+    assert runtime.second_bounces is not None
+    assert runtime.second_bounces.gain == 2e-3
+    assert runtime.second_bounces.light_half_angle_deg == 40.0
     assert effects["integration_time"]["p_value"] < 0.05
     assert effects["wiggling"]["with_mm"] > effects["wiggling"]["without_mm"] - 0.1
     assert effects["lens"]["why"] == "no single frame tells it, so no corrector can undo it"

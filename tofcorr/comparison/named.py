@@ -24,7 +24,7 @@ from tofcorr.error_terms.registry import TERMS
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import reading
 from tofcorr.geometry.se3 import small_motion, tool_twists
-from tofcorr.options import resolve_options
+from tofcorr.options import Options, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, folds, opened
 from tofcorr.pixels.passes import FrameErrors, held_out_errors
 from tofcorr.pixels.sample import MaskOptions
@@ -32,6 +32,7 @@ from tofcorr.scene_light.flying import FlyingPixelsOptions
 from tofcorr.scene_light.stray import StrayLightState
 from tofcorr.training.calibration import TrainingOptions, halves
 from tofcorr.training.run import Carried, Config, TrainingResult, carried_training, inspected
+from tofcorr.training.scene import SecondBouncesWanted
 
 # The kind of term that undoes an effect. The first three effects are finer forms of a polynomial:
 # its degree is raised.
@@ -46,7 +47,7 @@ _TERM_OF = {
 _CLOCK = "timestamp_offset"
 _STRAY = "stray_light"
 _MIXED = "mixed_pixels"
-_WHY_NOT = {"multipath": "second bounces are removed where runtime.second_bounces asks for it"}
+_MULTIPATH = "multipath"
 
 
 @dataclass(frozen=True)
@@ -171,11 +172,11 @@ def _tried(
         recorded: The recordings as given, which say what a pose is.
         left_out: Global numbers of the frames that take no part.
     """
-    if effect == _MIXED:
-        runtime = best.options.runtime.model_copy(update={"flying_pixels": FlyingPixelsOptions()})
+    removed = _removed_in_frames(effect, found)
+    if removed is not None:
+        runtime = best.options.runtime.model_copy(update=removed[0])
         options = best.options.model_copy(update={"runtime": runtime})
-        why = "the corrector looks for pixels that mix two surfaces"
-        return best._replace(options=options), Tried(effect, kept=True, why=why)
+        return best._replace(options=options), Tried(effect, kept=True, why=removed[1])
     further = _with_effect(best, effect, found)
     if isinstance(further, str):
         return best, Tried(effect, kept=False, why=further)
@@ -200,6 +201,20 @@ def _tried(
     return (further._replace(error=after) if kept else best._replace(error=before)), tried
 
 
+def _removed_in_frames(
+    effect: str, found: Mapping[str, Any]
+) -> tuple[dict[str, Options], str] | None:
+    """Return what the corrector is to look for in a frame, and why; None: nothing."""
+    if effect == _MIXED:
+        why = "the corrector looks for pixels that mix two surfaces"
+        return {"flying_pixels": FlyingPixelsOptions()}, why
+    state = found.get("second_bounces")
+    if effect != _MULTIPATH or state is None:
+        return None
+    wanted = SecondBouncesWanted(**{k: v for k, v in state.items() if k != "gain_interval"})
+    return {"second_bounces": wanted}, "the corrector removes second bounces of light in a frame"
+
+
 def _with_effect(best: _Model, effect: str, found: Mapping[str, Any]) -> _Model | str:
     """Return the model that undoes an effect as well, or why there is none."""
     data, options = best.data, best.options
@@ -214,7 +229,7 @@ def _with_effect(best: _Model, effect: str, found: Mapping[str, Any]) -> _Model 
         options = options.model_copy(update={"runtime": runtime})
         return _Model(data.without_stray_light(stray), options)
     if effect not in _TERM_OF:
-        return _WHY_NOT.get(effect, "no single frame tells it, so no corrector can undo it")
+        return "no single frame tells it, so no corrector can undo it"
     kind, finer = TERMS[_TERM_OF[effect]], effect in _POLYNOMIALS
     there = [term for term in options.model.terms if isinstance(term, kind)]
     if there and not finer:

@@ -1,6 +1,7 @@
 """A recording of an ideal camera, as the real camera would have given it."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,7 +17,9 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.progress import through
-from tofcorr.sensor.model import SensorModel
+from tofcorr.scene_light.surroundings import sampled, surroundings_of
+from tofcorr.sensor.model import Around, SensorModel
+from tofcorr.sensor.scene import conditions_of
 from tofcorr.sensor.sensor_file import SensorFile, read_sensor
 
 AmplitudeMeaning = Literal["amplitude", "reflectivity"]
@@ -90,17 +93,26 @@ def degrade(
     scale = kinds[file.depth_kind] / kinds[recording.depth_kind]
     source = "depth" if recording.true_depth is None else "true_depth"
     counts = np.zeros(3, dtype=np.int64)
+
+    def ideal(number: int) -> tuple[Tensor, Tensor | None]:
+        """Return true depth, of the sensor's kind, and light of a frame, (H, W) each."""
+        depth, light = (recording.read(name, np.array([number])) for name in (source, "amplitude"))
+        assert depth is not None
+        lit = None if light is None else torch.from_numpy(light[0])
+        if amplitude_is == "reflectivity" and lit is not None:
+            _refuse_no_share(recording, lit, number)
+        return torch.from_numpy(depth[0]) * scale, lit
+
     with RecordingWriter.like(out, header) as writer, torch.inference_mode():
         shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
+        around = None
+        if model.bounces is not None and recording.moves:
+            around = _around(model, recording, ideal, amplitude_is)
+            ending = model.to_sensor_file().ending_with_the_image()
+            model = SensorModel(ending, model.eye.ray_directions.dtype) if around else model
         for number in through(range(recording.num_frames), "degrading"):
-            depth, light, mask = (
-                recording.read(name, np.array([number])) for name in (source, "amplitude", "mask")
-            )
-            assert depth is not None
-            true_depth = torch.from_numpy(depth[0]) * scale
-            lit = None if light is None else torch.from_numpy(light[0])
-            if amplitude_is == "reflectivity" and lit is not None:
-                _refuse_no_share(recording, lit, number)
+            true_depth, lit = ideal(number)
+            mask = recording.read("mask", np.array([number]))
             # A seed of one frame, independent of those of all other frames and seeds.
             own = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
             measured = model(
@@ -108,6 +120,7 @@ def degrade(
                 **{amplitude_is: lit},
                 generator=torch.Generator().manual_seed(int(own >> 1)),
                 frame_shift=shift[number],
+                around=around and around.of(slice(number, number + 1)),
                 **conditions_of_frames(recording, number),
             )
             writer.append(
@@ -128,6 +141,30 @@ def degrade(
         _warn(f"{recording.path}: {said} measured at, {near:.2g} to {far:.2g} m; {beyond}")
     written = Recording.open(out, check_contents=False)
     return Degraded(written, valid_share, covered_share, model.left_out)
+
+
+def _around(
+    model: SensorModel,
+    recording: Recording,
+    ideal: Callable[[int], tuple[Tensor, Tensor | None]],
+    amplitude_is: AmplitudeMeaning,
+) -> Around | None:
+    """Return the planes that the frames of a robot show, and its poses; None: there is one."""
+    rays, found = model.eye.ray_directions.double().flatten(0, 1), list[tuple[Tensor, Tensor]]()
+    pixel = sampled(rays)
+    for number in range(recording.num_frames):
+        depth, lit = ideal(number)
+        given: dict[str, Tensor | None] = {"amplitude": None, "reflectivity": None}
+        given[amplitude_is] = None if lit is None else lit[None]
+        known = conditions_of(conditions_of_frames(recording, number), (1,), rays.device, {})
+        seen = model.eye(depth[None], **given, conditions=known, needs_amplitude=True)
+        distance = torch.where(seen.seen, seen.distance, torch.nan)
+        light = model.usual_light(seen)
+        found.append((distance.flatten()[pixel], light.flatten()[pixel]))
+    distance, amplitude = (torch.stack(images) for images in zip(*found, strict=True))
+    poses = torch.from_numpy(recording.frames.world_from_tool @ recording.tool_from_camera)
+    planes = surroundings_of(distance, amplitude, rays[pixel], poses, rays.new_zeros(0, 4))
+    return None if len(planes.offset) < 2 else Around(planes._replace(direct=True), poses)
 
 
 def conditions_of_frames(

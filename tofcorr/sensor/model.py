@@ -18,6 +18,7 @@ from tofcorr.errors import ConfigError
 from tofcorr.estimation.noise import NoiseModel
 from tofcorr.files import write_text
 from tofcorr.scene_light.bounces import SecondBounces
+from tofcorr.scene_light.surroundings import Surroundings, added_around
 from tofcorr.sensor.scene import Eye, Group, ImageEffects, SceneFrames, conditions_of
 from tofcorr.sensor.sensor_file import ErrorSection, SensorFile, read_sensor, sensor_text
 
@@ -190,16 +191,20 @@ class Measurement(NamedTuple):
     valid: Tensor
 
 
-def _with_second_bounces(frames: SceneFrames, bounces: SecondBounces) -> SceneFrames:
-    """Return frames as the light of all bounces shows them; the surfaces stay."""
-    seen = torch.where(frames.seen, frames.distance, torch.nan)
-    found = [bounces.added(*frame) for frame in zip(seen, frames.amplitude, strict=True)]
-    distance, amplitude = (torch.stack(images) for images in zip(*found, strict=True))
-    return replace(
-        frames,
-        distance=torch.where(frames.seen, distance, frames.distance),
-        amplitude=torch.where(frames.seen, amplitude, frames.amplitude),
-    )
+class Around(NamedTuple):
+    """What stands around the camera of some frames, also beside what they show.
+
+    Attributes:
+        surroundings: Large planes.
+        world_from_camera: Pose of each frame (B, 4, 4), in the axes of the planes.
+    """
+
+    surroundings: Surroundings
+    world_from_camera: Tensor
+
+    def of(self, frames: slice) -> Self:
+        """Return the same for some of the frames."""
+        return self._replace(world_from_camera=self.world_from_camera[frames])
 
 
 class SensorModel(DescribedModule):
@@ -256,6 +261,7 @@ class SensorModel(DescribedModule):
         self.noise = None if sensor.noise is None else SensorNoise(sensor.noise, size)
         self.dropouts, bounces = sensor.dropouts, sensor.second_bounces
         self.bounces = None if bounces is None else SecondBounces(camera, bounces)
+        self._half_angle = None if bounces is None else bounces.light_half_angle_deg
         self._ranges = self.base.domain.conditions
         self._said: set[str] = set()
         self.to(dtype)
@@ -310,6 +316,7 @@ class SensorModel(DescribedModule):
         generator: torch.Generator | None = None,
         noise: bool = True,
         frame_shift: Tensor | None = None,
+        around: Around | None = None,
         **conditions: Condition,
     ) -> Measurement:
         """Return what the camera measures.
@@ -324,6 +331,7 @@ class SensorModel(DescribedModule):
             noise: False: the expected measurement; nothing is drawn, and no pixel goes missing.
             frame_shift: What effects of whole frames add, shape (...), metres: a part of what
                 `frame_shift` returned for a whole recording. None: computed for these frames.
+            around: What else lights the scene by second bounces; None: what the frames show.
             **conditions: `timestamp_s`, `integration_time_us`, `room_temperature_c`,
                 `body_temperature_c`, `ambient`: one number, or one for each frame (...). Frames
                 stand in the order of their times. All but the time are held to the ranges that
@@ -341,7 +349,7 @@ class SensorModel(DescribedModule):
         needed = needed or self.bounces is not None
         frames = self.eye(true_depth, amplitude, reflectivity, known, needs_amplitude=needed)
         if self.bounces is not None:
-            frames = _with_second_bounces(frames, self.bounces)
+            frames = self._with_second_bounces(frames, self.bounces, around)
         radial = self._expected(frames, frame_shift)
         reported = frames.amplitude
         if noise and self.noise is not None:
@@ -385,6 +393,36 @@ class SensorModel(DescribedModule):
         """
         known = conditions_of(conditions, (count,), self.eye.ray_directions.device, self._ranges)
         return self.effects.frame_shift(known, count, self.eye.ray_directions)
+
+    def usual_light(self, frames: SceneFrames) -> Tensor:
+        """Return amplitudes (B, H, W) at the mean integration time, that of the gain."""
+        exposure, known = frames.conditions.get("integration_time"), self._ranges
+        if exposure is None or "integration_time" not in known:
+            return frames.amplitude
+        share = known["integration_time"][2] / exposure
+        return frames.amplitude * share[:, None, None].to(frames.amplitude)
+
+    def _with_second_bounces(
+        self, frames: SceneFrames, bounces: SecondBounces, around: Around | None
+    ) -> SceneFrames:
+        """Return frames as the light of all bounces shows them; the surfaces stay."""
+        found, light = [], self.usual_light(frames)
+        for number, own in enumerate(zip(frames.distance, light, frames.seen, strict=True)):
+            images = torch.where(own[2], own[0], torch.nan), own[1]
+            if around is None:
+                found.append(bounces.added(*images))
+            else:
+                pose = around.world_from_camera[number]
+                found.append(
+                    added_around(bounces, *images, around.surroundings, pose, self._half_angle)
+                )
+        distance, amplitude = (torch.stack(images) for images in zip(*found, strict=True))
+        brighter = torch.where(light > 0, amplitude / light, 1.0)
+        return replace(
+            frames,
+            distance=torch.where(frames.seen, distance, frames.distance),
+            amplitude=torch.where(frames.seen, frames.amplitude * brighter, frames.amplitude),
+        )
 
     def _expected(self, frames: SceneFrames, of_frame: Tensor | None) -> Tensor:
         """Return the expected distance along the ray, shape (B, H, W), metres."""

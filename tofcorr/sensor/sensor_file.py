@@ -1,7 +1,7 @@
 """The file `sensor.yaml`: the camera as it was found."""
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -147,6 +147,19 @@ class SensorFile(Options):
     light: LightSection | None = None
     validity: ValiditySection
     second_bounces: SecondBouncesState | None = None
+
+    def ending_with_the_image(self, patch_px: int | None = None) -> Self:
+        """Return the same without surfaces beyond the image: for frames with surroundings.
+
+        Args:
+            patch_px: Side of its patches; None: as it is.
+        """
+        if self.second_bounces is None:
+            return self
+        patch_px = patch_px or self.second_bounces.patch_px
+        changes = {"continued": False, "patch_px": patch_px}
+        ending = self.second_bounces.model_copy(update=changes)
+        return self.model_copy(update={"second_bounces": ending})
 
     def intrinsics(self) -> CameraIntrinsics:
         """Return the camera."""

@@ -41,7 +41,9 @@ from tofcorr.observables.compare import Observables
 from tofcorr.observables.pairs import LEAST_P
 from tofcorr.options import dump_yaml
 from tofcorr.progress import event_writer
+from tofcorr.scene_light.bounces import SecondBouncesState
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
+from tofcorr.simulation.effects.multipath import SECOND_BOUNCES, second_bounces_state
 from tofcorr.simulation.effects.registry import CATALOGUE
 from tofcorr.simulation.options import SimulatorOptions
 
@@ -135,6 +137,14 @@ class DiagnosisResult:
         """Whether a gap remains that no effect of the catalogue explains."""
         return self.remainder.unknown
 
+    @property
+    def second_bounces(self) -> SecondBouncesState | None:
+        """Second bounces, where multipath was named as those by surfaces that the frames show."""
+        intervals = [one.interval for one in self.fitted if one.name == SECOND_BOUNCES]
+        frequency = self.evidence.study.inputs.modulation_frequency
+        found = (second_bounces_state(own, frequency, *intervals) for own in self.evidence.effects)
+        return next(filter(None, found), None)
+
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of `diagnosis.json`: plain values, lengths in millimetres."""
         gap, remainder, named = self.gap, self.remainder, self.evidence.named
@@ -214,6 +224,7 @@ class DiagnosisResult:
                 "poses": degraded.poses,
                 "left_out": list(degraded.left_out),
             },
+            "second_bounces": self.second_bounces and self.second_bounces.to_mapping(),
             **self.observables.to_dict(),
             "hand_eye_shift_mm": _mm(gap.hand_eye_shift[0]),
             "hand_eye_shift_deg": round(math.degrees(gap.hand_eye_shift[1]), 5),
@@ -302,6 +313,7 @@ def write_report(result: DiagnosisResult, folder: Path) -> None:
     """
     findings = json.dumps(result.to_mapping(), indent=1, ensure_ascii=False, allow_nan=False)
     sensor = sensor_of(result.evidence, result.observables)
+    sensor = sensor.model_copy(update={"second_bounces": result.second_bounces})
     texts = {"diagnosis.json": findings + "\n", FILE_NAME: sensor_text(sensor)}
     if result.simulator is not None:
         texts["simulator_with_effects.yaml"] = dump_yaml(result.simulator.to_mapping())

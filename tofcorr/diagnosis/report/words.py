@@ -261,7 +261,8 @@ def _cause_line(found: Evidence, one: Share) -> str:
 
 def effect_line(named: NamedEffects, name: str) -> str:
     """Return what a named effect is, what it may be instead, and what hides it."""
-    study, words = named.study, CATALOGUE[name].summary
+    study = named.study
+    words = study.effects[name].said if name in study.effects else CATALOGUE[name].summary
     if not study.fit.model.groups.isdisjoint(CATALOGUE[name].refines):
         words = f"the base model's {name} term, and a higher-order form of it"
     rivals = [

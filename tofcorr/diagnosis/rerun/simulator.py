@@ -39,6 +39,7 @@ from tofcorr.sensor.sensor_file import (
     validity_of,
 )
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.multipath import second_bounces_state
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.options import (
     CameraMountOptions,
@@ -407,7 +408,10 @@ def sensor_of(found: Evidence, observables: Observables | None) -> SensorFile:
     study, model = found.study, found.study.fit.model
     recording = study.observations.recording
     own: list[CatalogueEffect] = [] if study.pattern is None else [study.pattern]
-    own += found.effects
+    states = [
+        second_bounces_state(effect, recording.modulation_frequency) for effect in found.effects
+    ]
+    own += [effect for effect, state in zip(found.effects, states, strict=True) if state is None]
     entries = [effect.in_other_recordings().to_mapping() for effect in own]
     error, remainder = given_error(found)
     terms, error_model = model.options.with_columns().terms, copy.deepcopy(model.error_model)
@@ -434,6 +438,7 @@ def sensor_of(found: Evidence, observables: Observables | None) -> SensorFile:
         effects=(*_given_effects(found), *entries),
         **({} if observables is None else _sections(study, observables, own)),
         validity=validity_of(model.domain),
+        second_bounces=next(filter(None, states), None),
     )
 
 

@@ -260,12 +260,12 @@ def build_study(
     wanted = options.catalogue if options.catalogue is not None else tuple(CATALOGUE)
     kinds = {name: CATALOGUE[name] for name in wanted if name not in options.leave_out}
     missing = {name: wants for name, kind in kinds.items() if (wants := kind.missing(inputs))}
-    known = {n: kind.for_recording(inputs) for n, kind in kinds.items() if n not in missing}
-    maps = {n: each for n, each in known.items() if isinstance(each, MapEffect)}
-    effects = {n: each for n, each in known.items() if n not in maps}
-    probes = probes_for(inputs)
-    sources = {**effects, **probes}
-    found = in_threads(lambda source: source.scaled_columns(inputs), sources.values())
+    known = {n: kind.forms(inputs) for n, kind in kinds.items() if n not in missing}
+    maps = {n: each for n, (each, *_) in known.items() if isinstance(each, MapEffect)}
+    probes, pose = probes_for(inputs), pose_columns(inputs)
+    sources = [(n, form) for n, forms in known.items() if n not in maps for form in forms]
+    sources += list(probes.items())
+    found = in_threads(lambda source: source[1].scaled_columns(inputs), sources)
     # What is uncertain of the simulator's own error, or stands in for the amplitude.
     further = [] if fit.known is None else [fit.known.uncertain]
     further.append(unknown_amplitude_columns(observations, inputs))
@@ -273,7 +273,20 @@ def build_study(
     prior = fit.model.prior_precision(num_units / OLS_SD**2)
     prior = torch.block_diag(prior, torch.eye(sum(own.shape[1] for own in further)).double())
     base = torch.cat([fit.model.linearised(fit.tool_from_camera)[1], *further], dim=1)
-    columns, pose = {BASE: base, **dict(zip(sources, found, strict=True))}, pose_columns(inputs)
+
+    def left_out(name: str, own: Tensor) -> float:
+        """Return what base model and a form leave of poses predicted by all others, m^2."""
+        sums = pose_sums(observations, {BASE: base, name: own}, pose, fit, prior)
+        gls = sums.with_pose_uncertainty((name,)).gls
+        return float(gls.squares_at((name,), gls.left_out_coefficients((name,))).sum())
+
+    columns, effects, least = {BASE: base}, dict[str, CatalogueEffect](), dict[str, float]()
+    for (name, form), own in zip(sources, found, strict=True):
+        left = left_out(name, own) if len(known.get(name, ())) > 1 else 0.0
+        if name not in columns or left < least[name]:
+            columns[name], least[name] = own, left
+            if isinstance(form, CatalogueEffect):
+                effects[name] = form
     sums = pose_sums(observations, columns, pose, fit, prior)
     return Study(
         options=options,

@@ -386,6 +386,16 @@ class CatalogueEffect(Effect, ABC):
         return cls(cls.shape_type())  # Every shape has defaults.
 
     @classmethod
+    def forms(cls, inputs: EffectInputs) -> tuple[Self, ...]:
+        """Return the effect in each form that it may have in a recording, all coefficients zero."""
+        return (cls.for_recording(inputs),)
+
+    @property
+    def said(self) -> str:
+        """What it is in this form, in one line."""
+        return self.summary
+
+    @classmethod
     def missing(cls, inputs: EffectInputs) -> list[str]:
         """Return the words of what the effect needs and the recording lacks."""
         return [need.words for need in cls.needs if not need.known(inputs)]

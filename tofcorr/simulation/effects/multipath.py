@@ -1,21 +1,34 @@
 """Light that reaches the target by a wall or the floor."""
 
 import itertools
-from typing import Self
+import math
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from tofcorr.geometry import se3
 from tofcorr.geometry.polynomials import exponents, products
-from tofcorr.geometry.rays import SPEED_OF_LIGHT
+from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
+from tofcorr.options import Number, PositiveNumber
+from tofcorr.scene_light.bounces import SecondBouncesState
+from tofcorr.scene_light.surroundings import (
+    CameraLight,
+    Surroundings,
+    bounced,
+    sampled,
+    surroundings_of,
+)
 from tofcorr.simulation.effects.base import (
     FIXED_TARGET,
     FREQUENCY,
+    CatalogueEffect,
     Coefficient,
     EffectInputs,
     SignalEffect,
+    inner_range,
     inputs_from_state,
+    known,
     side_by_side,
 )
 from tofcorr.simulation.effects.surface import LEAST_COSINE
@@ -33,6 +46,12 @@ Set by hand: a surface close by, and one farther away."""
 _BEFORE, _DEPTH = (0.05, 0.15, 0.4), (0.1, 0.15, 0.35)
 _ASIDE = (-0.25, 0.0, 0.25)
 _WIDTH = 0.25
+
+SECOND_BOUNCES = "second_bounces"
+"""Name of the coefficient of second bounces by surfaces that the frames show."""
+_CONES = (1.0, 1.2, 1.4)
+"""Half angles of the light that are tried, over that of the image's corners. Chosen: light beyond
+the image is lost, so that no camera sends much of it."""
 
 # Pixels evaluated at once. Chosen: what is computed of them stays in a processor's cache.
 _AT_ONCE = 10_000
@@ -93,9 +112,32 @@ _ROOM_DEGREE = 2
 
 
 class MultipathShape(AreaShape):
-    """The area of the target that the camera saw, and the distance from which it did."""
+    """The area of the target that the camera saw, and what the frames show beside the target.
+
+    Attributes:
+        distance_m: Mean distance from which the target was seen.
+        surfaces: Large planes n . p = offset of the world that light one another: n, offset, and
+            brightness over that of the target's bright parts. Empty: the frames show the target
+            alone.
+        targets: How many of them are targets; they come first.
+        light_half_angle_deg: How far off the optical axis the camera's light reaches.
+        amplitude_at_1m: Of the target's bright parts, seen straight on.
+    """
 
     distance_m: float = 1.0
+    surfaces: tuple[tuple[Number, Number, Number, Number, Number], ...] = ()
+    targets: int = 0
+    light_half_angle_deg: PositiveNumber = 45.0
+    amplitude_at_1m: PositiveNumber = 1.0
+
+    def around(self) -> Surroundings:
+        """Return the surfaces and their brightness."""
+        planes = torch.tensor(self.surfaces, dtype=torch.float64)
+        return Surroundings(planes[:, :3], planes[:, 3], self.amplitude_at_1m * planes[:, 4])
+
+    def gain(self, coefficient: float) -> float:
+        """Return the gain of second bounces, as in `SecondBouncesState`, of their coefficient."""
+        return coefficient / (math.pi * self.amplitude_at_1m)
 
 
 class MultipathEffect(SignalEffect, shape=MultipathShape):
@@ -130,7 +172,7 @@ class MultipathEffect(SignalEffect, shape=MultipathShape):
     summary = "light reflected by a wall, a floor or a table beside the target"
     remedy = "move the target within the room, or cover the floor with something black"
     needs = (FREQUENCY, FIXED_TARGET)
-    fixed_terms = (
+    _of_unseen = (
         *(Coefficient(f"{side}_{place}", "1", 0.5) for side, _, _ in SIDES for place in BEYOND),
         *(
             Coefficient(f"room_x{i}_y{j}{suffix}", "m", 0.03 / (1 + i + j))
@@ -141,10 +183,33 @@ class MultipathEffect(SignalEffect, shape=MultipathShape):
     )
 
     @classmethod
+    def terms(cls, shape: MultipathShape) -> tuple[Coefficient, ...]:
+        """Return the reflectivity of the target, or the coefficients of what was not seen."""
+        return (Coefficient(SECOND_BOUNCES, "1", 1.0),) if shape.surfaces else cls._of_unseen
+
+    @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Place the surfaces at the edges of the area that the camera saw."""
         distance = float(inputs.radial_distance.mean())
         return cls(MultipathShape.seen(inputs, distance_m=distance))
+
+    @classmethod
+    def forms(cls, inputs: EffectInputs) -> tuple[Self, ...]:
+        """Return the effect of surfaces that the frames show too, for some cones of light."""
+        usual = cls.for_recording(inputs)
+        seen = _seen(inputs)
+        if not seen:
+            return (usual,)
+        corner = math.degrees(math.acos(float(ray_directions(inputs.camera)[..., 2].min())))
+        cones = [{**seen, "light_half_angle_deg": share * corner} for share in _CONES]
+        return usual, *(cls(usual.shape.model_copy(update=each)) for each in cones)
+
+    @property
+    def said(self) -> str:
+        """What it is in this form, in one line."""
+        count = len(self.shape.surfaces) - self.shape.targets
+        planes = "a plane" if count == 1 else f"{count} planes"
+        return f"second bounces of light by {planes} in view" if count else self.summary
 
     def on_signal(self, state: FrameState) -> None:
         """Add the light of the other ways to every harmonic."""
@@ -160,22 +225,90 @@ class MultipathEffect(SignalEffect, shape=MultipathShape):
         return inputs.remembered(_response, self.shape, 1)
 
 
+def _seen(inputs: EffectInputs) -> dict[str, Any]:
+    """Return surfaces and amplitude of the shape; empty where the frames show the target alone."""
+    facts = inputs.facts
+    if inputs.amplitude is None or inputs.amplitude_images is None:
+        return {}
+    exposure = torch.ones_like(facts.offset)
+    if facts.integration_time is not None:
+        exposure = facts.integration_time / facts.integration_time.mean()
+    bright = inputs.amplitude * inputs.radial_distance**2 / inputs.incidence_cosine
+    white = inner_range(bright / inputs.of_frame(exposure))[1]
+    targets = torch.cat([facts.normal_world, -facts.offset[:, None]], dim=1).unique(dim=0)
+    rays = ray_directions(inputs.camera).reshape(-1, 3)
+    pixel = sampled(rays)
+    found = surroundings_of(
+        known(inputs, "distance_images").flatten(1)[:, pixel],
+        inputs.amplitude_images.flatten(1)[:, pixel] / (white * exposure[:, None]),
+        rays[pixel],
+        facts.world_from_tool @ inputs.tool_from_camera,
+        targets,
+    )
+    if len(found.offset) == len(targets):
+        return {}
+    planes = torch.cat([found.normal, found.offset[:, None], found.brightness[:, None]], dim=1)
+    return {
+        "surfaces": tuple(map(tuple, planes.tolist())),
+        "targets": len(targets),
+        "amplitude_at_1m": white,
+    }
+
+
+def _second_bounces(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor:
+    """Return second bounces over the direct light, of a white target, shape (M,), complex."""
+    facts, around, gain = inputs.facts, shape.around(), shape.gain(1.0)
+    half_angle, frequency = math.radians(shape.light_half_angle_deg), inputs.known_frequency
+    light = torch.zeros_like(inputs.radial_distance, dtype=torch.complex128)
+    for number, pose in enumerate(facts.world_from_tool @ inputs.tool_from_camera):
+        own, normal = inputs.frame == number, facts.normal_world[number]
+        facing = normal * (normal @ pose[:3, 3] + facts.offset[number]).sign()
+        camera = CameraLight(pose, half_angle, order * frequency, gain)
+        place = inputs.points_world[own]
+        light[own] = bounced(around, camera, place, facing.expand_as(place))
+    return light.masked_fill(light.isnan(), 0.0)
+
+
 def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor:
     """Return each coefficient's light over the direct light, shape (M, K), complex."""
     turn = order * 4 * torch.pi * inputs.known_frequency / SPEED_OF_LIGHT
-    camera = camera_over_target(inputs)
     distance, cosine = inputs.radial_distance, inputs.incidence_cosine
+    if shape.surfaces:
+        return _second_bounces(inputs, shape, order)[:, None]
+    far = distance / shape.distance_m
+    flange = torch.polar(cosine / far**2, turn * distance)[:, None]
+    camera = camera_over_target(inputs)
     parts = [
         light_by_surfaces(inputs.target_xy[k], camera[k], distance[k], cosine[k], shape, turn)
         for k in torch.arange(len(distance)).split(_AT_ONCE)
     ]
     light = torch.cat(parts)
     light = light.masked_fill(light.isnan(), 0.0)  # Beside the target.
-    far = distance / shape.distance_m
-    flange = torch.polar(cosine / far**2, turn * distance)
     # What bounced more often lights the target evenly; its error grows as the direct light falls.
     x, y = shape.scaled(inputs.target_xy)
     strength = far**2 / cosine.clamp(min=LEAST_COSINE)
     smooth = strength[:, None] * side_by_side(products(x, y, 0, _ROOM_DEGREE))
     room = 1j * turn * torch.cat([smooth, (far - 1)[:, None] * smooth], dim=1)
-    return torch.cat([light, room, flange[:, None]], dim=1)
+    return torch.cat([light, room, flange], dim=1)
+
+
+def second_bounces_state(
+    effect: CatalogueEffect, frequency: float | None, interval: tuple[float, float] | None = None
+) -> SecondBouncesState | None:
+    """Return the second bounces of a camera; None if an effect is not that of surfaces seen.
+
+    Args:
+        effect: Any, with its coefficients.
+        frequency: Hz.
+        interval: Of the coefficient of second bounces; None: it is not known.
+    """
+    shape, value = effect.shape, float(effect.coefficients[0])
+    if not (isinstance(shape, MultipathShape) and shape.surfaces and frequency and value > 0):
+        return None
+    low, high = map(shape.gain, interval or (value, value))
+    return SecondBouncesState(
+        frequencies_hz=(frequency,),
+        gain=shape.gain(value),
+        gain_interval=None if interval is None else (low, high),
+        light_half_angle_deg=shape.light_half_angle_deg,
+    )
