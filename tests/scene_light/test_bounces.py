@@ -20,6 +20,7 @@ from tofcorr.scene_light.bounces import SecondBounces, SecondBouncesState
 from tofcorr.scene_light.gain import fit_gain
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
+from tofcorr.training.scene import patch_within, recorded_room
 
 FREQUENCY, GAIN = 20e6, 1 / 500
 CAMERA = CameraIntrinsics(
@@ -145,6 +146,100 @@ def test_a_board_between_two_walls_hides_them_from_each_other() -> None:
     assert not free(hidden)[left, right]
 
 
+ROOM = [
+    {"corners": [[1.8, -3, 0.1], [-1.5, -3, 3.4], [-1.5, 3, 3.4], [1.8, 3, 0.1]]},
+    {"corners": [[-1.5, -3, 0.05], [1.5, -3, 3.05], [1.5, 3, 3.05], [-1.5, 3, 0.05]]},
+]
+"""A room of two walls that meet ahead, in the camera's axes."""
+
+
+def room(**changed: object) -> SecondBounces:
+    values = STATE.to_mapping() | {"room": ROOM, "continued": False, **changed}
+    return SecondBounces(CAMERA, SecondBouncesState.model_validate(values)).double()
+
+
+def in_room(found: SecondBounces) -> tuple[Tensor, Tensor]:
+    """Distances and light of the room's walls, of a reflectivity of one half."""
+    found.room.set_pose(torch.eye(4))
+    planes, _ = found.room.met(found.rays.reshape(3, -1))
+    near = (planes * found.rays.reshape(3, -1)).sum(0).reshape(24, 32)
+    cosine = near / planes.norm(dim=0).reshape(24, 32)
+    return 1 / near, 0.5 / (math.pi * GAIN) * cosine * near**2
+
+
+def test_a_room_in_the_world_is_that_in_the_camera_from_its_pose() -> None:
+    still, moved = room(room_axes="camera"), room()
+    distance, light = in_room(still)
+    pose = torch.eye(4).double()
+    pose[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0, -1, 2], [1, 0, 3], [-2, -3, 0]]) / 4.0)
+    pose[:3, 3] = torch.tensor([1.0, -2.0, 0.5])
+    turned = [
+        {"corners": (torch.tensor(f["corners"]).double() @ pose[:3, :3].T + pose[:3, 3]).tolist()}
+        for f in ROOM
+    ]
+    expected = still.removed(distance, light)
+    moved = room(room=turned)
+    moved.room.set_pose(pose)
+    torch.testing.assert_close(moved.removed(distance, light), expected, rtol=0, atol=1e-5)
+
+
+def test_a_room_sends_light_from_beyond_the_image() -> None:
+    wide = {"light_half_angle_deg": 60.0, "room_axes": "camera"}
+    whole, none = room(**wide), room(room=[], **wide)
+    distance, light = in_room(whole)
+    more = whole.added(distance, light)[0] - none.added(distance, light)[0]
+    assert (more > 0).all()
+    # Continued planes of the frame are those of the room.
+    continued = room(room=[], continued=True, **wide).added(distance, light)[0]
+    assert (whole.added(distance, light)[0] - continued).abs().max() < 0.1 * more.max()
+
+
+def test_without_a_pose_the_room_of_a_world_is_not_used() -> None:
+    distance, light = in_room(room())  # Of another one, with a pose.
+    torch.testing.assert_close(
+        room().removed(distance, light), room(room=[]).removed(distance, light)
+    )
+
+
+def test_planes_of_frames_are_put_together_in_the_world() -> None:
+    poses = torch.eye(4).double().repeat(3, 1, 1)
+    poses[1:, :3, 3] = torch.tensor([[0.1, 0.0, -0.1], [-0.05, 0.2, 0.0]])
+    frames = []
+    for pose in poses:
+        moved = room()
+        moved.room.set_pose(pose)
+        planes, _ = moved.room.met(moved.rays.reshape(3, -1))
+        near = (planes * moved.rays.reshape(3, -1)).sum(0)
+        light = 0.5 / (math.pi * GAIN) * near**3 / planes.norm(dim=0)
+        frames.append((1 / near.reshape(24, 32), light.reshape(24, 32)))
+    none = room(room=[], gain=GAIN / 1e3)  # Hardly any bounces: these distances are direct.
+    faces = recorded_room(none, frames, poses)
+    assert len(faces) == 2
+    for face in faces:
+        corners = torch.tensor(face.corners).double()
+        off = [
+            ((corners - torch.tensor(f["corners"][0]).double()) @ torch.tensor(n).double())
+            .abs()
+            .max()
+            for f, n in zip(ROOM, ((1, 0, 1), (-1, 0, 1)), strict=True)
+        ]
+        assert min(off) < 1e-4  # A thousandth of what the bounces would add.
+
+
+def test_a_budget_makes_patches_larger_or_is_refused() -> None:
+    depth, light = (image.float()[None] for image in CORNER)
+    values = {"frequencies_hz": (FREQUENCY,), "gain": GAIN}
+    assert patch_within(1e6, values, state_with_bounces(), depth, light) == 2
+    with pytest.raises(CalibrationDataError, match="budget_ms"):
+        patch_within(1e-3, values, state_with_bounces(), depth, light)
+
+
+def test_a_bent_face_is_refused() -> None:
+    bent = [{"corners": [[0, 0, 1], [1, 0, 1], [1, 1, 2], [0, 1, 1]]}]
+    with pytest.raises(ValueError, match="flat and convex"):
+        room(room=bent)
+
+
 def test_pixels_without_a_return_stay_without() -> None:
     distance, light = (image.clone() for image in CORNER)
     distance[3:6, 4:9] = torch.nan
@@ -239,3 +334,23 @@ def test_a_sensor_adds_what_is_removed() -> None:
     torch.testing.assert_close(seen.depth, expected)
     torch.testing.assert_close(seen.amplitude, brighter)
     assert torch.equal(plain(distance, light, noise=False).depth, distance)
+
+
+def test_a_scripted_corrector_takes_the_pose_of_each_frame() -> None:
+    mounted = torch.eye(4).double()
+    mounted[:3, 3] = torch.tensor([0.02, -0.05, 0.1])
+    scene = {"second_bounces": STATE.to_mapping() | {"room": ROOM, "continued": False}}
+    state = state_with_bounces().model_copy(
+        update={"scene": SceneLight.model_validate(scene), "tool_from_camera": mounted}
+    )
+    poses = torch.eye(4).double().repeat(2, 1, 1)
+    poses[1, :3, 3] = torch.tensor([0.1, 0.0, -0.2])
+    depth, light = (image.float().repeat(2, 1, 1) for image in CORNER)
+    corrector, compiled = (DepthCorrector.from_state(state) for _ in range(2))
+    compiled = torch.jit.script(compiled)
+    compiled.set_pose(poses)
+    both = compiled(depth, light)[0]
+    for frame, pose in enumerate(poses):
+        corrector.set_pose(pose)
+        torch.testing.assert_close(corrector(depth[frame], light[frame])[0], both[frame])
+    assert not torch.equal(both[0], both[1])

@@ -168,6 +168,15 @@ class DepthCorrector(nn.Module):
                 values[k] = value * self.si_per_unit[k]
         self.conditions_inside = self.error.set_conditions(values.to(self.radial_of_z.device))
 
+    def set_pose(self, world_from_tool: Tensor) -> None:
+        """Set the tool's pose in the next frames, (4, 4), or one of each frame of a batch.
+
+        Only a room in the axes of the world needs it; it is used from then on.
+        """
+        if self.bounces is not None:
+            tool = world_from_tool.double()
+            self.bounces.room.set_pose(tool @ self.tool_from_camera.double())
+
     def points(self, depth: Tensor, amplitude: Tensor) -> Tensor:
         """Return corrected points in the camera frame, shape (..., H, W, 3), metres."""
         corrected, _ = self.forward(depth, amplitude)
@@ -259,7 +268,7 @@ class DepthCorrector(nn.Module):
 # What the file offers besides `forward`. Set here, not when it is compiled: TorchScript compiles a
 # class once, whoever asks first.
 if hasattr(torch, "jit"):  # Later versions of torch may lack it.
-    for _name in ("set_conditions", "points", "points_tool", "sigma", "metadata"):
+    for _name in ("set_conditions", "set_pose", "points", "points_tool", "sigma", "metadata"):
         torch.jit.export(getattr(DepthCorrector, _name))
 
 

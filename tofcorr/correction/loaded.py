@@ -85,6 +85,11 @@ class LoadedCorrector(nn.Module):
             raise FrameError(f"{', '.join(conditions)}: this file cannot take it, {held}.")
         return self.correct(depth, strength)
 
+    def set_pose(self, world_from_tool: Any) -> None:  # noqa: ANN401 - tensor, or array
+        """Set the tool's pose in the next frames, as `DepthCorrector.set_pose` does."""
+        if hasattr(self.correct, "set_pose"):
+            self.correct.set_pose(torch.as_tensor(world_from_tool))
+
     def metadata(self) -> str:
         """Return camera, model, validity range and versions as JSON text."""
         return self.text

@@ -15,7 +15,7 @@ reflectivity of i cancels. The gain s is a constant of the camera.
 """
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -24,11 +24,10 @@ from torch import Tensor, nn
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.options import FiniteNumber, NonNegativeNumber, Number, Options, PositiveNumber
+from tofcorr.scene_light.room import Face, Room
 
 _PATCHES = (32, 24)
 """Columns and rows of patches at most, if no size is given. Asked for: 768 of a frame of 4:3."""
-_FLAT = 1e-3
-"""Share of the distance by which a plane may miss its cells without noise. Chosen."""
 _ODD = 9.0
 """Variance above which a window is no plane, in those of the noise: three deviations. Chosen."""
 _WIDE_PLANE = 0.03
@@ -38,8 +37,8 @@ _ALIKE = 0.8
 """Least cosine between the normals of cells of one large plane. Set there."""
 _LEAST_FACE = 0.005
 """Share of all cells that makes a large plane. Chosen: 15 of 64 x 48."""
-_FACES, _CANDIDATES = 12, 128
-"""Large planes that are looked for, and cells whose planes are tried. Chosen."""
+_FACES = 12
+"""Large planes that are looked for. Chosen."""
 _STEEPEST = 0.05
 """Least cosine of incidence with which a patch takes or sends light: 87 degrees. Chosen."""
 _SAMPLES = 4
@@ -58,12 +57,21 @@ class SecondBouncesOptions(Options):
         light_half_angle_deg: How far off the optical axis light reaches; None: to the image's
             corners.
         continued: Whether planes at the border of the image go on beyond it.
+        room: What stands around and does not move. Beyond the image it is taken where it is met, in
+            place of planes that go on.
+        room_in_image: Whether its planes are taken in the image too, wherever nothing stands
+            before it: those that a frame shows are bent by second bounces.
+        room_axes: Of the corners: the world in which poses are stated, or the camera's. The room of
+            a world is used from `Room.set_pose` on.
     """
 
     patch_px: Annotated[int, Field(ge=2, multiple_of=2)] | None = None
     light_m: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     light_half_angle_deg: Annotated[FiniteNumber, Field(gt=0, le=80)] | None = None
     continued: bool = True
+    room: tuple[Face, ...] = ()
+    room_in_image: bool = True
+    room_axes: Literal["world", "camera"] = "world"
 
 
 Frequencies = Annotated[tuple[PositiveNumber, ...], Field(min_length=1, max_length=8)]
@@ -126,7 +134,8 @@ class SecondBounces(nn.Module):
         self.wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in state.frequencies_hz]
         total = sum(f * f for f in state.frequencies_hz)
         self.weights = [f * f / total for f in state.frequencies_hz]
-        self.constants = [_FLAT, _ODD, _WIDE_PLANE, _ALIKE, _LEAST_FACE, _STEEPEST, _OFF_PLANE]
+        self.constants = [_OFF_PLANE / 3, _ODD, _WIDE_PLANE, _ALIKE]
+        self.constants += [_LEAST_FACE, _STEEPEST, _OFF_PLANE]
         self.faces_sought: int = _FACES
         self.samples: int = _SAMPLES
         rays = ray_directions(camera)
@@ -142,8 +151,12 @@ class SecondBounces(nn.Module):
         self.register_buffer("cell_rays", cell_rays)
         self.register_buffer("solid", solid)
         self.register_buffer("light", torch.tensor(state.light_m, dtype=torch.float64))
-        spaced = torch.linspace(0, len(solid) - 1, min(_CANDIDATES, len(solid)))
+        # As many cells are tried as the smallest of large planes would go into the image.
+        spaced = torch.linspace(0, len(solid) - 1, min(round(1 / _LEAST_FACE), len(solid)))
         self.register_buffer("candidates", spaced.long())
+        self.room = Room(state.room, in_world=state.room_axes == "world")
+        self.continued: bool = state.continued
+        self.in_image: bool = state.room_in_image
         self._lay_patches_beyond(state, pitch)
         self._tabulate_patches()
         self._share_cells(size)
@@ -155,7 +168,8 @@ class SecondBounces(nn.Module):
         corner = float(self.rays[2].min())
         half = state.light_half_angle_deg
         cosine = corner if half is None else math.cos(math.radians(half))
-        reach = math.sqrt(1 / cosine**2 - 1) if state.continued else 0.0
+        further = state.continued or bool(state.room)
+        reach = math.sqrt(1 / cosine**2 - 1) if further else 0.0
         width = [4 * self.cell * each for each in pitch]
         lines = []
         for axis in (0, 1):
@@ -168,7 +182,7 @@ class SecondBounces(nn.Module):
         border = torch.tensor(width, dtype=torch.float64) / 4
         outside = ((place < (low - border)[:, None]) | (place > (high + border)[:, None])).any(0)
         ray = nn.functional.normalize(nn.functional.pad(place, (0, 0, 0, 1), value=1.0), dim=0)
-        kept = outside & (ray[2] >= cosine) & bool(state.continued)
+        kept = outside & (ray[2] >= cosine) & further
         held = place[:, kept].clamp(low[:, None], high[:, None])
         nearest = torch.cdist(held.T.contiguous(), slopes.T.contiguous()).argmin(1)
         self.register_buffer("out_rays", ray[:, kept])
@@ -215,7 +229,11 @@ class SecondBounces(nn.Module):
             return self.removed(radial, amplitude)
         if radial.shape[0] == 0:
             return radial
-        frames = [self.removed(radial[i], amplitude[i]) for i in range(radial.shape[0])]
+        frames = torch.jit.annotate(list[Tensor], [])
+        for i in range(radial.shape[0]):
+            self.room.frame = i
+            frames.append(self.removed(radial[i], amplitude[i]))
+        self.room.frame = 0
         return torch.stack(frames)
 
     def removed(self, radial: Tensor, amplitude: Tensor, rounds: int = 2) -> Tensor:
@@ -335,7 +353,7 @@ class SecondBounces(nn.Module):
         small, small_misfit = self.windows(near, 1)
         scale = radial.square().square()
         some = torch.where(small_misfit.isfinite(), small_misfit * scale, math.nan)
-        level = self.constants[1] * (some.nanmedian() + (self.constants[0] * radial).square())
+        level = self.constants[1] * some.nanmedian() + (self.constants[0] * radial).square()
         flat = wide_misfit * scale < level
         fits = flat | (small_misfit * scale < level)
         planes = torch.where(fits, torch.where(flat, wide, small), math.nan)
@@ -348,7 +366,13 @@ class SecondBounces(nn.Module):
         nearest = off.argmin(0)[None, None].expand(3, 1, -1)
         beside = around.gather(1, nearest)[:, 0]
         beside = beside * (near / (beside * self.cell_rays).sum(0))
-        return self.large_planes(near, torch.where(fits, planes, beside), fits)
+        planes, fits, large = self.large_planes(near, torch.where(fits, planes, beside), fits)
+        if not self.in_image:
+            return planes, fits, large
+        # A room hides what is behind it: what seems further away, second bounces have shifted.
+        room, _ = self.room.met(self.cell_rays.double())
+        met = radial * (room * self.cell_rays).sum(0) > 1.0 - self.constants[2]
+        return torch.where(met, room, planes), fits | met, large | met
 
     def windows(self, near: Tensor, half: int) -> tuple[Tensor, Tensor]:
         """Return g of the best of nine windows that contain a cell, and its variance (of 1 / r)."""
@@ -454,11 +478,24 @@ class SecondBounces(nn.Module):
         middle, light = sums[:3] / whole, sums[7:].reshape(2, len(self.wave_numbers), -1)
         free = self.unhidden(middle, facing, sums[6])
         start = self.out_from
-        far_planes, beyond_rays = planes[:, start], self.out_rays.double()
+        beyond_rays, bright = self.out_rays.double(), amplitude * away.square() / cosine
+        far_planes, reflectivity = self.room.met(beyond_rays)
+        known = reflectivity.isfinite()
+        far_planes = torch.where(known, far_planes, planes[:, start])
         far = self.surfaces(far_planes, beyond_rays, self.out_solid.double())
-        ahead = ((far_planes * beyond_rays).sum(0) > 0) & (sends & large)[start]
+        # As bright as the cell beside it, or as the cells of its face; if none is seen, as known.
+        on = ((far_planes.T @ place - 1.0).abs() < self.constants[2]) & sends
+        beside, on = on.gather(1, start[:, None])[:, 0], on.to(bright.dtype)
+        shown = on @ torch.where(sends, bright, 0.0) / on.sum(1)
+        given = (reflectivity / (math.pi * self.gain)).nan_to_num(0.0, 0.0)
+        shown = torch.where(
+            beside | ~known, bright[start], torch.where(shown.isnan(), given, shown)
+        )
+        if self.continued:
+            known = known | (sends & large)[start]
+        ahead = ((far_planes * beyond_rays).sum(0) > 0) & known
         ahead = ahead & (far[3] > self.constants[5])
-        bright = (amplitude * away.square() / cosine)[start] * far[3] / far[2].square() * far[4]
+        bright = shown * far[3] / far[2].square() * far[4]
         bright = turn[:, :, start] * bright
         beyond = turned(bright, self.wave_numbers, far[2]).flatten(0, 1)
         table = torch.cat([far[0], far[1], far[4][None], beyond])
@@ -481,18 +518,25 @@ class SecondBounces(nn.Module):
         normal = normal.float()
         offset, slack = (place.float() * normal).sum(0), -0.5 * area.float().sqrt()
         low_x, low_y, step_x, step_y = self.table_at
-        free = torch.ones(place.shape[1], place.shape[1], dtype=torch.bool, device=place.device)
         limit = torch.cat([normal, (offset + slack)[None]]).T.contiguous()
-        for sample in range(self.samples):  # On the nearer half of the way from i to j.
-            t = (sample + 0.5) / (2 * self.samples)
-            at_x, at_y = torch.lerp(x[:, None], x, t), torch.lerp(y[:, None], y, t)
-            at_z = torch.lerp(z[:, None], z, t).clamp(min=1e-3)
-            column = ((at_x / at_z - low_x) / step_x).int().clamp(0, self.columns - 1)
-            row = ((at_y / at_z - low_y) / step_y).int().clamp(0, self.rows - 1)
-            met = self.table.reshape(-1).index_select(0, (row * self.columns + column).reshape(-1))
-            plane = limit.index_select(0, met).reshape(at_x.shape[0], -1, 4)
-            nx, ny, nz, least = plane.unbind(-1)
-            free = free & (at_x * nx + at_y * ny + at_z * nz > least)
+        wide, rows = self.columns // 2, torch.jit.annotate(list[Tensor], [])
+        for first in range(0, place.shape[1], wide):
+            free = torch.ones(wide, place.shape[1], dtype=torch.bool, device=place.device)
+            own = place.float()[:, first : first + wide, None]
+            for sample in range(self.samples):  # On the nearer half of the way from i to j.
+                t = (sample + 0.5) / (2 * self.samples)
+                at_x, at_y = torch.lerp(own[0], x, t), torch.lerp(own[1], y, t)
+                at_z = torch.lerp(own[2], z, t).clamp(min=1e-3)
+                column = ((at_x / at_z - low_x) / step_x).int().clamp(0, self.columns - 1)
+                row = ((at_y / at_z - low_y) / step_y).int().clamp(0, self.rows - 1)
+                met = self.table.reshape(-1).index_select(
+                    0, (row * self.columns + column).reshape(-1)
+                )
+                plane = limit.index_select(0, met).reshape(wide, -1, 4)
+                nx, ny, nz, least = plane.unbind(-1)
+                free = free & (at_x * nx + at_y * ny + at_z * nz > least)
+            rows.append(free)
+        free = torch.cat(rows)
         return free & free.T
 
     def gathered(
@@ -508,22 +552,28 @@ class SecondBounces(nn.Module):
             light: That they send, times their area, (2, F, P).
             free: Which patches of the image see each other (P', P').
         """
-        count, high, wide = free.shape[0], self.rows // 2, self.columns // 2
-        at, up = here[:3], here[3:]
-        square = at.square().sum(0)[:, None] + place.square().sum(0) - 2.0 * (at.T @ place)
-        square = square.clamp(min=1e-6)
-        facing = (up.T @ place - (up * at).sum(0)[:, None]).clamp(min=0)
-        facing = facing * (at.T @ normal - (place * normal).sum(0)).clamp(min=0)
-        kernel = facing / (square * (square + area / math.pi))
-        seen = free.reshape(high, 1, wide, 1, count).expand(high, 2, wide, 2, count)
-        own = kernel[:, :count] * seen.reshape(-1, count)
-        kernel, ways = torch.cat([own, kernel[:, count:]], dim=1), square.sqrt()
-        found = []
-        for f, k in enumerate(self.wave_numbers):
-            c, s = kernel * torch.cos(k * ways), kernel * torch.sin(k * ways)
-            real, imaginary = light[0, f], light[1, f]
-            found.append(torch.stack([c @ real - s @ imaginary, c @ imaginary + s @ real]))
-        return torch.stack(found, dim=1)
+        count, wide = free.shape[0], 2 * self.columns
+        found = torch.jit.annotate(list[Tensor], [])
+        # Row by row of patches: what fits a cache takes half the time.
+        for row in range(self.rows // 2):
+            at, up = (
+                here[:3, row * wide : (row + 1) * wide],
+                here[3:, row * wide : (row + 1) * wide],
+            )
+            square = at.square().sum(0)[:, None] + place.square().sum(0) - 2.0 * (at.T @ place)
+            square = square.clamp(min=1e-6)
+            facing = (up.T @ place - (up * at).sum(0)[:, None]).clamp(min=0)
+            facing = facing * (at.T @ normal - (place * normal).sum(0)).clamp(min=0)
+            kernel, ways = facing / (square * (square + area / math.pi)), square.sqrt()
+            seen = free[row * wide // 4 : (row + 1) * wide // 4].repeat_interleave(2, 0)
+            kernel[:, :count] *= seen.repeat(2, 1)
+            sums = []
+            for f, k in enumerate(self.wave_numbers):
+                c, s = kernel * torch.cos(k * ways), kernel * torch.sin(k * ways)
+                real, imaginary = light[0, f], light[1, f]
+                sums.append(torch.stack([c @ real - s @ imaginary, c @ imaginary + s @ real]))
+            found.append(torch.stack(sums, dim=1))
+        return torch.cat(found, dim=2)
 
 
 def turned(phasors: Tensor, wave_numbers: list[float], ways: Tensor) -> Tensor:

@@ -115,6 +115,9 @@ def degrade(
             mask = recording.read("mask", np.array([number]))
             # A seed of one frame, independent of those of all other frames and seeds.
             own = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
+            if model.bounces is not None:
+                pose = recording.frames.world_from_tool[number] @ recording.tool_from_camera
+                model.bounces.room.set_pose(torch.from_numpy(pose))
             measured = model(
                 true_depth,
                 **{amplitude_is: lit},

@@ -2,6 +2,9 @@
 
 import logging
 import math
+import time
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +32,7 @@ from tofcorr.scene_light.flying import (
     squared_spreads,
 )
 from tofcorr.scene_light.gain import fit_gain
+from tofcorr.scene_light.room import Face
 from tofcorr.scene_light.stray import StrayLightState
 
 _LOG = logging.getLogger(__name__)
@@ -47,10 +51,16 @@ class SecondBouncesWanted(SecondBouncesOptions):
         frequencies_hz: Modulation frequencies; null: that of the recording.
         gain: One over pi times the amplitude of white paper at 1 m; null: found from the curvature
             that second bounces give to walls.
+        budget_ms: Time of a frame on this machine, the median: patches are made larger until a
+            frame keeps to it.
+        recorded_room: The room is the large planes of the recordings, put together in the world by
+            their poses. It is used beyond the image: they are as bent as those of any frame.
     """
 
     frequencies_hz: Frequencies | None = None
     gain: PositiveNumber | None = None
+    budget_ms: PositiveNumber | None = None
+    recorded_room: bool = False
 
 
 class RuntimeOptions(Options):
@@ -91,19 +101,39 @@ def _second_bounces(
     """Return what removing second bounces takes, with the gain found where none is given."""
     data.require("amplitude", "removing second bounces (runtime.second_bounces)")
     frequency, values = data.first.modulation_frequency, wanted.to_mapping()
+    del values["budget_ms"], values["recorded_room"]
+    recorded = wanted.recorded_room
+    if recorded:
+        values |= {"room": (), "room_axes": "world", "room_in_image": False}
     if wanted.frequencies_hz is None and frequency is None:
         said = "Second bounces need the modulation frequency, which the recording does not state"
         raise CalibrationDataError(f"{said}: set runtime.second_bounces.frequencies_hz.")
     values["frequencies_hz"] = wanted.frequencies_hz or (frequency,)
-    if wanted.gain is not None:
+    if wanted.gain is not None and wanted.budget_ms is None and not recorded:
         return SecondBouncesState.model_validate(values)
     depths, amplitudes = _corrected(data, state)
+    if wanted.budget_ms is not None:
+        values["gain"] = wanted.gain or 0.0
+        values["patch_px"] = patch_within(wanted.budget_ms, values, state, depths, amplitudes)
     radial = depths * DepthCorrector.from_state(state).radial_of_z
     frames = list(zip(radial, amplitudes, strict=True))
+    if wanted.gain is None:
+        values |= _fitted_gain(frames, values, state)
+    if recorded:
+        bounces = SecondBounces(state.camera, SecondBouncesState.model_validate(values))
+        poses = data.column("world_from_tool")[thinned(np.arange(data.num_frames), _FRAMES)]
+        values["room"] = recorded_room(bounces, frames, poses @ state.tool_from_camera.cpu())
+    return SecondBouncesState.model_validate(values)
+
+
+def _fitted_gain(
+    frames: list[tuple[Tensor, Tensor]], values: dict[str, Any], state: CalibrationState
+) -> dict[str, Any]:
+    """Return the gain that is fitted to frames, and its interval."""
     # Half white, seen straight on, to begin with.
     bright = torch.cat([(d.square() * a).flatten() for d, a in frames]).nanmedian()
-    values["gain"] = 1 / (2 * math.pi * float(bright))
-    bounces = SecondBounces(state.camera, SecondBouncesState.model_validate(values))
+    start = values | {"gain": 1 / (2 * math.pi * float(bright))}
+    bounces = SecondBounces(state.camera, SecondBouncesState.model_validate(start))
     terms = state.correction().error_model.signal_terms
 
     def functions(distance: Tensor, amplitude: Tensor) -> Tensor:
@@ -111,8 +141,80 @@ def _second_bounces(
         return torch.cat(found)
 
     fit = fit_gain(bounces, frames, functions)
-    values |= {"gain": fit.gain, "gain_interval": fit.interval}
-    return SecondBouncesState.model_validate(values)
+    return {"gain": fit.gain, "gain_interval": fit.interval}
+
+
+def patch_within(
+    budget_ms: float, values: dict[str, Any], state: CalibrationState, depth: Tensor, light: Tensor
+) -> int:
+    """Return the smallest side of a patch, from the usual one on, that keeps to a time a frame."""
+    options, camera = SecondBouncesState.model_validate(values), state.camera
+    patch = options.patch_px or 2 * SecondBounces(camera, options).cell
+    taken = [math.inf]
+    while patch <= max(camera.width, camera.height):
+        tried = SceneLight(second_bounces=options.model_copy(update={"patch_px": patch}))
+        corrector = DepthCorrector.from_state(state.model_copy(update={"scene": tried}))
+        taken = []
+        for frame in depth.float().split(1)[:5]:
+            begun = time.perf_counter()
+            with torch.no_grad():
+                corrector(frame, light[:1].float())
+            taken.append(1000 * (time.perf_counter() - begun))
+        usual = float(np.median(taken))
+        if usual <= budget_ms:
+            said = "Removing second bounces: %.0f ms a frame (median), patches of %d pixels."
+            _LOG.info(said, usual, patch)
+            return patch
+        # Time goes with the square of the number of patches, at most.
+        patch = max(patch + 2, 2 * int(patch * (usual / budget_ms) ** (1 / 4) / 2))
+    raise CalibrationDataError(
+        f"Second bounces cannot be removed in {budget_ms:g} ms (runtime.second_bounces.budget_ms): "
+        f"the largest patches take {np.median(taken):.0f} ms."
+    )
+
+
+def recorded_room(
+    bounces: SecondBounces, frames: Iterable[tuple[Tensor, Tensor]], poses: Tensor
+) -> tuple[Face, ...]:
+    """Put the large planes of frames together in the world.
+
+    Args:
+        bounces: What finds them.
+        frames: Distances along the ray, metres, and amplitudes, (H, W) each.
+        poses: World from camera, one of each frame (B, 4, 4).
+    """
+    ray, found = bounces.cell_rays.double(), list[list[tuple[Tensor, Tensor, Tensor]]]()
+    wide, alike = bounces.constants[2:4]
+    for (distance, amplitude), pose in zip(frames, poses, strict=True):
+        cells = bounces.cells(distance, amplitude)
+        _, planes, large = bounces.found(*cells)
+        place, normal, away, cosine, _ = bounces.surfaces(planes, ray, bounces.solid)
+        white = math.pi * bounces.gain * cells[1] * away.square() / cosine
+        place, normal = pose[:3, :3] @ place + pose[:3, 3:], pose[:3, :3] @ normal
+        for plane in planes[:, large].unique(dim=1).T:
+            own = large & (planes == plane[:, None]).all(0)
+            part = (place[:, own], normal[:, own].mean(1), white[own])
+            for others in found:
+                off = (part[0].mean(1) - others[0][0].mean(1)) @ others[0][1]
+                if part[1] @ others[0][1] > alike and abs(off) < wide * away[own].mean():
+                    others.append(part)
+                    break
+            else:
+                found.append([part])
+    return tuple(_face(parts) for parts in found)
+
+
+def _face(parts: list[tuple[Tensor, Tensor, Tensor]]) -> Face:
+    """Return the hull of points on one plane (3, N), with their median reflectivity (N,)."""
+    from scipy.spatial import ConvexHull  # Slow to import.
+
+    points, white = (torch.cat([part[k] for part in parts], dim=-1) for k in (0, 2))
+    middle = points.mean(1, keepdim=True)
+    axes = torch.linalg.svd(points - middle, full_matrices=False).U[:, :2]
+    flat = axes.T @ (points - middle)
+    hull = flat[:, ConvexHull(flat.T.numpy()).vertices.copy()]
+    corners = (middle + axes @ hull).T.tolist()
+    return Face.model_validate({"corners": corners, "reflectivity": min(float(white.median()), 1)})
 
 
 def _flying_pixels(
