@@ -3,7 +3,6 @@
 import copy
 import json
 import math
-from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.correction.model import AGREEMENT
+from tofcorr.correction.runtime_sigma import RuntimeSigma, frozen
 from tofcorr.correction.state import CalibrationState, corrector_metadata
 from tofcorr.error_terms.base import EVERYTHING, Domain, Interval, ScaledPolynomial, SignalTerm
 from tofcorr.error_terms.model import ErrorModel
@@ -20,6 +20,7 @@ from tofcorr.geometry.se3 import transformed
 from tofcorr.scene_light.bounces import SecondBounces
 from tofcorr.scene_light.flying import FlyingPixels
 from tofcorr.scene_light.stray import StrayLight
+from tofcorr.scene_light.unremoved import UnremovedBounces
 
 # The error is computed times -2^40, so that `torch.lerp` with the weight w = 2^-40 subtracts it:
 # depth + w (-e / w - depth). Unlike a plain subtraction this turns an infinite depth into NaN in
@@ -93,9 +94,12 @@ class DepthCorrector(nn.Module):
         self.mean_conditions = state.domain.mean_conditions()
         self.si_per_unit = [condition(name).si_per_unit for name in CONDITIONS]
         self.conditions_inside: bool = True
-        self.uncertainty = RuntimeSigma(state, error, limits)
+        self.known_sigma = RuntimeSigma(state, error, limits)
         self.stray: StrayLight | None = state.stray_light()
         self.bounces: SecondBounces | None = state.second_bounces()
+        self.unremoved: UnremovedBounces | None = None
+        if self.bounces is not None and state.scene.second_bounces is not None:
+            self.unremoved = UnremovedBounces(self.bounces, state.scene.second_bounces)
         self.flying: FlyingPixels | None = state.flying_pixels()
         scale = geometry.radial_of_depth if self.is_z else geometry.radial_of_depth[:1, :1]
         points = geometry.points(torch.ones_like(geometry.radial_of_depth))
@@ -116,6 +120,15 @@ class DepthCorrector(nn.Module):
             ValueError: Shape or dtype are not those of the camera (`torch.jit.Error` once
                 scripted).
         """
+        corrected, amplitude, valid = self.without_own_error(depth, amplitude)
+        if self.bounces is not None:
+            corrected = self.bounces(corrected * self.radial_of_z, amplitude) / self.radial_of_z
+        if self.flying is not None:
+            return self.flying(corrected, amplitude, valid)
+        return corrected, valid
+
+    def without_own_error(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return depth and amplitude without what the camera itself adds, and where it is valid."""
         check_frames(depth, amplitude, self.height, self.width)
         depth, amplitude = self.without_stray_light(depth, amplitude)
         depth, amplitude = depth.contiguous(), amplitude.contiguous()
@@ -128,11 +141,7 @@ class DepthCorrector(nn.Module):
             self.correct(depth, amplitude, self.error.offset, 0, corrected, valid)
         if not self.conditions_inside:
             valid.zero_()
-        if self.bounces is not None:
-            corrected = self.bounces(corrected * self.radial_of_z, amplitude) / self.radial_of_z
-        if self.flying is not None:
-            return self.flying(corrected, amplitude, valid)
-        return corrected, valid
+        return corrected, amplitude, valid
 
     def without_stray_light(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         """Return depth and amplitude as they were without the camera's own stray light."""
@@ -196,8 +205,29 @@ class DepthCorrector(nn.Module):
         check_frames(depth, amplitude, self.height, self.width)
         radial = depth * self.radial_of_z
         rows, columns = self.error.rows, self.error.columns
-        noise, calibration = self.uncertainty(radial, amplitude, rows, columns)
+        noise, calibration = self.known_sigma(radial, amplitude, rows, columns)
         return noise / self.radial_of_z, calibration / self.radial_of_z
+
+    def uncertainty(self, depth: Tensor, amplitude: Tensor) -> Tensor:
+        """Return the standard deviation of the corrected depth, all that is known, metres.
+
+        Noise and calibration, as `sigma` has them, what second bounces still add or lack, and what
+        flying pixels that were not found add beside those that were. Of depth of the camera's kind,
+        the shape of `depth`. Errors of second bounces are alike in neighbouring pixels, and in
+        frames of one scene. NaN as `sigma`. A flying pixel has none that holds: it is not valid.
+        """
+        noise, calibration = self.sigma(depth, amplitude)
+        variance = noise.square() + calibration.square()
+        corrected, light, _ = self.without_own_error(depth, amplitude)
+        if self.unremoved is not None:
+            added = self.unremoved(corrected * self.radial_of_z, light) / self.radial_of_z
+            variance = variance + added.square()
+        if self.flying is not None:
+            if self.bounces is not None:
+                corrected = self.bounces(corrected * self.radial_of_z, light) / self.radial_of_z
+            missed = self.flying.missed(corrected, light)
+            variance = variance + (missed * noise).square()
+        return variance.sqrt()
 
     def metadata(self) -> str:
         """Return camera, model, validity range and versions as JSON text."""
@@ -268,7 +298,15 @@ class DepthCorrector(nn.Module):
 # What the file offers besides `forward`. Set here, not when it is compiled: TorchScript compiles a
 # class once, whoever asks first.
 if hasattr(torch, "jit"):  # Later versions of torch may lack it.
-    for _name in ("set_conditions", "set_pose", "points", "points_tool", "sigma", "metadata"):
+    for _name in (
+        "set_conditions",
+        "set_pose",
+        "points",
+        "points_tool",
+        "sigma",
+        "uncertainty",
+        "metadata",
+    ):
         torch.jit.export(getattr(DepthCorrector, _name))
 
 
@@ -352,13 +390,13 @@ class RuntimeErrorModel(nn.Module):
         self.normalised = RuntimePolynomial(normalised, bounds, factor)
         parts = (self.distance, self.amplitude, self.normalised)
         self.left_over: float = sum(one.left_over for one in parts)
-        self.others = _frozen(others)
+        self.others = frozen(others)
         self.has_amplitude: bool = "amplitude" in found
         self.has_normalised: bool = normalised is not None
         self.needs_amplitude: bool = model.needs_amplitude()
         offset = factor * (model.pixel_error().detach() + self.left_over)
         self.register_buffer("offset", offset.float().contiguous())
-        self.condition_terms = _frozen(model.condition_terms, torch.float64)
+        self.condition_terms = frozen(model.condition_terms, torch.float64)
         self.has_conditions: bool = len(model.condition_terms) > 0
         at_mean = self.offset.clone() if self.has_conditions else self.offset[:0]
         self.register_buffer("offset_at_mean", at_mean)
@@ -448,79 +486,6 @@ class RuntimePolynomial(nn.Module):
         return value
 
 
-class RuntimeSigma(nn.Module):
-    r"""Standard deviations of a corrected distance along its ray.
-
-    .. math:: \sigma_\mathrm{noise}^2 = a + b / I + c / I^2, \quad
-        \sigma_\mathrm{calibration}^2 = b_v^T C b_v
-
-    with C the covariance of the coefficients and b_v the functions they multiply at the pixel.
-    A residual network and a fixed pattern are taken as exact. What is unknown is NaN.
-
-    Args:
-        state: The calibration, with covariance and noise where they are known.
-        error: Its error model.
-        limits: Ranges of the variables, beyond which the edge's value is given.
-    """
-
-    factor: Tensor
-    noise: list[float]
-
-    def __init__(self, state: CalibrationState, error: ErrorModel, limits: Domain) -> None:
-        super().__init__()
-        self.signal_terms = _frozen(error.signal_terms)
-        self.pixel_terms = _frozen(error.pixel_terms)
-        self.nearest, self.farthest = limits.radial_distance
-        self.weakest, self.strongest = limits.amplitude or EVERYTHING
-        self.knows_noise: bool = state.noise is not None
-        self.noise = list(state.noise or (0.0, 0.0, 0.0))
-        self.knows_calibration: bool = state.covariance is not None
-        factor = torch.zeros(1, 1, dtype=torch.float64)
-        if state.covariance is not None:
-            size = len(error.image_symbols())
-            values, vectors = torch.linalg.eigh(state.covariance[:size, :size].detach().cpu())
-            factor = (vectors * values.clamp(min=0).sqrt()).T
-        self.register_buffer("factor", factor.float().contiguous())
-
-    def forward(
-        self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return both standard deviations, shape (..., H, W), metres along the ray.
-
-        Args:
-            radial_distance: Measured, shape (..., H, W), metres.
-            amplitude: The same shape, the camera's units.
-            rows: Shape (H, 1), pixels.
-            columns: Shape (1, W), pixels.
-        """
-        unknown = torch.full_like(radial_distance, float("nan"))
-        noise, calibration = unknown, unknown
-        seen = torch.isfinite(radial_distance) & (radial_distance > 0)
-        if self.knows_noise:
-            # As `DistanceNoise` has it; the least amplitude, for zero times infinity would be NaN.
-            weakness = 1.0 / amplitude.clamp(min=2.0**-126)
-            variance = self.noise[0] + weakness * (self.noise[1] + self.noise[2] * weakness)
-            noise = torch.where(seen, variance.sqrt(), unknown)
-        if self.knows_calibration:
-            distance = radial_distance.clamp(self.nearest, self.farthest)
-            strength = amplitude.clamp(self.weakest, self.strongest)
-            ones = torch.ones_like(distance)
-            functions = [ones.unsqueeze(0)]
-            for term in self.signal_terms:
-                basis = term.basis(distance, strength)  # pyright: ignore[reportCallIssue]
-                functions.append(basis)
-            for place in self.pixel_terms:
-                u, v = torch.broadcast_tensors(rows, columns)
-                found = place.basis(u, v)  # pyright: ignore[reportCallIssue]
-                shape = [found.shape[0]] + list(distance.shape)  # noqa: RUF005
-                if distance.dim() == 3:
-                    found = found.unsqueeze(1)
-                functions.append(found.expand(shape))
-            spread = torch.tensordot(self.factor, torch.cat(functions), dims=1)
-            calibration = torch.where(seen, spread.square().sum(0).sqrt(), unknown)
-        return noise, calibration
-
-
 def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> None:
     """Refuse all but a frame, or a batch of frames, of the camera in float32, without gradients.
 
@@ -574,11 +539,6 @@ def separated(error: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     columns = error.mean(dim=0, keepdim=True) - error.mean()
     rest = error - rows - columns
     return rows, columns, rest if bool(rest.abs().max() > AGREEMENT / 100) else None
-
-
-def _frozen(terms: Iterable[nn.Module], dtype: torch.dtype = torch.float32) -> nn.ModuleList:
-    copied = nn.ModuleList([copy.deepcopy(term) for term in terms])
-    return copied.to(dtype).requires_grad_(requires_grad=False)
 
 
 def _rounding(raw: list[float], interval: Interval) -> float:

@@ -69,6 +69,7 @@ def check(
         refuse_page(Path(page))
     state = load_calibration(Path(run) / STATE_FILE)
     dataset = Dataset(opened(recordings)).without_stray_light(state.scene.stray_light)
+    dataset = dataset.without_second_bounces(state)
     _refuse_unfit(state, dataset, "per_image")
     planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
     headline = vet(dataset, planes, fits=False, force=force).headline

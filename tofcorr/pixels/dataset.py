@@ -20,6 +20,7 @@ from pydantic import Field, NonNegativeInt, field_validator
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
+from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import (
     CHUNK_PIXELS,
     FrameBatch,
@@ -32,6 +33,7 @@ from tofcorr.data.recording import (
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import Chosen, Rays, ray_directions
 from tofcorr.options import Options
+from tofcorr.pixels.direct import DirectDistance
 from tofcorr.scene_light.stray import StrayLight, StrayLightState
 
 Frames = Sequence[int] | np.ndarray
@@ -49,11 +51,13 @@ class Dataset:
         exclude: Returns True where a valid pixel of a batch is not used, shape (B, H, W); None
             uses all valid pixels. Fits and measured errors both leave these pixels out.
         stray: Takes the camera's own stray light out of every frame that is read; None: nothing.
+        direct: Takes second bounces out of the distances, after that; None: nothing.
     """
 
     recordings: tuple[Recording, ...]
     exclude: Callable[[FrameBatch], Chosen] | None = None
     stray: StrayLight | None = None
+    direct: DirectDistance | None = None
 
     def __post_init__(self) -> None:
         """Refuse recordings that are not of one camera in one setting."""
@@ -113,6 +117,11 @@ class Dataset:
             return self
         self.require("amplitude", "taking stray light back")
         return replace(self, stray=StrayLight(self.first.camera, state))
+
+    def without_second_bounces(self, state: CalibrationState) -> "Dataset":
+        """Return the data set without the second bounces that a calibration removes, if it does."""
+        removes = state.scene.second_bounces is not None
+        return replace(self, direct=DirectDistance(state)) if removes else self
 
     def require(self, name: str, needed_by: str) -> None:
         """Refuse a recording without an array, a column or a header entry, naming it.
@@ -199,6 +208,8 @@ class Dataset:
                     stray = self.stray.to(batch.radial_distance)
                     distance, light = stray(batch.radial_distance, batch.amplitude)
                     numbered = replace(numbered, radial_distance=distance, amplitude=light)
+                if self.direct is not None:
+                    numbered = replace(numbered, radial_distance=self.direct(numbered))
                 if self.exclude is not None:
                     numbered = replace(numbered, valid=batch.valid & ~self.exclude(numbered))
                 yield numbered

@@ -468,15 +468,8 @@ class SecondBounces(nn.Module):
         sends = seen & fits
         known = torch.where(sends, amplitude * area, 0.0)
         light = turned(turn.nan_to_num() * known.nan_to_num(), self.wave_numbers, away.nan_to_num())
-        images = [place * area, normal * area, area[None], light.reshape(-1, place.shape[1])]
-        image = torch.where(sends, torch.cat(images), 0.0)
-        sums = 4.0 * nn.functional.avg_pool2d(
-            image.reshape(1, -1, self.rows, self.columns), 2
-        ).reshape(image.shape[0], -1)
-        whole = sums[6].clamp(min=1e-12)
-        facing = sums[3:6] / sums[3:6].square().sum(0).sqrt().clamp(min=1e-12)
-        middle, light = sums[:3] / whole, sums[7:].reshape(2, len(self.wave_numbers), -1)
-        free = self.unhidden(middle, facing, sums[6])
+        middle, facing, whole, light = self.patches(place, normal, area, light, sends)
+        free = self.unhidden(middle, facing, whole)
         start = self.out_from
         beyond_rays, bright = self.out_rays.double(), amplitude * away.square() / cosine
         far_planes, reflectivity = self.room.met(beyond_rays)
@@ -505,12 +498,33 @@ class SecondBounces(nn.Module):
             torch.cat([place, normal]).nan_to_num().to(dtype),
             torch.cat([middle, table[:3]], dim=1).to(dtype),
             torch.cat([facing, table[3:6]], dim=1).to(dtype),
-            torch.cat([sums[6], table[6]]).to(dtype),
+            torch.cat([whole, table[6]]).to(dtype),
             torch.cat([light, table[7:].reshape(2, len(self.wave_numbers), -1)], dim=2).to(dtype),
             free.to(dtype),
         ).to(place.dtype)
         q = turned(q, [-k for k in self.wave_numbers], away) * (self.gain * away.square() / cosine)
         return torch.where(seen, q, 0.0)
+
+    def patches(
+        self, place: Tensor, normal: Tensor, area: Tensor, light: Tensor, sends: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return place (3, P), normal (3, P), area (P,) and light (2, F, P) of 2 x 2 cells.
+
+        Args:
+            place: Of the cells (3, N).
+            normal: Of the cells (3, N).
+            area: Of the cells (N,).
+            light: That they send, times their area, (2, F, N).
+            sends: Which of them count (N,).
+        """
+        images = [place * area, normal * area, area[None], light.reshape(-1, place.shape[1])]
+        image = torch.where(sends, torch.cat(images), 0.0)
+        sums = 4.0 * nn.functional.avg_pool2d(
+            image.reshape(1, -1, self.rows, self.columns), 2
+        ).reshape(image.shape[0], -1)
+        facing = sums[3:6] / sums[3:6].square().sum(0).sqrt().clamp(min=1e-12)
+        middle = sums[:3] / sums[6].clamp(min=1e-12)
+        return middle, facing, sums[6], sums[7:].reshape(2, len(self.wave_numbers), -1)
 
     def unhidden(self, place: Tensor, normal: Tensor, area: Tensor) -> Tensor:
         """Return which patches (P, P) nothing stands between, as far as the camera sees."""

@@ -3,7 +3,7 @@
 import logging
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -23,7 +23,7 @@ from tofcorr.correction.state import (
 )
 from tofcorr.errors import ConfigError, ExportError
 from tofcorr.estimation.moments import Parameters
-from tofcorr.estimation.solvers import Solution
+from tofcorr.estimation.solvers import Solution, Watcher
 from tofcorr.files import refuse_existing, staged_folder, write_json, write_text
 from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.problem import Fit
@@ -83,6 +83,26 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
         residual_variance=fit.residual_variance,
     )
     return state.model_copy(update={"scene": scene_light(data, options.runtime, state)})
+
+
+def calibrated(
+    data: Dataset,
+    options: TrainingOptions,
+    watcher: Watcher | None = None,
+    resumed: Parameters | None = None,
+    left_out: Collection[int] = (),
+    known: PriorKnowledge | None = None,
+) -> Calibration:
+    """Fit as `Calibration` does, and once more without second bounces if they are to be removed.
+
+    Their gain is found beside the first fit, and again, of the frames as recorded, beside the last.
+    """
+    found = Calibration(data, options, watcher, resumed, left_out, known)
+    if options.runtime.second_bounces is None:
+        return found
+    state = calibration_state(found.data, options, found.fit)
+    start, direct = found.fit.solution.parameters, data.without_second_bounces(state)
+    return Calibration(direct, options, watcher, start, left_out, known)
 
 
 def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
@@ -403,7 +423,7 @@ def carried_training(
                 with stage("fit"):
                     before = carry and carry(data, local, halves(data, local, left_out)[0])
                     data, known = (data, None) if before is None else before[:2]
-                    calibration = Calibration(data, local, watch, start, left_out, known)
+                    calibration = calibrated(data, local, watch, start, left_out, known)
                 with stage("report"):
                     report = training_report(calibration, options, inspection)
                     report |= {} if before is None else before.said(calibration.fit)

@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,7 @@ def scene_light(data: Dataset, options: RuntimeOptions, state: CalibrationState)
     Raises:
         CalibrationDataError: Flying pixels are to be found, and there are no amplitudes.
     """
-    wanted = options.flying_pixels
+    data, wanted = replace(data, direct=None), options.flying_pixels
     flying = wanted and _flying_pixels(data, wanted, state)
     bounces = options.second_bounces and _second_bounces(data, options.second_bounces, state)
     return SceneLight(stray_light=options.stray_light, flying_pixels=flying, second_bounces=bounces)
