@@ -28,7 +28,9 @@ from benchmarks.scene_light.rooms import (
 )
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.scene_light.bounces import SecondBounces, SecondBouncesState
+from tofcorr.scene_light.drawn import fit_remainder
 from tofcorr.scene_light.gain import fit_gain
+from tofcorr.scene_light.remainder import RemainderOptions
 
 NOISE = 3.5e-3  # metres, at the median amplitude of a frame
 WALLS = ("wall_and_floor", "wall_and_side")  # the other walls are mostly outside
@@ -75,13 +77,17 @@ class Calibration(NamedTuple):
         return distance - (self.coefficients @ of).reshape(distance.shape)
 
 
+def state(gain: float, light: tuple[float, float, float]) -> SecondBouncesState:
+    """What the camera knows of its light."""
+    return SecondBouncesState(
+        frequencies_hz=(FREQUENCY,), gain=gain, light_half_angle_deg=CONE, light_m=light
+    )
+
+
 def calibrate(seed: int, views: int, light: tuple[float, float, float]) -> Calibration:
     """Fit gain and base error to walls."""
     draw = np.random.default_rng(seed)
-    state = SecondBouncesState(
-        frequencies_hz=(FREQUENCY,), gain=0.5 / GAIN, light_half_angle_deg=CONE, light_m=light
-    )
-    bounces = SecondBounces(camera(), state)
+    bounces = SecondBounces(camera(), state(0.5 / GAIN, light))
     walls = [frame for name in WALLS for frame in rendered(name, seed, views, light[0])]
     lone = rendered("lone_wall", seed, views, light[0])
     seen = [measured(frame, draw) for frame in walls + lone]
@@ -159,6 +165,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--baseline", type=float, default=0.0, help="of the light, metres")
+    parser.add_argument("--learned", type=int, help="drawn scenes to learn the remainder from")
     parser.add_argument("--figure", type=Path, help="draw a corner into this file instead")
     options = parser.parse_args()
     seed, views, baseline = options.seed, options.views, options.baseline
@@ -169,6 +176,17 @@ def main() -> None:
         return
     low, high = known.interval
     print(f"seed {seed}: gain over the true one {known.gain:.3f} ({low:.3f} to {high:.3f})")
+    if options.learned:
+        wanted = RemainderOptions(scenes=options.learned, seed=seed)
+        at = state(known.bounces.gain, (baseline, 0.0, 0.0))
+        network, left = fit_remainder(camera(), at, (NOISE**2, 0.0, 0.0), wanted)
+        print("drawn scenes held out, mm:", *(f"{each:.1f}" for each in left))
+        print(
+            f"{'without it':16}",
+            *(scored(n, seed, views, known, baseline) for n in SCENES),
+            sep="\n",
+        )
+        known.bounces.remainder = network.requires_grad_(False)
     titles = ("mm", "left mm", "removed %", "plane %", "scene %", "frame %")
     print(f"{'scene':16}" + "".join(f"{title:>10}" for title in titles), flush=True)
     for name in SCENES:

@@ -14,6 +14,8 @@ area under d is that of a disk, seen from above its middle: the sum stays finite
 reflectivity of i cancels. The gain s is a constant of the camera.
 """
 
+# Long: one class, told in order from a frame to the light of its surfaces.
+
 import math
 from typing import Annotated, Literal
 
@@ -24,6 +26,7 @@ from torch import Tensor, nn
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.options import FiniteNumber, NonNegativeNumber, Number, Options, PositiveNumber
+from tofcorr.scene_light.remainder import Remainder
 from tofcorr.scene_light.room import Face, Room
 
 _PATCHES = (32, 24)
@@ -77,6 +80,10 @@ class SecondBouncesOptions(Options):
 Frequencies = Annotated[tuple[PositiveNumber, ...], Field(min_length=1, max_length=8)]
 
 
+Planes = tuple[Tensor, Tensor, Tensor]
+"""What `SecondBounces.planes` returns."""
+
+
 class SecondBouncesState(SecondBouncesOptions):
     """What the removal of second bounces takes.
 
@@ -101,6 +108,9 @@ class SecondBounces(nn.Module):
         camera: The intrinsics.
         state: Frequencies, gain, patches and light.
 
+    Attributes:
+        remainder: Says what the removal leaves; None: that stays.
+
     Shape:
         - Frames: `(H, W)`, distances along the ray in metres, NaN without a return. A batch
           `(B, H, W)` in `forward`.
@@ -124,6 +134,7 @@ class SecondBounces(nn.Module):
 
     def __init__(self, camera: CameraIntrinsics, state: SecondBouncesState) -> None:
         super().__init__()
+        self.remainder: Remainder | None = None
         size = camera.height, camera.width
         most = max(camera.width / _PATCHES[0], camera.height / _PATCHES[1])
         self.cell: int = (state.patch_px or 2 * math.ceil(most / 2)) // 2
@@ -245,8 +256,19 @@ class SecondBounces(nn.Module):
             rounds: How often the geometry is taken from the distances that were just found.
         """
         measured, strength = self.cells(radial, amplitude)
-        shift, planes, _ = self.found(measured, strength, rounds)
+        shift, planes, large = self.found(measured, strength, rounds)
+        if self.remainder is not None:
+            read = self.remainder.inputs(*self.read(measured, strength, shift, planes, large))
+            left = self.remainder(read[None])[0].reshape(-1)
+            shift = shift + left * (measured - shift)
         return radial - self.in_pixels(shift, radial, shift, planes)
+
+    def read(
+        self, measured: Tensor, strength: Tensor, shift: Tensor, planes: Tensor, large: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return what a network of the remainder reads, of what `cells` and `found` return."""
+        here = torch.stack([measured, shift])
+        return here, self.gain * strength, torch.stack([planes, self.cell_rays.to(planes)]), large
 
     def found(
         self, measured: Tensor, strength: Tensor, rounds: int = 2
@@ -274,16 +296,19 @@ class SecondBounces(nn.Module):
             turn = turn / turn.square().sum(0).sqrt()
         return shift, planes, large
 
-    def added(self, radial: Tensor, amplitude: Tensor, rounds: int = 4) -> tuple[Tensor, Tensor]:
+    def added(
+        self, radial: Tensor, amplitude: Tensor, rounds: int = 4, known: Planes | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return distances and amplitudes with second bounces, (H, W) each.
 
         Args:
             radial: True distances, metres (H, W).
             amplitude: Of the direct light, the camera's units (H, W).
             rounds: Bounces that are followed, after the direct light.
+            known: What `planes` would find; None: it does.
         """
         true, strength = self.cells(radial, amplitude)
-        planes, fits, large = self.planes(true)
+        planes, fits, large = self.planes(true) if known is None else known
         turn = torch.zeros(2, len(self.wave_numbers), true.shape[0]).to(true)
         turn[0] += 1.0
         ratio = torch.zeros_like(turn)

@@ -54,7 +54,7 @@ from tofcorr.training.judgement import (
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.pool import CameraType, load_type
 from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report
-from tofcorr.training.scene import scene_light
+from tofcorr.training.scene import learned_remainder, scene_light
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,7 +82,8 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
         joint_covariance=fit.joint_covariance,
         residual_variance=fit.residual_variance,
     )
-    return state.model_copy(update={"scene": scene_light(data, options.runtime, state)})
+    state = state.model_copy(update={"scene": scene_light(data, options.runtime, state)})
+    return state.model_copy(update={"remainder": learned_remainder(options.runtime, state)})
 
 
 def calibrated(
@@ -98,9 +99,13 @@ def calibrated(
     Their gain is found beside the first fit, and again, of the frames as recorded, beside the last.
     """
     found = Calibration(data, options, watcher, resumed, left_out, known)
-    if options.runtime.second_bounces is None:
+    wanted = options.runtime.second_bounces
+    if wanted is None:
         return found
-    state = calibration_state(found.data, options, found.fit)
+    # A network of what their removal leaves is trained once, with the last fit.
+    plain = {"second_bounces": wanted.model_copy(update={"learned": None})}
+    plain = {"runtime": options.runtime.model_copy(update=plain)}
+    state = calibration_state(found.data, options.model_copy(update=plain), found.fit)
     start, direct = found.fit.solution.parameters, data.without_second_bounces(state)
     return Calibration(direct, options, watcher, start, left_out, known)
 
@@ -235,7 +240,7 @@ class TrainingResult:
     def _found(self) -> dict[str, Any]:
         """The content of calibration.yaml."""
         found = calibration_mapping(self.data, self.options, self.fit, self.report)
-        return found | {"scene": self._state.scene.to_mapping()}
+        return found | {"scene": self._state.scene_mapping()}
 
     @cached_property
     def _sample(self) -> PixelSample:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.state import CalibrationState, SceneLight
+from tofcorr.correction.state import CalibrationState, RemainderState, SceneLight
 from tofcorr.data.recording import valid_pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import fit_noise
@@ -26,6 +26,7 @@ from tofcorr.scene_light.bounces import (
     SecondBouncesOptions,
     SecondBouncesState,
 )
+from tofcorr.scene_light.drawn import fit_remainder
 from tofcorr.scene_light.flying import (
     FlyingPixels,
     FlyingPixelsOptions,
@@ -33,6 +34,7 @@ from tofcorr.scene_light.flying import (
     squared_spreads,
 )
 from tofcorr.scene_light.gain import fit_gain
+from tofcorr.scene_light.remainder import RemainderOptions
 from tofcorr.scene_light.room import Face
 from tofcorr.scene_light.stray import StrayLightState
 
@@ -56,8 +58,11 @@ class SecondBouncesWanted(SecondBouncesOptions):
             frame keeps to it.
         recorded_room: The room is the large planes of the recordings, put together in the world by
             their poses. It is used beyond the image: they are as bent as those of any frame.
+        learned: Train a network on drawn scenes for what the removal leaves, and keep it if it
+            helps on others; null: none.
     """
 
+    learned: RemainderOptions | None = None
     frequencies_hz: Frequencies | None = None
     gain: PositiveNumber | None = None
     budget_ms: PositiveNumber | None = None
@@ -102,7 +107,8 @@ def _second_bounces(
     """Return what removing second bounces takes, with the gain found where none is given."""
     data.require("amplitude", "removing second bounces (runtime.second_bounces)")
     frequency, values = data.first.modulation_frequency, wanted.to_mapping()
-    del values["budget_ms"], values["recorded_room"]
+    for name in ("learned", "budget_ms", "recorded_room"):
+        del values[name]
     recorded = wanted.recorded_room
     if recorded:
         values |= {"room": (), "room_axes": "world", "room_in_image": False}
@@ -216,6 +222,29 @@ def _face(parts: list[tuple[Tensor, Tensor, Tensor]]) -> Face:
     hull = flat[:, ConvexHull(flat.T.numpy()).vertices.copy()]
     corners = (middle + axes @ hull).T.tolist()
     return Face.model_validate({"corners": corners, "reflectivity": min(float(white.median()), 1)})
+
+
+def learned_remainder(options: RuntimeOptions, state: CalibrationState) -> RemainderState | None:
+    """Train a network for what the removal of second bounces leaves.
+
+    Returns:
+        None: It was not asked for, or does not help on scenes held out.
+    """
+    wanted, bounces = options.second_bounces, state.scene.second_bounces
+    if wanted is None or wanted.learned is None or bounces is None:
+        return None
+    noise, learned = state.noise or (0.0, 0.0, 0.0), wanted.learned
+    _LOG.info("Drawing %d scenes to learn what second bounces leave.", learned.scenes)
+    network, found = fit_remainder(state.camera, bounces, noise, learned)
+    left = [round(each, 2) for each in found]
+    helps = left[1] < left[0] and left[3] < left[2]
+    _LOG.warning(  # Shown by the commands.
+        "Second bounces leave %g mm on scenes held out, with the network %g; "
+        "after a plane fit of each surface %g and %g. The network is %s.",
+        *(*left, "kept" if helps else "not kept"),
+    )
+    values = {"left_mm": left[:2], "flat_mm": left[2:], "numbers": network.numbers()}
+    return RemainderState.model_validate({"options": learned, **values}) if helps else None
 
 
 def _flying_pixels(
