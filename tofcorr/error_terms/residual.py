@@ -11,7 +11,7 @@ from tofcorr.error_terms.base import DescribedModule, DescribedOptions, Domain, 
 
 # Beyond the calibrated range the network fades to zero within this share of its half-width (no
 # unit). Set by hand: short against the range, and long enough for a smooth step.
-FADE = 0.1
+_FADE = 0.1
 
 
 class ResidualNetworkOptions(DescribedOptions):
@@ -81,7 +81,7 @@ class ResidualNetwork(DescribedModule):
         for name in ("centre", "half_width"):
             numbers = [getattr(interval, name) for interval in intervals]
             self.register_buffer(name, torch.tensor(numbers, dtype=torch.float64))
-        self.margin: float = FADE
+        self.margin: float = _FADE
         self.bound: float = (options.bound_mm or torch.inf) / 1000
         self.width: int = options.width
         generator = torch.Generator().manual_seed(options.seed)
