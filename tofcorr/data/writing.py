@@ -349,8 +349,8 @@ def _frames(
             amplitude, mask = (recording.read(name, chunk) for name in ("amplitude", "mask"))
             on_target = np.ones(depth.shape, dtype=bool) if mask is None else mask == 1
             given = np.full_like(depth, np.nan) if amplitude is None else amplitude
-            if hasattr(corrector, "set_pose"):
-                corrector.set_pose(recording.frames.world_from_tool[chunk])
+            if (set_pose := getattr(corrector, "set_pose", None)) is not None:
+                set_pose(recording.frames.world_from_tool[chunk])
             corrected, valid = corrector(torch.from_numpy(depth), torch.from_numpy(given))
             yield depth, amplitude, on_target, corrected.numpy(), on_target & valid.numpy()
             advance(len(chunk))
