@@ -46,7 +46,7 @@ ORDER = {
     "How to": "install command-line robot-and-wall two-cameras robot-errors record choose pytorch "
     "deploy check diagnose your-simulator sensor *",
     "Concepts": "conventions error-model estimation walls observability diagnosis *",
-    "Results": "/results models diagnosis gap drift walls robustness speed openings",
+    "Results": "/results models diagnosis gap drift walls scene-light robustness speed openings",
     "Reference": "/format /glossary /architecture /thresholds /changelog",
     "API": "index module sensor functions data *",
 }
