@@ -5,6 +5,7 @@ import shutil
 import site
 import sys
 import venv
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import settings
 from running import Program, Said, printed_alone
 
 from tofcorr.cli.main import main
+from tofcorr.progress import LOG
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKED = ("tofcorr", "configs", "pyproject.toml", "setup.py", "MANIFEST.in", "README.md")
@@ -29,7 +31,18 @@ settings.load_profile("tofcorr")
 
 
 @pytest.fixture
-def program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Program:
+def log_lines() -> Iterator[None]:
+    """What `--verbose` sets is gone after a test."""
+    level, handlers = LOG.level, list(LOG.handlers)
+    yield
+    LOG.setLevel(level)
+    LOG.handlers[:] = handlers
+
+
+@pytest.fixture
+def program(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], log_lines: None
+) -> Program:
     """The command line as a user has it: arguments in, exit code and what is printed out."""
 
     def run(*arguments: object) -> Said:

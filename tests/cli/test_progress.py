@@ -7,7 +7,6 @@ import select
 import subprocess
 import sys
 import termios
-from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -15,7 +14,7 @@ import pytest
 
 import tofcorr
 from tofcorr.cli.main import COMMANDS, group
-from tofcorr.progress import LOG, log_to_stderr, stages, through
+from tofcorr.progress import log_to_stderr, stages, through
 
 
 class Terminal(io.StringIO):
@@ -23,14 +22,6 @@ class Terminal(io.StringIO):
 
     def isatty(self) -> bool:
         return True
-
-
-@pytest.fixture
-def log_lines() -> Iterator[None]:
-    level, handlers = LOG.level, list(LOG.handlers)
-    yield
-    LOG.setLevel(level)
-    LOG.handlers[:] = handlers
 
 
 def test_at_a_terminal_a_bar_counts_and_the_stage_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

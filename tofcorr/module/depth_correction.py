@@ -6,6 +6,7 @@ import math
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, Self
 
@@ -43,10 +44,10 @@ from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.options import one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Frames, Recordings, opened
 from tofcorr.pixels.lattice import covered_domain
-from tofcorr.training.calibration import TrainingOptions
+from tofcorr.training.calibration import Calibration, TrainingOptions
 from tofcorr.training.judgement import report_text
 from tofcorr.training.report import training_report
-from tofcorr.training.run import Config, calibrated, calibration_state, inspected
+from tofcorr.training.run import Config, calibration_of, calibration_state, inspected
 
 FORMAT = "tofcorr-module"
 
@@ -343,7 +344,8 @@ class DepthCorrection(FrameCorrection):
         dataset = open_dataset(recordings, self.camera)
         options = resolve_options(TrainingOptions, self.options, changes)
         data, options, inspection, left_out = inspected(dataset, options, force=force)
-        found = calibrated(data, options, watcher, left_out=left_out)
+        fitted = partial(Calibration, watcher=watcher, left_out=left_out)
+        found = calibration_of(data, options, fitted)
         told = training_report(found, options.model_copy(update={"advice": 0}), inspection)
         self._take_over(calibration_state(found.data, options, found.fit))
         return FitReport.of(told)

@@ -501,14 +501,15 @@ class SecondBounces(nn.Module):
         known = reflectivity.isfinite()
         far_planes = torch.where(known, far_planes, planes[:, start])
         far = self.surfaces(far_planes, beyond_rays, self.out_solid.double())
-        # As bright as the cell beside it, or as the cells of its face; if none is seen, as known.
-        on = ((far_planes.T @ place - 1.0).abs() < self.constants[2]) & sends
-        beside, on = on.gather(1, start[:, None])[:, 0], on.to(bright.dtype)
-        shown = on @ torch.where(sends, bright, 0.0) / on.sum(1)
-        given = (reflectivity / (math.pi * self.gain)).nan_to_num(0.0, 0.0)
-        shown = torch.where(
-            beside | ~known, bright[start], torch.where(shown.isnan(), given, shown)
-        )
+        shown = bright[start]
+        if self.room.corners.shape[0] > 0:
+            # As bright as the cell beside it, or as the cells of its face; if none is, as known.
+            on = ((far_planes.T @ place - 1.0).abs() < self.constants[2]) & sends
+            beside, on = on.gather(1, start[:, None])[:, 0], on.to(bright.dtype)
+            of_face = on @ torch.where(sends, bright, 0.0) / on.sum(1)
+            given = (reflectivity / (math.pi * self.gain)).nan_to_num(0.0, 0.0)
+            of_face = torch.where(of_face.isnan(), given, of_face)
+            shown = torch.where(beside | ~known, shown, of_face)
         if self.continued:
             known = known | (sends & large)[start]
         ahead = ((far_planes * beyond_rays).sum(0) > 0) & known

@@ -153,13 +153,14 @@ class Drawing:
     def frame(self, draw: Draw) -> Drawn:
         """Draw a scene, and return its frame."""
         shape, rays = self.wide.rays.shape[1:], self.wide.rays.reshape(3, -1)
-        scene = drawn(draw)
-        planes, face, grey = scene.met(rays)
-        true = 1 / (planes * rays).sum(0)
-        near = self.cut(true)
-        filled = float(near.isfinite().double().mean()) > _SCENES["filled"]
-        if not filled or bool((near < _SCENES["nearest"]).any()):
-            return self.frame(draw)
+        while True:
+            scene = drawn(draw)
+            planes, face, grey = scene.met(rays)
+            true = 1 / (planes * rays).sum(0)
+            near = self.cut(true)
+            filled = float(near.isfinite().double().mean()) > _SCENES["filled"]
+            if filled and not bool((near < _SCENES["nearest"]).any()):
+                break
         _, _, away, cosine, _ = self.wide.surfaces(planes, rays, rays[0])
         # A face looks the same from behind.
         light = grey * cosine.abs() / (math.pi * self.own.gain * away.square())

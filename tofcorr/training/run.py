@@ -3,7 +3,7 @@
 import logging
 import signal
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -23,7 +23,7 @@ from tofcorr.correction.state import (
 )
 from tofcorr.errors import ConfigError, ExportError
 from tofcorr.estimation.moments import Parameters
-from tofcorr.estimation.solvers import Solution, Watcher
+from tofcorr.estimation.solvers import Solution
 from tofcorr.files import refuse_existing, staged_folder, write_json, write_text
 from tofcorr.fit.known import PriorKnowledge
 from tofcorr.fit.problem import Fit
@@ -86,19 +86,23 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
     return state.model_copy(update={"remainder": learned_remainder(options.runtime, state)})
 
 
-def calibrated(
+def calibration_of(
     data: Dataset,
     options: TrainingOptions,
-    watcher: Watcher | None = None,
-    resumed: Parameters | None = None,
-    left_out: Collection[int] = (),
-    known: PriorKnowledge | None = None,
+    fitted: Callable[..., Calibration],
+    start: Parameters | None = None,
 ) -> Calibration:
-    """Fit as `Calibration` does, and once more without second bounces if they are to be removed.
+    """Fit, and once more without second bounces if they are to be removed.
 
     Their gain is found beside the first fit, and again, of the frames as recorded, beside the last.
+
+    Args:
+        data: The recordings.
+        options: Model and training.
+        fitted: `Calibration`, with all else that it takes.
+        start: Where the first fit starts; None: anew.
     """
-    found = Calibration(data, options, watcher, resumed, left_out, known)
+    found = fitted(data, options, resumed=start)
     wanted = options.runtime.second_bounces
     if wanted is None:
         return found
@@ -106,8 +110,8 @@ def calibrated(
     plain = {"second_bounces": wanted.model_copy(update={"learned": None})}
     plain = {"runtime": options.runtime.model_copy(update=plain)}
     state = calibration_state(found.data, options.model_copy(update=plain), found.fit)
-    start, direct = found.fit.solution.parameters, data.without_second_bounces(state)
-    return Calibration(direct, options, watcher, start, left_out, known)
+    direct = data.without_second_bounces(state)
+    return fitted(direct, options, resumed=found.fit.solution.parameters)
 
 
 def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
@@ -428,7 +432,8 @@ def carried_training(
                 with stage("fit"):
                     before = carry and carry(data, local, halves(data, local, left_out)[0])
                     data, known = (data, None) if before is None else before[:2]
-                    calibration = calibrated(data, local, watch, start, left_out, known)
+                    own = partial(Calibration, watcher=watch, left_out=left_out, known=known)
+                    calibration = calibration_of(data, local, own, start)
                 with stage("report"):
                     report = training_report(calibration, options, inspection)
                     report |= {} if before is None else before.said(calibration.fit)
