@@ -37,6 +37,9 @@ noise, and a degree of a million fills the memory."""
 STRAY = 0.001
 """Share of values that may lie beyond either end of their range (no unit). Chosen: gross errors are
 rarer, and a few pixels must not widen the range in which a correction is valid."""
+FADE = 0.1
+"""Share of the half width of a range within which what was learned fades to zero beyond it. Set by
+hand: short against the range, and long enough for a smooth step."""
 LARGEST_SIDE = 1_000_000
 """Largest width or height of an image, pixels. Set by hand: more than any image sensor has."""
 

@@ -86,7 +86,7 @@ def test_one_bounce_in_a_corner_is_the_integral_over_its_sides(pixel: tuple[int,
     planes, fits, large = found.planes(distance)
     direct = torch.zeros(2, 1, len(distance)).double()
     direct[0] = 1.0
-    ratio = found.indirect(planes, fits, large, light, direct).reshape(2, 24, 32)
+    ratio = found.indirect(planes, fits, large, light, direct, 1).reshape(2, 24, 32)
     # Patches of two pixels leave 3 % where the corner is some patches away.
     assert complex(*ratio[:, pixel[0], pixel[1]].tolist()) == pytest.approx(
         integral(pixel), rel=0.03

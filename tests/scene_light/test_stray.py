@@ -70,6 +70,11 @@ def test_a_script_does_the_same_and_pixels_without_a_return_stay_and_send_no_lig
     torch.testing.assert_close(stray(measured.nan_to_num(1.0), dark)[0][0, 40:], found[0][0, 40:])
 
 
+def test_more_stray_light_than_light_is_refused() -> None:
+    with pytest.raises(ValueError, match="below 1"):
+        StrayLightState(modulation_frequency=F, shares=(0.7,), sigma_of_width=(0.1,), veil=0.4)
+
+
 def test_a_camera_without_stray_light_measures_what_it_did() -> None:
     radial, amplitude = scene()
     none = StrayLight(CAMERA, StrayLightState(modulation_frequency=F)).double()

@@ -8,10 +8,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from tofcorr.error_terms.base import DescribedModule, DescribedOptions, Domain, Interval
-
-# Beyond the calibrated range the network fades to zero within this share of its half-width (no
-# unit). Set by hand: short against the range, and long enough for a smooth step.
-_FADE = 0.1
+from tofcorr.options import FADE
 
 
 class ResidualNetworkOptions(DescribedOptions):
@@ -81,7 +78,7 @@ class ResidualNetwork(DescribedModule):
         for name in ("centre", "half_width"):
             numbers = [getattr(interval, name) for interval in intervals]
             self.register_buffer(name, torch.tensor(numbers, dtype=torch.float64))
-        self.margin: float = _FADE
+        self.margin: float = FADE
         self.bound: float = (options.bound_mm or torch.inf) / 1000
         self.width: int = options.width
         generator = torch.Generator().manual_seed(options.seed)

@@ -14,8 +14,6 @@ area under d is that of a disk, seen from above its middle: the sum stays finite
 reflectivity of i cancels. The gain s is a constant of the camera.
 """
 
-# Long: one class, told in order from a frame to the light of its surfaces.
-
 import math
 from typing import Annotated, Literal
 
@@ -26,29 +24,14 @@ from torch import Tensor, nn
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.options import FiniteNumber, NonNegativeNumber, Number, Options, PositiveNumber
+from tofcorr.scene_light.planes import OFF_PLANE, STEEPEST, WIDE_PLANE, CellPlanes
 from tofcorr.scene_light.remainder import Remainder
 from tofcorr.scene_light.room import Face, Room
 
 _PATCHES = (32, 24)
 """Columns and rows of patches at most, if no size is given. Asked for: 768 of a frame of 4:3."""
-_ODD = 9.0
-"""Variance above which a window is no plane, in those of the noise: three deviations. Chosen."""
-_WIDE_PLANE = 0.03
-"""Share of the distance by which cells of one large plane may miss it: second bounces bend a wall
-by that much before they are removed. Set on `benchmarks/scene_light/bounces.py`, building seed."""
-_ALIKE = 0.8
-"""Least cosine between the normals of cells of one large plane. Set there."""
-_LEAST_FACE = 0.005
-"""Share of all cells that makes a large plane. Chosen: 15 of 64 x 48."""
-_FACES = 12
-"""Large planes that are looked for. Chosen."""
-_STEEPEST = 0.05
-"""Least cosine of incidence with which a patch takes or sends light: 87 degrees. Chosen."""
 _SAMPLES = 4
 """Places on half the way between two patches at which something may stand in between. Chosen."""
-_OFF_PLANE = 0.01
-"""Share of its distance by which a pixel may miss the plane of a cell whose light it gets. Chosen:
-three deviations of the noise of cameras."""
 
 
 class SecondBouncesOptions(Options):
@@ -123,7 +106,6 @@ class SecondBounces(nn.Module):
     out_rays: Tensor
     out_solid: Tensor
     out_from: Tensor
-    candidates: Tensor
     table: Tensor
     corners: Tensor
     shares: Tensor
@@ -145,9 +127,7 @@ class SecondBounces(nn.Module):
         self.wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in state.frequencies_hz]
         total = sum(f * f for f in state.frequencies_hz)
         self.weights = [f * f / total for f in state.frequencies_hz]
-        self.constants = [_OFF_PLANE / 3, _ODD, _WIDE_PLANE, _ALIKE]
-        self.constants += [_LEAST_FACE, _STEEPEST, _OFF_PLANE]
-        self.faces_sought: int = _FACES
+        self.constants = [0.0, 0.0, WIDE_PLANE, 0.0, 0.0, STEEPEST, OFF_PLANE]
         self.samples: int = _SAMPLES
         rays = ray_directions(camera)
         slopes = rays[..., :2] / rays[..., 2:]
@@ -162,9 +142,7 @@ class SecondBounces(nn.Module):
         self.register_buffer("cell_rays", cell_rays)
         self.register_buffer("solid", solid)
         self.register_buffer("light", torch.tensor(state.light_m, dtype=torch.float64))
-        # As many cells are tried as the smallest of large planes would go into the image.
-        spaced = torch.linspace(0, len(solid) - 1, min(round(1 / _LEAST_FACE), len(solid)))
-        self.register_buffer("candidates", spaced.long())
+        self.cell_planes = CellPlanes(cell_rays, self.rows)
         self.room = Room(state.room, in_world=state.room_axes == "world")
         self.continued: bool = state.continued
         self.in_image: bool = state.room_in_image
@@ -289,7 +267,7 @@ class SecondBounces(nn.Module):
         planes, large = self.cell_rays, measured > 0
         for _ in range(rounds):
             planes, fits, large = self.planes(here)
-            ratio = self.indirect(planes, fits, large, strength, turn)
+            ratio = self.indirect(planes, fits, large, strength, turn, 1)
             shift = self.shift(ratio)
             here = measured - shift
             turn = self.direct_and(ratio)
@@ -311,10 +289,8 @@ class SecondBounces(nn.Module):
         planes, fits, large = self.planes(true) if known is None else known
         turn = torch.zeros(2, len(self.wave_numbers), true.shape[0]).to(true)
         turn[0] += 1.0
-        ratio = torch.zeros_like(turn)
-        for _ in range(rounds):
-            ratio = self.indirect(planes, fits, large, strength, turn)
-            turn = self.direct_and(ratio)
+        ratio = self.indirect(planes, fits, large, strength, turn, rounds)
+        turn = self.direct_and(ratio)
         none = torch.zeros_like(true)
         shift = self.in_pixels(self.shift(ratio), radial, none, planes)
         factor = self.in_pixels(turn.square().sum(0).sqrt().mean(0), radial, none, planes)
@@ -366,99 +342,15 @@ class SecondBounces(nn.Module):
             total, weight = total + share * value, weight + share
         return total / weight.clamp(min=1e-12)
 
-    def planes(self, radial: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return g of 1 / r = g . ray of every cell (3, N), which fit a plane, and a large one.
-
-        A cell takes the best window that contains it: of 5 x 5 cells, or of 3 x 3 if those fit no
-        plane. If neither does, it takes the normal of a neighbour. Cells on one large plane take
-        that plane.
-        """
-        near = 1.0 / radial
-        wide, wide_misfit = self.windows(near, 2)
-        small, small_misfit = self.windows(near, 1)
-        scale = radial.square().square()
-        some = torch.where(small_misfit.isfinite(), small_misfit * scale, math.nan)
-        level = self.constants[1] * some.nanmedian() + (self.constants[0] * radial).square()
-        flat = wide_misfit * scale < level
-        fits = flat | (small_misfit * scale < level)
-        planes = torch.where(fits, torch.where(flat, wide, small), math.nan)
-        image = nn.functional.pad(
-            planes.reshape(3, self.rows, self.columns), [2] * 4, value=math.nan
-        )
-        around = image.unfold(1, self.rows, 1).unfold(2, self.columns, 1).reshape(3, 25, -1)
-        met = (around * self.cell_rays[:, None]).sum(0)
-        off = (near / met - 1.0).abs().nan_to_num(math.inf, math.inf)
-        nearest = off.argmin(0)[None, None].expand(3, 1, -1)
-        beside = around.gather(1, nearest)[:, 0]
-        beside = beside * (near / (beside * self.cell_rays).sum(0))
-        planes, fits, large = self.large_planes(near, torch.where(fits, planes, beside), fits)
+    def planes(self, radial: Tensor) -> Planes:
+        """Return g of 1 / r = g . ray of every cell (3, N), which fit a plane, and a large one."""
+        planes, fits, large = self.cell_planes(radial)
         if not self.in_image:
             return planes, fits, large
         # A room hides what is behind it: what seems further away, second bounces have shifted.
         room, _ = self.room.met(self.cell_rays.double())
         met = radial * (room * self.cell_rays).sum(0) > 1.0 - self.constants[2]
         return torch.where(met, room, planes), fits | met, large | met
-
-    def windows(self, near: Tensor, half: int) -> tuple[Tensor, Tensor]:
-        """Return g of the best of nine windows that contain a cell, and its variance (of 1 / r)."""
-        seen = near.isfinite()
-        near, ray = torch.where(seen, near, 0.0), self.cell_rays.double()
-        outer = (ray[:, None] * ray).reshape(9, -1) * seen
-        terms = torch.cat([outer, ray * near, near.square()[None], seen.to(near.dtype)[None]])
-        size = 2 * half + 1
-        image = terms.reshape(1, 14, self.rows, self.columns)
-        means = nn.functional.avg_pool2d(image, size, 1, half)[0].reshape(14, -1)
-        plane = solved(means[:9].reshape(3, 3, -1), means[9:12])
-        count = means[13] * size**2
-        misfit = (means[12] - (plane * means[9:12]).sum(0)).clamp(min=0) * size**2 / (count - 3.0)
-        misfit = torch.where(count > 3.0 * half + 2.5, misfit, math.inf)  # Twice its unknowns.
-        image = torch.cat([plane, misfit[None]]).reshape(4, self.rows, self.columns)
-        # Not around the border's cells: any two rows of cells across an edge are on one plane.
-        image = nn.functional.pad(image[:, 1:-1, 1:-1], [half + 1] * 4, value=math.inf)
-        best, least = torch.zeros_like(plane), torch.full_like(near, math.inf)
-        for down in range(0, size, half):
-            for right in range(0, size, half):
-                tried = image[:, down : down + self.rows, right : right + self.columns]
-                tried = tried.reshape(4, -1)
-                off = (near - (tried[:3] * ray).sum(0)).square() + tried[3]
-                better = off < least
-                best = torch.where(better, tried[:3], best)
-                least = torch.where(better, off, least)
-        return best, torch.where(seen, least, math.inf)
-
-    def large_planes(
-        self, near: Tensor, own: Tensor, fits: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Give cells that lie on one large plane that plane: the largest first."""
-        ray, size = self.cell_rays.double(), self.constants[4] * near.shape[0]
-        normal = own / own.square().sum(0).sqrt()
-        free, best = fits & own.isfinite().all(0), own
-        left = torch.full_like(near, math.inf)
-        seeds = own[:, self.candidates]
-        tried, toward = seeds.float(), normal[:, self.candidates].float()
-        alike = ((tried.T @ ray.float()) / near.float() - 1.0).abs() < self.constants[2]
-        alike = (alike & (toward.T @ normal.float() > self.constants[3])).float()
-        for _ in range(self.faces_sought):
-            most = (alike @ free.to(alike.dtype)).argmax()
-            member, plane, off = (alike[most] > 0) & free, seeds[:, most], left
-            for _again in range(2):
-                weight = torch.where(member, near.square().reciprocal(), 0.0)
-                rows = ray * weight
-                right = rows @ torch.where(member, near * weight, 0.0)
-                plane = solved((rows @ rows.T)[:, :, None], right[:, None])[:, 0]
-                facing = plane / plane.square().sum().sqrt()
-                off = ((plane @ ray) / near - 1.0).abs()
-                member = free & (off < self.constants[2]) & (facing @ normal > self.constants[3])
-            member = member & (member.sum() > size)
-            spread = nn.functional.max_pool2d(
-                member.to(near.dtype).reshape(1, self.rows, self.columns), 5, 1, 2
-            )
-            beside = (spread.reshape(-1) > 0) & (off < self.constants[2]) & (off < left)
-            chosen = member | (beside & ~fits)
-            best = torch.where(chosen, plane[:, None], best)
-            left = torch.where(chosen, off, left)
-            free = free & ~member
-        return best, fits | left.isfinite(), left.isfinite()
 
     def surfaces(
         self, planes: Tensor, rays: Tensor, solid: Tensor
@@ -474,7 +366,13 @@ class SecondBounces(nn.Module):
         return place, normal, away, cosine, solid * radial.square() / steep
 
     def indirect(
-        self, planes: Tensor, fits: Tensor, large: Tensor, amplitude: Tensor, turn: Tensor
+        self,
+        planes: Tensor,
+        fits: Tensor,
+        large: Tensor,
+        amplitude: Tensor,
+        turn: Tensor,
+        rounds: int,
     ) -> Tensor:
         """Return the ratios q of the cells, real and imaginary part (2, F, N).
 
@@ -485,15 +383,15 @@ class SecondBounces(nn.Module):
             amplitude: Of the cells (N,).
             turn: What turns the amplitude into the phasor that a cell sends, without the way from
                 the light: real and imaginary part (2, F, N).
+            rounds: How often the result is put in its place: one more order of bounces each.
         """
         place, normal, away, cosine, area = self.surfaces(
             planes, self.cell_rays.double(), self.solid.double()
         )
         seen = planes.isfinite().all(0) & amplitude.isfinite() & (cosine > self.constants[5])
         sends = seen & fits
-        known = torch.where(sends, amplitude * area, 0.0)
-        light = turned(turn.nan_to_num() * known.nan_to_num(), self.wave_numbers, away.nan_to_num())
-        middle, facing, whole, light = self.patches(place, normal, area, light, sends)
+        strength = torch.where(sends, amplitude * area, 0.0).nan_to_num()
+        middle, facing, whole, _ = self.patches(place, normal, area, turn, sends)
         free = self.unhidden(middle, facing, whole)
         start = self.out_from
         beyond_rays, bright = self.out_rays.double(), amplitude * away.square() / cosine
@@ -515,21 +413,23 @@ class SecondBounces(nn.Module):
         ahead = ((far_planes * beyond_rays).sum(0) > 0) & known
         ahead = ahead & (far[3] > self.constants[5])
         bright = shown * far[3] / far[2].square() * far[4]
-        bright = turn[:, :, start] * bright
-        beyond = turned(bright, self.wave_numbers, far[2]).flatten(0, 1)
-        table = torch.cat([far[0], far[1], far[4][None], beyond])
-        table = torch.where(ahead, table, 0.0)
         dtype = self.shares.dtype
-        q = self.gathered(
-            torch.cat([place, normal]).nan_to_num().to(dtype),
-            torch.cat([middle, table[:3]], dim=1).to(dtype),
-            torch.cat([facing, table[3:6]], dim=1).to(dtype),
-            torch.cat([whole, table[6]]).to(dtype),
-            torch.cat([light, table[7:].reshape(2, len(self.wave_numbers), -1)], dim=2).to(dtype),
-            free.to(dtype),
-        ).to(place.dtype)
-        q = turned(q, [-k for k in self.wave_numbers], away) * (self.gain * away.square() / cosine)
-        return torch.where(seen, q, 0.0)
+        table = torch.where(ahead, torch.cat([far[0], far[1], far[4][None]]), 0.0)
+        here = torch.cat([place, normal]).nan_to_num().to(dtype)
+        middle = torch.cat([middle, table[:3]], dim=1).to(dtype)
+        facing = torch.cat([facing, table[3:6]], dim=1).to(dtype)
+        whole, free = torch.cat([whole, table[6]]).to(dtype), free.to(dtype)
+        q = torch.zeros_like(turn)
+        for _order in range(rounds):
+            light = turned(turn.nan_to_num() * strength, self.wave_numbers, away.nan_to_num())
+            beyond = turned(turn[:, :, start] * bright, self.wave_numbers, far[2])
+            beyond = torch.where(ahead, beyond, 0.0)
+            light = torch.cat([self.summed(light), beyond], dim=2).to(dtype)
+            q = self.gathered(here, middle, facing, whole, light, free).to(place.dtype)
+            q = turned(q, [-k for k in self.wave_numbers], away)
+            q = torch.where(seen, q * (self.gain * away.square() / cosine), 0.0)
+            turn = self.direct_and(q)
+        return q
 
     def patches(
         self, place: Tensor, normal: Tensor, area: Tensor, light: Tensor, sends: Tensor
@@ -543,14 +443,16 @@ class SecondBounces(nn.Module):
             light: That they send, times their area, (2, F, N).
             sends: Which of them count (N,).
         """
-        images = [place * area, normal * area, area[None], light.reshape(-1, place.shape[1])]
-        image = torch.where(sends, torch.cat(images), 0.0)
-        sums = 4.0 * nn.functional.avg_pool2d(
-            image.reshape(1, -1, self.rows, self.columns), 2
-        ).reshape(image.shape[0], -1)
-        facing = sums[3:6] / sums[3:6].square().sum(0).sqrt().clamp(min=1e-12)
-        middle = sums[:3] / sums[6].clamp(min=1e-12)
-        return middle, facing, sums[6], sums[7:].reshape(2, len(self.wave_numbers), -1)
+        table = torch.where(sends, torch.cat([place * area, normal * area, area[None]]), 0.0)
+        table = self.summed(table)
+        facing = table[3:6] / table[3:6].square().sum(0).sqrt().clamp(min=1e-12)
+        middle = table[:3] / table[6].clamp(min=1e-12)
+        return middle, facing, table[6], self.summed(torch.where(sends, light, 0.0))
+
+    def summed(self, values: Tensor) -> Tensor:
+        """Return sums of values of cells (..., N) over patches, (..., P)."""
+        image = values.unflatten(-1, [self.rows, self.columns])
+        return 4.0 * nn.functional.avg_pool2d(image, 2).flatten(-2)
 
     def unhidden(self, place: Tensor, normal: Tensor, area: Tensor) -> Tensor:
         """Return which patches (P, P) nothing stands between, as far as the camera sees."""
@@ -624,12 +526,3 @@ def turned(phasors: Tensor, wave_numbers: list[float], ways: Tensor) -> Tensor:
         real, imaginary = phasors[0, f], phasors[1, f]
         found.append(torch.stack([c * real - s * imaginary, c * imaginary + s * real]))
     return torch.stack(found, dim=1)
-
-
-def solved(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve symmetric equations (3, 3, N) x = (3, N) by determinants; NaN if they are singular."""
-    a, b, c = matrix.unbind(0)
-    rows = [torch.linalg.cross(b, c, dim=0), torch.linalg.cross(c, a, dim=0)]
-    rows.append(torch.linalg.cross(a, b, dim=0))
-    determinant = (a * rows[0]).sum(0)
-    return torch.stack([(row * right).sum(0) for row in rows]) / determinant

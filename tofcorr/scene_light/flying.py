@@ -36,21 +36,11 @@ from torch import Tensor, nn
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import FiniteNumber, NonNegativeNumber, Number, Options
+from tofcorr.scene_light.planes import STEEPEST
 
-STEEPEST = math.tan(math.radians(80))
-"""Tangent of the angle of incidence above which neighbours are an edge. Chosen: a sixth of the
-light of a surface seen straight on comes back, and a wall beside the camera is less steep."""
-MAJORITY = 0.75
-"""Share of a pixel's area from which a surface counts as certain. Set on
-`benchmarks/scene_light/edges.py`: at 0.6 one replaced pixel in 150 gets the wrong surface, at 0.75
-one in 600."""
 _REACH = 5
 """Pixels on either side of an edge at which its brightness is read. Chosen: light of a camera in
 focus spreads over one."""
-_FLAT = 0.03
-"""Largest step of brightness beside an edge, as a share of the edge's. Chosen."""
-_CONTRAST = 0.4
-"""Least step of an edge over the mean brightness of its sides. Chosen."""
 
 
 class FlyingPixelsOptions(Options):
@@ -106,8 +96,9 @@ class FlyingPixels(nn.Module):
         # A plane leaves six of the nine numbers.
         self.most_misfit: float = float(chdtri(6, state.false_alarm))
         self.noise = list(state.noise)
-        self.steepest: float = STEEPEST
-        self.majority: float = MAJORITY
+        self.steepest: float = math.tan(math.acos(STEEPEST))
+        # A right-angled corner of the other surface that reaches the middle takes a quarter.
+        self.majority: float = 1 - 0.5**2
         beside = (-1, 0, 1)
         self.around = [(row, column) for row in beside for column in beside if row or column]
         # As far apart as light spreads, so that no plane fits a blurred edge.
@@ -305,7 +296,8 @@ def squared_spreads(amplitude: Tensor) -> Tensor:
         )
         slope = slope / (2 * contrast[..., 0])
         outer = (steps / contrast).abs()[..., [0, 1, -2, -1]].amax(-1)
-        sharp = contrast.abs() > _CONTRAST * lines[..., [0, -1]].mean(-1, keepdim=True)
-        chosen = sharp[..., 0] & (outer < _FLAT) & (middle[..., 0].abs() <= 0.5) & (slope.abs() < 1)
-        found.append((spread / (1 + slope.square()))[chosen])
+        # It doubles the brightness, and beside it is less of it than if all steps were alike.
+        sharp = contrast[..., 0].abs() > lines[..., [0, -1]].amin(-1)
+        inner = (middle[..., 0].abs() <= 0.5) & (slope.abs() < 1) & (outer < 1 / share.shape[-1])
+        found.append((spread / (1 + slope.square()))[sharp & inner])
     return torch.cat(found)

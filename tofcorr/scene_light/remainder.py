@@ -17,13 +17,11 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, relu
 
-from tofcorr.options import Options
+from tofcorr.options import FADE, Options
 
 _FROM = 0.005
 """Share of the distance that second bounces must add somewhere in a frame, and by which a cell is
 off its plane. Chosen: about the noise of cameras."""
-_FADE = 0.1
-"""Share of the half width of a range within which it fades beyond it, as `ResidualNetwork` does."""
 _READ = ("shift", "level", "distance", "off", "cosine", "grey", "x", "y", "z", "large", "known")
 """What the network reads of a cell; x, y and z of the normal."""
 
@@ -54,7 +52,7 @@ class Remainder(nn.Module):
 
     def __init__(self, rows: int, width: int) -> None:
         super().__init__()
-        self.rows, self.least, self.margin = rows, _FROM, _FADE
+        self.rows, self.least, self.margin = rows, _FROM, FADE
         wide = 2 * width
         self.first = nn.Conv2d(len(_READ), width, 3, padding=1)
         self.down = nn.ModuleList(

@@ -14,9 +14,10 @@ Source: Kavli et al. 2008; Mure-Dubois and Huegli 2007.
 """
 
 import math
+from typing import Self
 
 import torch
-from pydantic import PositiveFloat
+from pydantic import PositiveFloat, model_validator
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
@@ -24,11 +25,9 @@ from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Number, Options, PositiveNumber
 
-_LEFT = 1e-3
-"""Share of the stray light that may be left. Chosen: a thousandth of centimetres."""
-_CELLS_OF_SIGMA = 4
-"""Cells in the standard deviation of the narrowest Gaussian. Chosen: averages over cells widen it
-by 0.3 %."""
+_LEFT = 2.5e-3
+"""Share of the stray light that may be left, and by which averages over cells may widen its
+Gaussians. Chosen: of centimetres, hundredths of millimetres."""
 
 
 class StrayLightState(Options):
@@ -51,6 +50,14 @@ class StrayLightState(Options):
     ghost_sizes: tuple[PositiveFloat, ...] = ()
     ghost_shares: tuple[Number, ...] = ()
     ghost_sigma_of_width: PositiveFloat = 0.02
+
+    @model_validator(mode="after")
+    def _less_than_all(self) -> Self:
+        """Refuse more stray light than there is light: taking it back would not end."""
+        total = sum(map(abs, (*self.shares, *self.ghost_shares, self.veil)))
+        if total >= 1:
+            raise ValueError(f"expected 'shares', 'ghost_shares' and 'veil' below 1, got {total:g}")
+        return self
 
 
 class StrayLight(nn.Module):
@@ -76,7 +83,8 @@ class StrayLight(nn.Module):
         self.height, self.width, self.veil = height, width, float(state.veil)
         ghosts = [state.ghost_sigma_of_width] * len(state.ghost_sizes)
         sigmas = [width * share for share in (*state.sigma_of_width, *ghosts)]
-        self.cell: int = max(1, int(min(sigmas, default=width) / _CELLS_OF_SIGMA))
+        # The mean over a cell adds its square over 12 to a variance.
+        self.cell: int = max(1, int(min(sigmas, default=width) * (24 * _LEFT) ** 0.5))
         (_, _, x), (_, _, y), _ = camera.matrix
         sizes = [*(-1.0 for _ in state.sigma_of_width), *state.ghost_sizes]
         spreads = list(zip(sizes, sigmas, strict=True))
@@ -88,7 +96,7 @@ class StrayLight(nn.Module):
         shares = [*state.shares, *state.ghost_shares]
         self.register_buffer("shares", torch.tensor(shares, dtype=torch.float32))
         # Each round leaves the share of all stray light of what was left.
-        scattered = min(max(sum(map(abs, [*shares, state.veil])), _LEFT), 0.9)
+        scattered = max(sum(map(abs, [*shares, state.veil])), _LEFT)
         self.rounds: int = math.ceil(math.log(_LEFT) / math.log(scattered))
 
     def _spread(self, size: int, centre: float, ghost: float, sigma: float) -> Tensor:

@@ -3,8 +3,9 @@
 import logging
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -40,11 +41,12 @@ from tofcorr.scene_light.stray import StrayLightState
 
 _LOG = logging.getLogger(__name__)
 
+Frames = Callable[[], tuple[Tensor, Tensor]]
+"""Reads depth, corrected, and amplitude of some frames (B, H, W)."""
+
 _FRAMES = 24
 """Frames that are looked at, evenly spread. Chosen: each has thousands of pixels, and some hundred
 at edges."""
-_EDGES = 30
-"""Fewest edges from which the point spread is known. Chosen: their median is then known to 5 %."""
 
 
 class SecondBouncesWanted(SecondBouncesOptions):
@@ -95,14 +97,15 @@ def scene_light(data: Dataset, options: RuntimeOptions, state: CalibrationState)
     Raises:
         CalibrationDataError: Flying pixels are to be found, and there are no amplitudes.
     """
-    data, wanted = replace(data, direct=None), options.flying_pixels
-    flying = wanted and _flying_pixels(data, wanted, state)
-    bounces = options.second_bounces and _second_bounces(data, options.second_bounces, state)
+    data, wanted, other = replace(data, direct=None), options.flying_pixels, options.second_bounces
+    frames = cache(lambda: _corrected(data, state))  # They are read once, and only where needed.
+    flying = wanted and _flying_pixels(data, wanted, state, frames)
+    bounces = other and _second_bounces(data, other, state, frames)
     return SceneLight(stray_light=options.stray_light, flying_pixels=flying, second_bounces=bounces)
 
 
 def _second_bounces(
-    data: Dataset, wanted: SecondBouncesWanted, state: CalibrationState
+    data: Dataset, wanted: SecondBouncesWanted, state: CalibrationState, frames: Frames
 ) -> SecondBouncesState:
     """Return what removing second bounces takes, with the gain found where none is given."""
     data.require("amplitude", "removing second bounces (runtime.second_bounces)")
@@ -118,18 +121,18 @@ def _second_bounces(
     values["frequencies_hz"] = wanted.frequencies_hz or (frequency,)
     if wanted.gain is not None and wanted.budget_ms is None and not recorded:
         return SecondBouncesState.model_validate(values)
-    depths, amplitudes = _corrected(data, state)
+    depths, amplitudes = frames()
     if wanted.budget_ms is not None:
         values["gain"] = wanted.gain or 0.0
         values["patch_px"] = patch_within(wanted.budget_ms, values, state, depths, amplitudes)
     radial = depths * DepthCorrector.from_state(state).radial_of_z
-    frames = list(zip(radial, amplitudes, strict=True))
+    pairs = list(zip(radial, amplitudes, strict=True))
     if wanted.gain is None:
-        values |= _fitted_gain(frames, values, state)
+        values |= _fitted_gain(pairs, values, state)
     if recorded:
         bounces = SecondBounces(state.camera, SecondBouncesState.model_validate(values))
         poses = data.column("world_from_tool")[thinned(np.arange(data.num_frames), _FRAMES)]
-        values["room"] = recorded_room(bounces, frames, poses @ state.tool_from_camera.cpu())
+        values["room"] = recorded_room(bounces, pairs, poses @ state.tool_from_camera.cpu())
     return SecondBouncesState.model_validate(values)
 
 
@@ -248,11 +251,11 @@ def learned_remainder(options: RuntimeOptions, state: CalibrationState) -> Remai
 
 
 def _flying_pixels(
-    data: Dataset, wanted: FlyingPixelsOptions, state: CalibrationState
+    data: Dataset, wanted: FlyingPixelsOptions, state: CalibrationState, frames: Frames
 ) -> FlyingPixelsState | None:
     """Measure what finding flying pixels takes; None, and a warning, where there are none."""
     data.require("amplitude", "finding flying pixels (runtime.flying_pixels)")
-    depths, amplitudes = _corrected(data, state)
+    depths, amplitudes = frames()
     shown = shown_by(depths, amplitudes.float(), state.camera, state.depth_kind, wanted)
     if shown is None:
         _LOG.warning("Flying pixels are not looked for: the recording shows none.")
@@ -291,7 +294,7 @@ def shown_by(
         wanted: What was asked for.
     """
     spreads = torch.cat([squared_spreads(one[None]) for one in amplitude])
-    if len(spreads) < _EDGES:
+    if len(spreads) < len(depth):  # Not an edge a frame.
         return None
     spread = float(spreads.median().clamp(min=0).sqrt())
     values = wanted.to_mapping() | {"point_spread_px": spread}
