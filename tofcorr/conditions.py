@@ -72,7 +72,7 @@ class Conditions(Generic[Value]):
         return {name: getattr(self, name) for name in CONDITIONS}
 
 
-_INTEGRATION = ("integration_time", "integration_time_us", "us")
+_INTEGRATION = ("integration_time", "integration_time_us", "µs")
 _ROOM = ("room_temperature", "room_temperature_c", "C", "room temperature", "room_temperature_c")
 _BODY = ("body_temperature", "body_temperature_c", "C", "body temperature", "body_temperature_c")
 _ALL = (

@@ -37,12 +37,11 @@ def test_what_was_not_named_is_not_looked_for(trained: Trained) -> None:
     assert trained.calibration()["scene"] == SceneLight().to_mapping()
 
 
-def test_where_a_recording_shows_none_they_are_not_looked_for(
-    trained: Trained, caplog: pytest.LogCaptureFixture
-) -> None:
-    corrector = tofcorr.train(trained.recording, NAMED).corrector()
-    assert corrector.flying is None
-    assert "Flying pixels are not looked for: the recording shows none." in caplog.messages
+def test_where_a_recording_shows_none_they_are_not_looked_for(trained: Trained) -> None:
+    result = tofcorr.train(trained.recording, NAMED)
+    assert result.corrector().flying is None
+    assert result.report["scene"] == {"flying_pixels": {"held_out_share": None}}
+    assert "Flying pixels are not looked for: the recording shows none." in repr(result)
 
 
 def test_where_boards_stand_before_walls_the_column_between_them_is_not_valid(
@@ -61,6 +60,10 @@ def test_where_boards_stand_before_walls_the_column_between_them_is_not_valid(
     flying, _ = result.corrector().flying.found(depth, amplitude)  # type: ignore[union-attr]
     middle = depth.shape[2] // 2
     assert flying[:, 2:-2, middle].float().mean() > 0.9
+    # Half the frames were held out: what the report says of them is about what all show.
+    share = result.report["scene"]["flying_pixels"]["held_out_share"]
+    assert share == pytest.approx(float(flying.float().mean()), rel=0.2)
+    assert f"Flying pixels are {100 * share:.2g} % of all pixels" in repr(result)
     beside = flying.float().mean(dim=(0, 1))
     assert beside[: middle - 1].max() < 0.05
     assert beside[middle + 2 :].max() < 0.05
@@ -79,3 +82,15 @@ def test_a_rate_that_is_none_is_refused(trained: Trained) -> None:
     wrong = NAMED | {"runtime": {"flying_pixels": {"false_alarm": 0}}}
     with pytest.raises(ConfigError, match="false_alarm"):
         tofcorr.train(trained.recording, wrong)
+
+
+def test_the_report_says_what_removing_light_changes_in_held_out_frames(trained: Trained) -> None:
+    stray = {"modulation_frequency": 20e6, "sigma_of_width": [0.1], "shares": [0.05]}
+    wanted = CONFIG | {"advice": 0, "runtime": {"stray_light": stray}}
+    result = tofcorr.train(trained.recording, wanted)
+    left, without = result.report["scene"]["stray_light"]["held_out_rms_mm"]
+    # Without it frames are those that the errors of the report are of.
+    assert without == pytest.approx(result.report["error_mm"]["after"]["test"]["rms"])
+    assert left != pytest.approx(without)
+    said = f"Held-out frames are off by {left:.1f} mm RMS with stray light and {without:.1f} mm"
+    assert said in repr(result)

@@ -212,7 +212,9 @@ class EvaluationResult:
             cells = [f"{errors[column][0]:.2f}" for column in self.options.columns]
             rows.append([f"{one.name}: {of.replace('_', ' ')}", *cells])
         note = "Between views: offset and tilts of whole images, beyond any model of a pixel."
-        return self._table("Parts of the half's RMS error of the z depth, mm", rows, note)
+        return self._table(
+            "RMS error of z depth on that half, between views and within them, mm", rows, note
+        )
 
     def _table(self, title: str, rows: list[list[str]], note: str) -> Table:
         seed = f" Seed {self.options.seed}." if "seed" not in note else ""
@@ -237,7 +239,7 @@ class EvaluationResult:
             walls = one.by_wall(protocol) if protocol in one.splits else {}
             cells = {wall: [f"{k:.2f}" for k in errors.values()] for wall, errors in walls.items()}
             rows += [[f"{one.name}, {wall}, {what}", *own] for wall, own in cells.items()]
-        note = "'images': some of each wall's were held out; 'wall': all of one wall's, in turn."
+        note = "'images': some images of each wall held out; 'wall': all of one wall, in turn."
         return self._table("Held-out RMS distance to each wall, mm", rows, note)
 
     def _folds_table(self) -> Table:

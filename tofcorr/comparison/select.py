@@ -139,7 +139,9 @@ class SelectionResult:
             ordered = sorted(ranking.errors.items(), key=lambda item: item[1].mean)
             rows = [self._row(ranking, name) for name, _ in ordered]
             title = f"{by.capitalize()}s held out: {metric} error, mm"
-            held_out = f"Held out in turn: {'; '.join(self.experiment.splits[by])}."
+            parts = self.experiment.splits[by]
+            names = "; ".join(parts) if by != "image" else f"{len(parts)} random parts"
+            held_out = f"Held out in turn: {names}."
             found.append(Table(title, header, rows, held_out))
         return found
 

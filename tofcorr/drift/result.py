@@ -111,6 +111,7 @@ class DriftResult:
             frames, [1e3 * one.flatness for one in self.images], "o", color=BLUE, markersize=4
         )
         lower.set(xlabel="frame", ylabel="departure from a plane, mm", ylim=(0, None))
+        lower.locator_params(axis="x", integer=True)
         return figure
 
     def page(self, run: str, recordings: list[str]) -> str:

@@ -67,7 +67,6 @@ def noise_figure(observables: Observables) -> Figure:
             if compared["ratio_ci"] is not None:
                 found[1].axhspan(*compared["ratio_ci"], color=RED, alpha=FAINT, linewidth=0)
             found[1].set_ylabel("recording / simulator\n(band: all, 95 %)")
-            found[1].set_ylim(bottom=0.0)
             found[1].set_xlim(found[0].get_xlim())
     found[0].set_ylabel("noise of a pixel, mm")
     found[-1].set_xlabel("amplitude, counts" if real.curve.needs_amplitude else "distance, m")

@@ -4,13 +4,14 @@ A template extends `page.html.j2` and fills its blocks `title` and `content`; wh
 pages, a picture with its words above all, is a macro of `parts.html.j2`.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import DictLoader, Environment, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import refuse_existing
@@ -46,13 +47,18 @@ def page_text(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= filters
+    environment.filters.update(filters, code=_code)
     return environment.get_template(name).render(
         values,
         figures={key: Markup(svg_of(figure)) for key, figure in figures.items()},
         style=Markup(resource("tofcorr.pages", "style.css")),
         version=__version__,
     )
+
+
+def _code(text: str) -> Markup:
+    """Return text as HTML, with what stands between backticks as code."""
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", escape(text)))
 
 
 def resource(folder: str, name: str) -> str:

@@ -169,4 +169,4 @@ class Inspection:
 
     @property
     def _measured(self) -> list[str]:
-        return aligned((f"  {name}", f"{value:.4g}") for name, value in self.numbers.items())
+        return aligned((f"  {name}", f"{value:.3g}") for name, value in self.numbers.items())

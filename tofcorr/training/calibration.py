@@ -116,6 +116,11 @@ class Calibration:
         self.fit = found
 
     @property
+    def tested(self) -> np.ndarray:
+        """Global numbers of the frames held out; of those fitted, if none is."""
+        return self.test if len(self.test) else self.train
+
+    @property
     def frames(self) -> np.ndarray:
         """Global numbers of all frames used, fitted or held out, increasing."""
         return np.sort(np.concatenate([self.train, self.test]))

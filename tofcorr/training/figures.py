@@ -143,7 +143,7 @@ def image_figure(sample: PixelSample, shape: tuple[int, int]) -> "Figure":
     """Draw the mean error over the image (H, W) at each stage, each on a scale of its own."""
     from tofcorr.pages.drawing import BLUE, SIGNED, STAGES, image_map, panels
 
-    figure, found = panels(2, 1, len(sample.errors_mm))
+    figure, found = panels(1 + 1.7 * shape[0] / shape[1], 1, len(sample.errors_mm))
     row, column = (sample.covariates[f"{name} [pixel]"] for name in ("row", "column"))
     pixel = (row * shape[1] + column).astype(int)
     for axes, (stage, error) in zip(found, sample.errors_mm.items(), strict=True):
@@ -176,7 +176,7 @@ def residual_figure(calibration: Calibration, frames: np.ndarray) -> "Figure":
     before, after = (np.concatenate(column) for column in columns.values())
     sizes = (np.abs(one[np.isfinite(one)]) for one in (before, after))
     common, own = (float(np.quantile(one, 1 - 1 / 50)) or 1.0 if len(one) else 1.0 for one in sizes)
-    figure, found = panels(1 + 2 * len(before) / camera.width, 1, 3)
+    figure, found = panels(1 + 1.7 * len(before) / camera.width, 1, 3)
     shown = ("before", before, common), ("after", after, common), ("after, finer", after, own)
     for axes, (title, image, limit) in zip(found, shown, strict=True):
         image_map(axes, image, "error, mm", (-limit, limit), SIGNED)

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from tofcorr.digits import aligned, at_most
+from tofcorr.digits import aligned, at_most, with_interval
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.files import reading
@@ -134,7 +134,7 @@ def expected(fit: Fit, errors: Mapping[str, Any], inspection: Inspection) -> str
 
     Arguments are those of `judge`.
     """
-    known = f", and the hand-eye is known to {_known(fit)}." if _is_free(fit) else "."
+    known = f", and the hand-eye is known to {_known(fit)} (1 σ)." if _is_free(fit) else "."
     return f"{_measured(fit, errors, inspection.look)}{known}"
 
 
@@ -262,7 +262,7 @@ _VIEWS = "between views (offset and tilts of whole images)", "within views"
 
 
 def report_text(report: Mapping[str, Any]) -> str:
-    """Return verdict, errors, hand-eye, what is least known and one warning: 11 lines at most.
+    """Return verdict, errors, hand-eye, what is least known and one warning, in a dozen lines.
 
     Args:
         report: The content of report.json.
@@ -272,6 +272,7 @@ def report_text(report: Mapping[str, Any]) -> str:
             verdict_text(report),
             *update_words(report)[:1],
             *_error_table(report, {"rms": "RMS"}),
+            *scene_words(report),
             *_hand_eye_lines(report)[:1],
             *_advice_lines(report, 2),
             *at_most(2, _warnings(report), "--verbose, or report.json"),
@@ -287,6 +288,7 @@ def full_text(report: Mapping[str, Any]) -> str:
     """
     lines = [verdict_text(report), *update_words(report), report["message"]]
     lines += _error_table(report, {"mean_abs": "mean abs.", "rms": "RMS"})
+    lines += scene_words(report)
     for half, own in report["views_mm"].items():
         if own["rms_z"] is not None:
             lines.append(f"{half.replace('test', 'held out')}: RMS along z {own['rms_z']:.2f} mm")
@@ -318,6 +320,37 @@ def update_words(report: Mapping[str, Any]) -> list[str]:
     ]
     others = f"Other explanations: {', '.join(others)}."
     return [update["sentence"], others, *own, *update["notes"]]
+
+
+def scene_words(report: Mapping[str, Any]) -> list[str]:
+    """Return what of the scene's light is removed, how well it is known, and what that changes.
+
+    Args:
+        report: The content of report.json; it has no `scene` where nothing was asked for.
+    """
+    scene, said = report.get("scene", {}), list[str]()
+    if "stray_light" in scene:
+        stray = scene["stray_light"]
+        share = sum(stray["shares"]) + stray["veil"] + sum(stray["ghost_shares"])
+        said.append(f"Stray light is taken back: {100 * share:.2g} % of the light.")
+    if "second_bounces" in scene:
+        bounces = scene["second_bounces"]
+        gain, ends = with_interval(bounces["gain"], bounces["gain_interval"])
+        known = f"{gain} (95 %: {ends}, from the curvature of walls)"
+        known = known if ends else f"{bounces['gain']:.3g} (as given)"
+        said.append(f"Second bounces are removed with the gain {known}.")
+    half = "Held-out frames" if report["frames"]["test"] else "Frames fitted"
+    for name in ("stray_light", "second_bounces"):
+        if name in scene:
+            left, without = (f"{rms:.1f}" for rms in scene[name]["held_out_rms_mm"])
+            light = name.replace("_", " ")
+            said.append(f"{half} are off by {left} mm RMS with {light} and {without} mm without.")
+    if "flying_pixels" in scene:
+        share = scene["flying_pixels"]["held_out_share"]
+        shown = "not looked for: the recording shows none"
+        shown = shown if share is None else f"{100 * share:.2g} % of all pixels"
+        said.append(f"Flying pixels are {shown}.")
+    return said
 
 
 def _error_table(report: Mapping[str, Any], kinds: Mapping[str, str]) -> list[str]:

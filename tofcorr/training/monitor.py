@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,16 +69,16 @@ class RunMonitor:
         """
         with event_writer(folder) as writer:
             # TensorBoard shows groups in the order of their names: the result comes first.
-            stages = "_".join(f"{step}_{stage}" for step, stage in enumerate(report["error_mm"]))
-            for step, halves in enumerate(report["error_mm"].values()):
+            # A point each: TensorBoard smooths what stands in one curve.
+            for step, (stage, halves) in enumerate(report["error_mm"].items()):
                 for half, error in zip(("fitted", "held_out"), halves.values(), strict=True):
                     if error["rms"] is not None:
-                        writer.add_scalar(f"1_result/rms_mm_{half}_{stages}", error["rms"], step)
+                        writer.add_scalar(f"1_result/rms_mm_{half}_{step}_{stage}", error["rms"])
             for values in self._scalars(calibration):
                 writer.add_scalar(*values)
             # Four spaces keep the lines of a table as they are.
-            lines = full_text(report).splitlines()
-            writer.add_text("report", "\n".join(f"    {line}" for line in lines))
+            lines = [wrap(line, 100) for line in full_text(report).splitlines()]
+            writer.add_text("report", "\n".join(f"    {part}" for line in lines for part in line))
             if sample is not None:
                 _write_errors(writer, calibration, sample)
             for name, figure in figures.items():

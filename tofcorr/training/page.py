@@ -30,6 +30,7 @@ from tofcorr.training.judgement import (
     advice_words,
     left_out_words,
     outlying_words,
+    scene_words,
     stage_words,
     update_words,
 )
@@ -100,6 +101,8 @@ def render(
         {"mm": in_mm, "with_interval": with_interval, "stage": stage_words},
         report=report,
         updated=update_words(report),
+        scene=scene_words(report),
+        direct=data.direct is not None or data.stray is not None,
         advised=report["advice"] and advice_words(report["advice"]),
         names=[recording.path.name for recording in data.recordings],
         frame={"number": frame, "target": data.targets[frame], "tested": frame in calibration.test}

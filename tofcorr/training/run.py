@@ -37,7 +37,7 @@ from tofcorr.pixels.dataset import (
     split_frames,
 )
 from tofcorr.pixels.lattice import covered_domain, lattice_of
-from tofcorr.pixels.passes import is_first, process_group
+from tofcorr.pixels.passes import FittedModel, is_first, process_group
 from tofcorr.pixels.sample import PixelSample, usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
@@ -54,7 +54,12 @@ from tofcorr.training.judgement import (
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.pool import CameraType, load_type
 from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report
-from tofcorr.training.scene import learned_remainder, scene_light
+from tofcorr.training.scene import (
+    RuntimeOptions,
+    learned_remainder,
+    scene_light,
+    scene_summary,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -139,11 +144,19 @@ class TrainingResult:
         force: Whether a corrector is written whatever the verdict.
     """
 
-    report: Mapping[str, Any]
+    report: dict[str, Any]
     calibration: Calibration
     options: TrainingOptions
     monitor: RunMonitor
     force: bool = False
+
+    def __post_init__(self) -> None:
+        """Report what of the scene's light is removed, if anything was asked for."""
+        if self.options.runtime != RuntimeOptions():
+            model = FittedModel(self.fit.model, self.calibration.tested)
+            self.report["scene"] = scene_summary(
+                self.data, self.options.runtime, self._state, model
+            )
 
     @property
     def iterations(self) -> tuple[Solution, ...]:
@@ -437,13 +450,13 @@ def carried_training(
                 with stage("report"):
                     report = training_report(calibration, options, inspection)
                     report |= {} if before is None else before.said(calibration.fit)
-                result = TrainingResult(
-                    report=report | {"seconds": seconds},
-                    calibration=calibration,
-                    options=options,
-                    monitor=monitor,
-                    force=force,
-                )
+                    result = TrainingResult(
+                        report=report | {"seconds": seconds},
+                        calibration=calibration,
+                        options=options,
+                        monitor=monitor,
+                        force=force,
+                    )
                 if folder:
                     with stage("write"):
                         result.write_into(folder)

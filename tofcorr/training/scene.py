@@ -20,6 +20,7 @@ from tofcorr.estimation.noise import fit_noise
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.options import Options, PositiveNumber
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.passes import FittedModel, held_out_errors
 from tofcorr.pixels.sample import thinned
 from tofcorr.scene_light.bounces import (
     Frequencies,
@@ -98,7 +99,8 @@ def scene_light(data: Dataset, options: RuntimeOptions, state: CalibrationState)
         CalibrationDataError: Flying pixels are to be found, and there are no amplitudes.
     """
     data, wanted, other = replace(data, direct=None), options.flying_pixels, options.second_bounces
-    frames = cache(lambda: _corrected(data, state))  # They are read once, and only where needed.
+    every = np.arange(data.num_frames)
+    frames = cache(lambda: _corrected(data, state, every))  # Read once, and only where needed.
     flying = wanted and _flying_pixels(data, wanted, state, frames)
     bounces = other and _second_bounces(data, other, state, frames)
     return SceneLight(stray_light=options.stray_light, flying_pixels=flying, second_bounces=bounces)
@@ -253,26 +255,56 @@ def learned_remainder(options: RuntimeOptions, state: CalibrationState) -> Remai
 def _flying_pixels(
     data: Dataset, wanted: FlyingPixelsOptions, state: CalibrationState, frames: Frames
 ) -> FlyingPixelsState | None:
-    """Measure what finding flying pixels takes; None, and a warning, where there are none."""
+    """Measure what finding flying pixels takes; None where there are none."""
     data.require("amplitude", "finding flying pixels (runtime.flying_pixels)")
     depths, amplitudes = frames()
-    shown = shown_by(depths, amplitudes.float(), state.camera, state.depth_kind, wanted)
-    if shown is None:
-        _LOG.warning("Flying pixels are not looked for: the recording shows none.")
-    return shown
+    return shown_by(depths, amplitudes.float(), state.camera, state.depth_kind, wanted)
 
 
-def _corrected(data: Dataset, state: CalibrationState) -> tuple[Tensor, Tensor]:
-    """Return depth, corrected, and amplitude of some frames (B, H, W); NaN where not usable."""
-    corrector, frames = DepthCorrector.from_state(state), []
-    for batch in data.batches(thinned(np.arange(data.num_frames), _FRAMES)):
+def scene_summary(
+    data: Dataset, runtime: RuntimeOptions, state: CalibrationState, model: FittedModel
+) -> dict[str, Any]:
+    """Return what of the scene's light is removed, and what that changes in frames held out.
+
+    Of stray light and second bounces it is the RMS error to the target, mm, as recorded and without
+    that light; of flying pixels their share of all pixels, None where the recording shows none.
+
+    Args:
+        data: The recordings, with or without the light that is removed.
+        runtime: What was asked for.
+        state: The calibration, with what was found.
+        model: The fitted model, and the frames held out.
+    """
+    found, summary = state.scene_mapping(), dict[str, Any]()
+    stray = replace(data, stray=None), data.without_stray_light(state.scene.stray_light)
+    straight = data if data.direct is not None else data.without_second_bounces(state)
+    direct = replace(data, direct=None), straight
+    for name, sets in (("stray_light", stray), ("second_bounces", direct)):
+        if found[name] is not None:
+            errors = [held_out_errors(each, [model])[0]["to_plane"].rms_mm() for each in sets]
+            summary[name] = found[name] | {"held_out_rms_mm": errors}
+    if runtime.flying_pixels is not None:
+        share, finder = None, state.flying_pixels()
+        if finder is not None:
+            plain = state.model_copy(update={"scene": SceneLight()})
+            depths, amplitudes = _corrected(direct[1], plain, model.held_out)
+            flying, _ = finder.found(depths, amplitudes)
+            share = float(flying.sum() / depths.isfinite().sum())
+        summary["flying_pixels"] = (found["flying_pixels"] or {}) | {"held_out_share": share}
+    return summary | {name: found[name] for name in ("learned",) if name in found}
+
+
+def _corrected(data: Dataset, state: CalibrationState, frames: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Return depth, corrected, and amplitude of some of frames (B, H, W); NaN where not usable."""
+    corrector, images = DepthCorrector.from_state(state), []
+    for batch in data.batches(thinned(frames, _FRAMES)):
         assert batch.amplitude is not None
         depth, amplitude = batch.radial_distance / corrector.radial_of_z, batch.amplitude
         usable = valid_pixels(depth, amplitude, None, state.saturation_amplitude)
         with torch.no_grad():
             corrected, _ = corrector(depth.float(), amplitude.float())
-        frames.append((corrected.where(usable, torch.nan), amplitude.where(usable, torch.nan)))
-    depths, amplitudes = (torch.cat(images) for images in zip(*frames, strict=True))
+        images.append((corrected.where(usable, torch.nan), amplitude.where(usable, torch.nan)))
+    depths, amplitudes = (torch.cat(kind) for kind in zip(*images, strict=True))
     return depths, amplitudes
 
 

@@ -207,6 +207,10 @@ def _something_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
         before = sized(gap.before).split(" [")[0]
         start, advice = f"Recalibration leaves {before}; with ", "calibrate it and add"
     end = f": {advice} {many}"
+    rivals = {other for name in named.names for other in named.sets[name]}.difference(named.names)
+    if rivals:
+        others = ", ".join(effect_words(named.study, name) for name in sorted(rivals))
+        end += f", or what these data cannot tell it from ({others})"
     if remainder.unknown:
         end = ", which none of the effects tested explains"
     return f"{start}{many} added, {sized(gap.after)} remain{end}."
@@ -233,8 +237,8 @@ def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
 
 def list_causes(found: Evidence, causes: Sequence[Share]) -> tuple[str, ...]:
     """Return a line for each cause, the largest share first."""
-    # A parameter that was left as the simulator has it causes nothing.
-    shown = (one for one in causes if one.kind == "effect" or one.share or any(one.share.interval))
+    # A parameter that causes nothing is in the picture alone.
+    shown = (one for one in causes if one.kind == "effect" or round(100 * one.share))
     ordered = sorted(shown, key=lambda one: -one.share)
     return tuple(_cause_line(found, one) for one in ordered if one.kind != "unexplained")
 
