@@ -348,9 +348,14 @@ class SensorModel(DescribedModule):
         needed = any(part.needs_amplitude for part in parts if part is not None)
         needed = needed or self.bounces is not None
         frames = self.eye(true_depth, amplitude, reflectivity, known, needs_amplitude=needed)
+        further = torch.zeros_like(frames.distance)
         if self.bounces is not None:
-            frames = self._with_second_bounces(frames, self.bounces, around)
-        radial = self._expected(frames, frame_shift)
+            lit = self._with_second_bounces(frames, self.bounces, around)
+            # An error of the true distance was found beside what second bounces add.
+            if not self.base.reads_measured:
+                further = lit.distance - frames.distance
+            frames = replace(lit, distance=lit.distance - further)
+        radial = self._expected(frames, frame_shift) + further
         reported = frames.amplitude
         if noise and self.noise is not None:
             sigma = self.noise.sigma(frames.distance, frames.amplitude)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base import BaseFit, unknown_amplitude_columns
+from tofcorr.diagnosis.sums.base import BaseFit, filtered_inputs, unknown_amplitude_columns
 from tofcorr.diagnosis.sums.linear_system import (
     BASE,
     OLS_SD,
@@ -28,7 +28,8 @@ from tofcorr.diagnosis.sums.linear_system import (
     pose_columns,
     pose_sums,
 )
-from tofcorr.diagnosis.sums.observations import TINY, Observations
+from tofcorr.diagnosis.sums.observations import TINY, Observations, effect_inputs
+from tofcorr.geometry import se3
 from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.geometry.se3 import by_frame
 from tofcorr.pixels.dataset import in_threads
@@ -37,6 +38,11 @@ from tofcorr.simulation.effects.base import MEASURED_PLANES, EffectInputs
 
 # Prior standard deviation of a probe, metres. Chosen.
 _SIZE = 0.01
+# How often an effect in another form than the usual one is fitted together with the base model. Set
+# on rendered walls: after that the strength of second bounces changes by 1 % at most.
+_SETTLED = 4
+# Pixels that are enough for that: a hundred or so of each pose. Chosen.
+_FEW_PIXELS = 5_000
 
 
 @dataclass(frozen=True)
@@ -155,7 +161,9 @@ class Study:
             by name, metres at one standard deviation of the prior, shape (M, K) each. They are
             never copied into one matrix of all pixels.
         pose: Columns of an uncertain pose, shape (M, 3).
-        residual: Of the base fit less the maps already subtracted, shape (M,), metres.
+        residual: Of the base fit less the maps already subtracted, shape (M,), metres; where
+            effects are linearised at coefficients c, with J c less what they add.
+        straight: The same without that, shape (M,), metres.
         sums: Sums of products of these over the pixels of every pose.
         folds: Which poses each fold of the cross-validation holds out, shape (folds, U), float64.
         signs: Sign flips of the poses, shape (B, U).
@@ -173,6 +181,7 @@ class Study:
     columns: Mapping[str, Tensor]
     pose: Tensor
     residual: Tensor
+    straight: Tensor
     sums: PoseSums
     folds: Tensor
     signs: Tensor
@@ -263,9 +272,10 @@ def build_study(
     known = {n: kind.forms(inputs) for n, kind in kinds.items() if n not in missing}
     maps = {n: each for n, (each, *_) in known.items() if isinstance(each, MapEffect)}
     probes, pose = probes_for(inputs), pose_columns(inputs)
-    sources = [(n, form) for n, forms in known.items() if n not in maps for form in forms]
+    sources = [(name, forms[0]) for name, forms in known.items() if name not in maps]
     sources += list(probes.items())
     found = in_threads(lambda source: source[1].scaled_columns(inputs), sources)
+    effects = {name: form for name, form in sources if isinstance(form, CatalogueEffect)}
     # What is uncertain of the simulator's own error, or stands in for the amplitude.
     further = [] if fit.known is None else [fit.known.uncertain]
     further.append(unknown_amplitude_columns(observations, inputs))
@@ -274,21 +284,8 @@ def build_study(
     prior = torch.block_diag(prior, torch.eye(sum(own.shape[1] for own in further)).double())
     base = torch.cat([fit.model.linearised(fit.tool_from_camera)[1], *further], dim=1)
 
-    def left_out(name: str, own: Tensor) -> float:
-        """Return what base model and a form leave of poses predicted by all others, m^2."""
-        sums = pose_sums(observations, {BASE: base, name: own}, pose, fit, prior)
-        gls = sums.with_pose_uncertainty((name,)).gls
-        return float(gls.squares_at((name,), gls.left_out_coefficients((name,))).sum())
-
-    columns, effects, least = {BASE: base}, dict[str, CatalogueEffect](), dict[str, float]()
-    for (name, form), own in zip(sources, found, strict=True):
-        left = left_out(name, own) if len(known.get(name, ())) > 1 else 0.0
-        if name not in columns or left < least[name]:
-            columns[name], least[name] = own, left
-            if isinstance(form, CatalogueEffect):
-                effects[name] = form
-    sums = pose_sums(observations, columns, pose, fit, prior)
-    return Study(
+    columns = {BASE: base, **dict(zip([name for name, _ in sources], found, strict=True))}
+    study = Study(
         options=options,
         observations=observations,
         fit=fit,
@@ -300,10 +297,77 @@ def build_study(
         columns=columns,
         pose=pose,
         residual=fit.residual,
-        sums=sums.with_pose_uncertainty(),
+        straight=fit.residual,
+        sums=pose_sums(observations, columns, pose, fit, prior).with_pose_uncertainty(),
         folds=folds,
         signs=2.0 * flips.double() - 1.0,
     )
+    for name, (_, *others) in known.items():
+        study = _in_best_form(study, name, others, prior)
+    return study
+
+
+def _in_best_form(
+    study: Study, name: str, others: Sequence[CatalogueEffect], prior: Tensor
+) -> Study:
+    """Return the study with an effect in the form that best predicts poses left out.
+
+    Each of the other forms is fitted together with the base model, until its constants and the
+    geometry that it depends on change no more: alone, the base fit takes a part for its own.
+
+    Args:
+        study: With the effect in its usual form.
+        name: The effect.
+        others: Its other forms.
+        prior: Precision of the base model's coefficients (K, K).
+    """
+    if not others:
+        return study
+    few = slice(None, None, max(1, len(study.residual) // _FEW_PIXELS))
+    fit, some = study.fit, study.observations.at(few)
+    base = {BASE: study.columns[BASE][few]}
+    residual = study.residual[few]
+    fit_of_few = replace(
+        fit,
+        model=fit.model.on(some),
+        residual=residual,
+        sigma=fit.sigma[few],
+        trust=fit.trust[few],
+        known=fit.known and fit.known.at(few),
+    )
+    inputs = filtered_inputs(effect_inputs(some, fit.tool_from_camera), some, fit_of_few)
+    sparse = replace(
+        study,
+        observations=some,
+        fit=fit_of_few,
+        inputs=inputs,
+        pose=study.pose[few],
+        residual=residual,
+        straight=residual,
+    )
+
+    def in_form(form: CatalogueEffect) -> Study:
+        columns = {**base, name: form.scaled_columns(inputs)}
+        sums = pose_sums(some, columns, sparse.pose, fit_of_few, prior)
+        return replace(sparse, effects={name: form}, columns=columns, sums=sums)
+
+    def left_out(study: Study) -> float:
+        gls = study.sums.with_pose_uncertainty((name,)).gls
+        return float(gls.squares_at((name,), gls.left_out_coefficients((name,))).sum())
+
+    least, best = left_out(in_form(study.effects[name])), study
+    for form in others:
+        tried, theta = in_form(form), fit.coefficients
+        for _ in range(_SETTLED):
+            theta = tried.sums.ols.solve((name,))
+            tried = _linearised_at(tried, theta, tried, (name,), again=True)
+        if (left := left_out(tried)) < least:
+            own, least = tried.effects[name], left
+            columns = {**study.columns, name: own.scaled_columns(study.inputs)}
+            best = replace(study, columns=columns, effects={**study.effects, name: own})
+            sums = pose_sums(study.observations, columns, study.pose, study.fit, prior)
+            best = _linearised_at(best, theta, replace(best, sums=sums), (name,))
+    return replace(best, sums=best.sums.with_pose_uncertainty())
 
 
 def with_poses_reestimated(study: Study, names: Sequence[str]) -> Study:
@@ -329,7 +393,8 @@ def with_residual(
     """
     changed, before = changed or {}, study.sums
     columns = {**study.columns, **changed}
-    spans = [before.layout.effects[name] for name in changed]
+    all_spans = {BASE: (0, before.layout.base), **before.layout.effects}
+    spans = [all_spans[name] for name in changed]
     places = torch.cat([*(torch.arange(*span) for span in spans), torch.tensor([-1])])
     new = torch.cat([*changed.values(), residual[:, None]], dim=1)
     # One pass over the columns gives both sums.
@@ -354,43 +419,85 @@ def without_map(study: Study, values: Tensor, spent: Collection[str]) -> Study:
         spent: Maps that are candidates no longer.
     """
     maps = {name: m for name, m in study.maps.items() if name not in spent}
-    return replace(with_residual(study, study.residual - values), maps=maps)
+    left = with_residual(study, study.residual - values)
+    return replace(left, maps=maps, straight=study.straight - values)
 
 
 def relinearised(study: Study, names: Sequence[str]) -> Study:
-    """Return the study with effects of the model linearised at their fitted coefficients.
+    """Return the study linearised at the coefficients of a model.
 
-    Columns are derivatives at zero. Mixed or saturated signals are not linear in their strength.
-    With J the derivative at the fitted coefficients c, the residual r = y - (shift(c) - J c) and
-    the columns J replace those at zero, for the effects `names` only. A linearisation is kept if
-    it lowers the sum of squares.
+    Columns are derivatives at the base fit and at no effect. Mixed or saturated signals are not
+    linear in their strength, and an effect that the base fit took for its own moves the geometry
+    that both depend on. With J the derivative at the fitted coefficients c, the residual
+    r = y - (f(c) - J c) and the columns J replace those of the base model and of the effects
+    `names`, where one of these is not linear. A linearisation is kept if the model itself leaves
+    less there than before.
 
     Args:
         study: The recording.
         names: Effects of the model.
     """
-    effects = study.effects
-    bent = [name for name in names if name in effects and not effects[name].linear]
+    names = [name for name in names if name in study.effects]
+    bent = not all(study.effects[name].linear for name in names)
 
-    def loss(study: Study) -> float:
-        """Return the weighted sum of squares of the model fitted to all poses, m^2."""
-        return float((study.fit.share * study.residual_of(names) ** 2).sum())
+    def loss(left: Tensor) -> float:
+        """Return the weighted sum of squares, m^2."""
+        return float((study.fit.share * left**2).sum())
 
-    best, best_loss, current = study, loss(study), study
+    best, least, current = study, loss(study.residual_of(())), study
     for _ in range(3 if bent else 0):  # The second or third changes nothing any more.
-        ols, residual, changed = current.sums.ols, study.residual, dict[str, Tensor]()
-        theta, places = ols.solve(names), ols.layout.only(names).effects
-        for name in bent:
-            effect, sd = effects[name], effects[name].prior_sd()
-            own = theta[slice(*places[name])] * sd
-            slope = effect.slope(study.inputs, own)
-            residual = residual - (effect.shift(study.inputs, own) - slope @ own)
-            changed[name] = slope * sd
-        current = with_residual(current, residual, names, changed)
-        if not loss(current) < best_loss:
+        theta = current.sums.ols.solve(names)
+        current = _linearised_at(study, theta, current, names)
+        now = loss(current.residual - current.times(names, theta))  # Of the model itself there.
+        if not now < least:
             break
-        best, best_loss = current, loss(current)
+        best, least = current, now
     return best
+
+
+def _linearised_at(
+    study: Study, theta: Tensor, before: Study, names: Sequence[str], *, again: bool = False
+) -> Study:
+    """Return the study with the model linearised at some coefficients.
+
+    Args:
+        study: The recording.
+        theta: The coefficients (K,).
+        before: What they are of, linearised elsewhere.
+        names: Effects of the model.
+        again: Whether the effects' constants are found again.
+    """
+    fit, model = study.fit, study.fit.model.moved(theta)
+    step, count = theta[: model.num_columns], model.num_geometry
+    coefficients, pose = fit.coefficients + step[count:], fit.tool_from_camera
+    if model.hand_eye_free:
+        pose = pose @ se3.exp(step[:6])
+    observations = model.observations
+    distance, columns = model.linearised(pose)
+    left = observations.measured - distance - columns[:, count:] @ coefficients
+    # What was known, or taken off before, stays as it is.
+    known = 0.0 if fit.known is None else fit.known.error
+    residual = study.straight - fit.residual + left - known + columns @ step
+    further = study.columns[BASE][:, model.num_columns :]
+    changed = {BASE: torch.cat([columns, further], dim=1)}
+    inputs = filtered_inputs(effect_inputs(observations, pose), observations, fit)
+
+    def error(frame: Tensor, pixel: Tensor) -> Tensor:
+        some, ends = observations.choosing(frame, pixel), observations.measured.aminmax()
+        found = model.on(some).error_columns(some.measured.clamp(*ends)) @ coefficients
+        on_target = observations.on_target.flatten(1)[frame, pixel]
+        return torch.where(on_target, torch.nan, found)
+
+    places, effects = before.sums.layout.only(names).effects, dict(study.effects)
+    for name in (name for name in names if not effects[name].linear):
+        sd = effects[name].prior_sd()
+        own = theta[slice(*places[name])] * sd
+        effect = effects[name].with_coefficients(own)
+        effects[name] = effect = effect.again(inputs, error) if again else effect
+        slope = effect.slope(inputs, own)
+        residual = residual - (effect.shift(inputs, own) - slope @ own)
+        changed[name] = slope * sd
+    return replace(with_residual(before, residual, names, changed), effects=effects)
 
 
 LEAST_LEFT = 1e-3

@@ -317,6 +317,10 @@ def terms_in(unit: str, prior_sds: Mapping[str, float]) -> tuple[Coefficient, ..
     return tuple(Coefficient(name, unit, prior_sd) for name, prior_sd in prior_sds.items())
 
 
+ErrorElsewhere = Callable[[Tensor, Tensor], Tensor]
+"""Of frames and pixels (N,): the camera's own error there, metres (N,); NaN on the target."""
+
+
 class CatalogueEffect(Effect, ABC):
     """An effect with named coefficients, for simulation and for fitting.
 
@@ -389,6 +393,16 @@ class CatalogueEffect(Effect, ABC):
     def forms(cls, inputs: EffectInputs) -> tuple[Self, ...]:
         """Return the effect in each form that it may have in a recording, all coefficients zero."""
         return (cls.for_recording(inputs),)
+
+    def again(self, inputs: EffectInputs, error: ErrorElsewhere) -> Self:
+        """Return the same form with the constants that a better fit shows.
+
+        Args:
+            inputs: As of `forms`, at that fit; the coefficients are those fitted.
+            error: Of the camera, elsewhere than on the target.
+        """
+        del inputs, error
+        return self
 
     @property
     def said(self) -> str:

@@ -25,6 +25,7 @@ from tofcorr.simulation.effects.base import (
     CatalogueEffect,
     Coefficient,
     EffectInputs,
+    ErrorElsewhere,
     SignalEffect,
     inner_range,
     inputs_from_state,
@@ -122,6 +123,7 @@ class MultipathShape(AreaShape):
         targets: How many of them are targets; they come first.
         light_half_angle_deg: How far off the optical axis the camera's light reaches.
         amplitude_at_1m: Of the target's bright parts, seen straight on.
+        strength: Coefficient of second bounces at which the light between surfaces is computed.
     """
 
     distance_m: float = 1.0
@@ -129,11 +131,13 @@ class MultipathShape(AreaShape):
     targets: int = 0
     light_half_angle_deg: PositiveNumber = 45.0
     amplitude_at_1m: PositiveNumber = 1.0
+    strength: PositiveNumber = 1.0
 
     def around(self) -> Surroundings:
         """Return the surfaces and their brightness."""
         planes = torch.tensor(self.surfaces, dtype=torch.float64)
-        return Surroundings(planes[:, :3], planes[:, 3], self.amplitude_at_1m * planes[:, 4])
+        bright = self.amplitude_at_1m * planes[:, 4]
+        return Surroundings(planes[:, :3], planes[:, 3], bright)
 
     def gain(self, coefficient: float) -> float:
         """Return the gain of second bounces, as in `SecondBouncesState`, of their coefficient."""
@@ -204,6 +208,19 @@ class MultipathEffect(SignalEffect, shape=MultipathShape):
         cones = [{**seen, "light_half_angle_deg": share * corner} for share in _CONES]
         return usual, *(cls(usual.shape.model_copy(update=each)) for each in cones)
 
+    def with_coefficients(self, coefficients: Tensor) -> Self:
+        """Return the effect with coefficients (K,), and the light between surfaces at these."""
+        shape, strength = self.shape, float(coefficients[0])
+        if shape.surfaces and strength > 0:
+            shape = shape.model_copy(update={"strength": strength})
+        return type(self)(shape, coefficients)
+
+    def again(self, inputs: EffectInputs, error: ErrorElsewhere) -> Self:
+        """Return the effect with the surfaces that frames without these second bounces show."""
+        shape = self.shape
+        seen = _seen(inputs, error, self) if shape.surfaces else {}
+        return type(self)(shape.model_copy(update=seen), self.coefficients)
+
     @property
     def said(self) -> str:
         """What it is in this form, in one line."""
@@ -224,9 +241,35 @@ class MultipathEffect(SignalEffect, shape=MultipathShape):
         """Return each coefficient's light over the direct light, shape (M, K), complex."""
         return inputs.remembered(_response, self.shape, 1)
 
+    def at(self, inputs: EffectInputs, place: Tensor, pose: Tensor) -> Tensor:
+        """Return second bounces over direct light at points of one frame, complex (N,).
 
-def _seen(inputs: EffectInputs) -> dict[str, Any]:
-    """Return surfaces and amplitude of the shape; empty where the frames show the target alone."""
+        Args:
+            inputs: Of the recording.
+            place: On any of the surfaces, in the camera's axes (N, 3), metres.
+            pose: Of the camera in the world (4, 4).
+        """
+        around, half_angle = self.shape.around(), math.radians(self.shape.light_half_angle_deg)
+        gain = self.shape.gain(max(float(self.coefficients[0]), 0.0))
+        at = place @ pose[:3, :3].T + pose[:3, 3]
+        normal = around.normal[(at @ around.normal.T - around.offset).abs().argmin(1)]
+        normal = normal * (normal * (pose[:3, 3] - at)).sum(1, keepdim=True).sign()
+        light = CameraLight(pose, half_angle, inputs.known_frequency, gain)
+        return bounced(around, light, at, normal)
+
+
+def _seen(
+    inputs: EffectInputs,
+    error: ErrorElsewhere | None = None,
+    effect: MultipathEffect | None = None,
+) -> dict[str, Any]:
+    """Return surfaces and amplitude of the shape; empty where the frames show the target alone.
+
+    Args:
+        inputs: Of the recording.
+        error: Of the camera; None: not known.
+        effect: Second bounces that are taken off too; None: not known.
+    """
     facts = inputs.facts
     if inputs.amplitude is None or inputs.amplitude_images is None:
         return {}
@@ -237,12 +280,25 @@ def _seen(inputs: EffectInputs) -> dict[str, Any]:
     white = inner_range(bright / inputs.of_frame(exposure))[1]
     targets = torch.cat([facts.normal_world, -facts.offset[:, None]], dim=1).unique(dim=0)
     rays = ray_directions(inputs.camera).reshape(-1, 3)
-    pixel = sampled(rays)
+    pixel, poses = sampled(rays), facts.world_from_tool @ inputs.tool_from_camera
+    distance = known(inputs, "distance_images").flatten(1)[:, pixel].double()
+    amplitude = inputs.amplitude_images.flatten(1)[:, pixel].double()
+    if error is not None and effect is not None:
+        frame = torch.arange(len(poses)).repeat_interleave(len(pixel))
+        own = error(frame, pixel.repeat(len(poses))).reshape(distance.shape)
+        second = torch.stack(
+            [
+                1 + effect.at(inputs, rays[pixel] * one[:, None], pose)
+                for one, pose in zip(distance - own.nan_to_num(), poses, strict=True)
+            ]
+        )
+        off = own + inputs.metres_per_radian * second.angle()
+        distance = torch.where(off.isnan() | (distance <= 0), distance, distance - off)
     found = surroundings_of(
-        known(inputs, "distance_images").flatten(1)[:, pixel],
-        inputs.amplitude_images.flatten(1)[:, pixel] / (white * exposure[:, None]),
+        distance,
+        amplitude / (white * exposure[:, None]),
         rays[pixel],
-        facts.world_from_tool @ inputs.tool_from_camera,
+        poses,
         targets,
     )
     if len(found.offset) == len(targets):
@@ -257,7 +313,7 @@ def _seen(inputs: EffectInputs) -> dict[str, Any]:
 
 def _second_bounces(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor:
     """Return second bounces over the direct light, of a white target, shape (M,), complex."""
-    facts, around, gain = inputs.facts, shape.around(), shape.gain(1.0)
+    facts, around, gain = inputs.facts, shape.around(), shape.gain(shape.strength)
     half_angle, frequency = math.radians(shape.light_half_angle_deg), inputs.known_frequency
     light = torch.zeros_like(inputs.radial_distance, dtype=torch.complex128)
     for number, pose in enumerate(facts.world_from_tool @ inputs.tool_from_camera):
@@ -266,7 +322,7 @@ def _second_bounces(inputs: EffectInputs, shape: MultipathShape, order: int) -> 
         camera = CameraLight(pose, half_angle, order * frequency, gain)
         place = inputs.points_world[own]
         light[own] = bounced(around, camera, place, facing.expand_as(place))
-    return light.masked_fill(light.isnan(), 0.0)
+    return light.masked_fill(light.isnan(), 0.0) / shape.strength
 
 
 def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor:
