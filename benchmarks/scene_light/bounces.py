@@ -91,7 +91,7 @@ def calibrate(seed: int, views: int, light: tuple[float, float, float]) -> Calib
     walls = [frame for name in WALLS for frame in rendered(name, seed, views, light[0])]
     lone = rendered("lone_wall", seed, views, light[0])
     seen = [measured(frame, draw) for frame in walls + lone]
-    fit = fit_gain(bounces, seen, functions)
+    fit = fit_gain(bounces, seen, functions, torch.eye(4).expand(len(seen), 4, 4))
     known = [(own, frame) for own, frame in zip(seen[len(walls) :], lone, strict=True)]
     columns = torch.cat([functions(d.reshape(-1), a.reshape(-1)) for (d, a), _ in known], dim=1)
     off = torch.cat([(d - torch.tensor(f.distance)).reshape(-1) for (d, _), f in known])

@@ -253,6 +253,10 @@ def test_scripted_it_removes_the_same() -> None:
     assert torch.equal(torch.jit.script(found)(*frames), found(*frames))
 
 
+HERE = torch.eye(4).expand(6, 4, 4)
+"""Poses of six frames that no room needs."""
+
+
 def frames_of_walls(generator: Generator) -> list[tuple[Tensor, Tensor]]:
     """Walls beside each other, with second bounces and a base error, at different distances."""
     found, frames = bounces(), []
@@ -271,7 +275,7 @@ def base_error(distance: Tensor, _amplitude: Tensor) -> Tensor:
 
 def test_the_gain_is_found_beside_a_base_error(generator: Generator) -> None:
     found = bounces(gain=GAIN / 2)
-    fit = fit_gain(found, frames_of_walls(generator), base_error)
+    fit = fit_gain(found, frames_of_walls(generator), base_error, HERE)
     low, high = fit.interval
     assert low < fit.gain < high
     # The base error acts on what second bounces have lengthened, and its columns do not: its
@@ -288,7 +292,7 @@ def test_without_second_bounces_no_gain_is_found(generator: Generator) -> None:
         noise = 1e-3 * torch.randn(distance.shape, generator=generator).double()
         frames.append((distance + noise, light))
     with pytest.raises(CalibrationDataError, match="Record walls with"):
-        fit_gain(bounces(), frames, base_error)
+        fit_gain(bounces(), frames, base_error, HERE)
 
 
 def state_with_bounces() -> CalibrationState:

@@ -18,7 +18,7 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.scene_light.bounces import SecondBouncesState
 from tofcorr.scene_light.drawn import Drawing, Drawn, Faces, drawn, train
 from tofcorr.scene_light.remainder import RemainderOptions
-from tofcorr.training.scene import RuntimeOptions, SecondBouncesWanted, learned_remainder
+from tofcorr.training.scene import RuntimeOptions, SecondBouncesWanted, with_remainder
 
 CAMERA = CameraIntrinsics(
     width=32, height=24, matrix=((26.0, 0, 15.5), (0, 26.0, 11.5), (0, 0, 1.0))
@@ -115,13 +115,13 @@ def test_training_keeps_it_only_if_it_helps(
 ) -> None:
     wanted = SecondBouncesWanted(gain=STATE.gain, learned=RemainderOptions(scenes=30, width=2))
     state = state_with_bounces()
-    assert learned_remainder(RuntimeOptions(second_bounces=None), state) is None
+    assert with_remainder(RuntimeOptions(second_bounces=None), state) is state
     with caplog.at_level(logging.INFO):
-        found = learned_remainder(RuntimeOptions(second_bounces=wanted), state)
+        found = with_remainder(RuntimeOptions(second_bounces=wanted), state)
     said = caplog.messages[-1]
-    assert said.endswith("is kept." if found else "is not kept.")
+    assert said.endswith("is kept." if found.remainder else "is not kept.")
     monkeypatch.setattr("tofcorr.scene_light.drawn.train", lambda *_: None)
-    assert learned_remainder(RuntimeOptions(second_bounces=wanted), state) is None  # Untrained.
+    assert with_remainder(RuntimeOptions(second_bounces=wanted), state) is state  # Untrained.
 
 
 def test_the_corrector_holds_it(drawing: Drawing, frames: list[Drawn], tmp_path: Path) -> None:

@@ -13,8 +13,10 @@ from scene_light.test_bounces import (
     CAMERA,
     CORNER,
     FREQUENCY,
+    ROOM,
     STATE,
     bounces,
+    room,
     state_with_bounces,
     walls,
 )
@@ -25,9 +27,15 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import SceneLight
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
+from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.scene_light.flying import FlyingPixelsState
 from tofcorr.scene_light.unremoved import UnremovedBounces
+from tofcorr.training.calibration import TrainingOptions
+
+ARRAYS = "depth", "amplitude", "mask"
 
 
 def unremoved(**changed: object) -> UnremovedBounces:
@@ -112,7 +120,7 @@ def test_beside_flying_pixels_what_is_not_found_counts() -> None:
     assert float(wider[9, 12]) == pytest.approx(1.0, rel=1e-4)
 
 
-def recording_of_walls(folder: Path, generator: Generator) -> Path:
+def recording_of_walls(folder: Path, generator: Generator, *, moves: bool = False) -> Path:
     """A recording of walls with a second one beside each, which sends them light."""
     images, rows = [], []
     for k in range(12):
@@ -123,12 +131,15 @@ def recording_of_walls(folder: Path, generator: Generator) -> Path:
         noise = 1e-3 * torch.randn(lit.shape, generator=generator).double()
         mask = (direct[0] - walls(wall)[0]).abs() < 1e-9
         images.append((lit + 0.01 * lit + noise, light, mask))
+        twist = torch.randn(6, generator=generator).double() * (0.5 if moves else 0.0)
+        pose = se3.exp(twist)
+        normal = pose[:3, :3] @ torch.tensor(wall[0]).double()
         rows.append(
             FrameRow(
-                timestamp=0.1 * k,
-                world_from_tool=np.eye(4),
-                normal_world=np.array(wall[0]),
-                offset=wall[1],
+                timestamp=float(k),
+                world_from_tool=pose.numpy(),
+                normal_world=normal.numpy(),
+                offset=wall[1] - float(normal @ pose[:3, 3]),
                 target="white",
                 pose_id=k,
             )
@@ -148,19 +159,67 @@ def recording_of_walls(folder: Path, generator: Generator) -> Path:
     return folder
 
 
+CONFIG = {
+    "name": "line",
+    "model": {"terms": [{"kind": "distance_polynomial", "degree": 1}]},
+    "runtime": {"second_bounces": {"gain": STATE.gain, "patch_px": 2}},
+    "split": {"test_fraction": 0.0},
+    "figures": False,
+    "advice": 0,
+}
+
+
 def test_the_base_error_is_fitted_without_second_bounces(
     tmp_path: Path, generator: Generator
 ) -> None:
     recording = recording_of_walls(tmp_path / "walls", generator)
-    config = {
-        "name": "line",
-        "model": {"terms": [{"kind": "distance_polynomial", "degree": 1}]},
-        "runtime": {"second_bounces": {"gain": STATE.gain, "patch_px": 2}},
-        "figures": False,
-        "advice": 0,
-    }
     lone, light = (image.float() for image in walls(((0.0, 0.0, -1.0), 1.4)))
-    run = tofcorr.train(recording, config, force=True)
+    run = tofcorr.train(recording, CONFIG, force=True)
     found, _ = run.corrector()(1.01 * lone, light)
     # Fitted with second bounces in the frames, the base error is off by centimetres.
     assert float((found - lone).abs().mean()) < 1.5e-3
+
+
+def test_a_live_calibration_is_fitted_without_second_bounces_too(
+    tmp_path: Path, generator: Generator
+) -> None:
+    folder = recording_of_walls(tmp_path / "walls", generator, moves=True)
+    recording = tofcorr.Recording.open(folder)
+    options = resolve_options(TrainingOptions, CONFIG, ["runtime.second_bounces.learned={}"])
+    live = tofcorr.LiveCalibration(recording, options, folder=tmp_path / "live")
+    for k in range(recording.num_frames):
+        depth, light, mask = (recording.read(n, np.array([k])) for n in ARRAYS)
+        assert depth is not None
+        assert light is not None
+        assert mask is not None
+        row = recording.frames.row(k)
+        live.add_frame(row, depth[0], light[0], mask[0], plane_is_known=True)
+    trained = tofcorr.train(recording, CONFIG, force=True)
+    resumed = tofcorr.LiveCalibration.resume(tmp_path / "live")
+    for one in (live, resumed):
+        found = one.state()
+        torch.testing.assert_close(found.coefficients, trained._state.coefficients)
+        assert found.scene == trained._state.scene
+        assert found.remainder is None  # A state is asked for often: its network comes last.
+
+
+def test_the_room_of_a_world_is_there_when_frames_are_freed_of_its_light(
+    tmp_path: Path, generator: Generator
+) -> None:
+    data = Dataset((tofcorr.Recording.open(recording_of_walls(tmp_path / "walls", generator)),))
+    poses = torch.eye(4).double().repeat(data.num_frames, 1, 1)
+    poses[:, 0, 3] = torch.linspace(0.0, 0.1, data.num_frames)
+    data = data.with_columns(world_from_tool=poses.numpy())
+    scene = {"second_bounces": STATE.to_mapping() | {"room": ROOM, "room_in_image": False}}
+    changed = {"scene": SceneLight.model_validate(scene), "tool_from_camera": torch.eye(4).double()}
+    state = state_with_bounces().model_copy(update=changed)
+    direct = next(data.without_second_bounces(state).batches([0, 11])).radial_distance
+    own = room(room_in_image=False, continued=True)
+    plain = DepthCorrector.from_state(state.model_copy(update={"scene": SceneLight()}))
+    batch = next(data.batches([0, 11]))
+    for k, frame in enumerate((0, 11)):
+        radial, light = batch.radial_distance[k].float(), batch.amplitude[k].float()
+        corrected = plain(radial / plain.radial_of_z, light)[0] * plain.radial_of_z
+        own.room.set_pose(poses[frame])
+        off = corrected - own.float()(corrected, light)
+        torch.testing.assert_close(radial - direct[k].float(), off, rtol=0.1, atol=1e-3)

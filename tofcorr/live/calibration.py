@@ -1,8 +1,9 @@
 """`tofcorr.LiveCalibration`: a calibration that grows frame by frame.
 
 A frame is kept as its moments, which hold all that the loss needs, and a lattice of its pixels,
-which gives the ranges and the noise: some 10 and 64 kB in place of 2.5 MB of a VGA image. A linear
-map takes moments to other ranges. So the finished calibration is that of `tofcorr.train` on the
+which gives the ranges and the noise: some 10 and 64 kB in place of 2.5 MB of a VGA image. Flying
+pixels and second bounces are found in whole images: these are then kept as well. A linear map takes
+moments to other ranges. So the finished calibration is that of `tofcorr.train` on the
 same frames, in any order.
 
 What `add` returns is a quick fit of the moments alone (`fit.fitting.fit_of_moments`), on ranges
@@ -72,7 +73,7 @@ from tofcorr.live.frames import (
     wider,
 )
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, thread_number
+from tofcorr.pixels.dataset import Dataset, SplitOptions, thread_number
 from tofcorr.pixels.lattice import (
     condition_ranges,
     covered_domain,
@@ -89,8 +90,9 @@ from tofcorr.training.advice import (
     draw_pool,
     predicted_precision,
 )
-from tofcorr.training.calibration import TrainingOptions
-from tofcorr.training.run import Config, calibration_state
+from tofcorr.training.calibration import Calibration, TrainingOptions
+from tofcorr.training.run import Config, calibration_of, calibration_state
+from tofcorr.training.scene import with_remainder
 
 _START = "tofcorr-live"
 START_FILE = "live.pt"
@@ -212,7 +214,8 @@ class LiveCalibration:
         self.camera = self._like.camera
         self._domain = domain_of_views(self.camera, Workspace(nearest=1.0, farthest=2.0))
         self.options = suitable(resolve_options(TrainingOptions, config), self._domain)
-        self._terms = of_images(self.options.model)
+        runtime, self._terms = self.options.runtime, of_images(self.options.model)
+        self._keeps_images = runtime.flying_pixels is not None or runtime.second_bounces is not None
         model = ErrorModel(self._terms, self._domain)
         design = Design(model, self._domain, ray_directions(self.camera))
         self._accumulator = MomentAccumulator(design)
@@ -455,19 +458,37 @@ class LiveCalibration:
         Raises:
             CalibrationDataError: The frames do not determine it.
         """
+        return self._finished()[1]
+
+    def _finished(self) -> tuple[Dataset, Fit]:
+        """Return the frames, with their images if these were kept, and their calibration."""
         order = self._order()
         dataset, frames = self._dataset(order, found=False), np.arange(len(order))
         every = [one.thinned(most_pixels(len(order))) for one in self._kept(order)]
+        if self._keeps_images:
+            images = {k: np.concatenate([x.images[k] for x in every]) for k in every[0].images}
+            data = Dataset((replace(dataset.first, **images),))
+            data = data.without_stray_light(self.options.runtime.stray_light)
+            data = usable_pixels(data, self.options, robust=False)
+            all_of_them = {"split": SplitOptions(test_fraction=0.0)}
+            options = self.options.model_copy(update=all_of_them)
+            trained = calibration_of(data, options, Calibration)
+            return trained.data, trained.fit
         lattice = joined([one.lattice for one in every])
         moments = _seen(every, dataset, frames)
         domain = covered_domain(dataset, frames, lattice)
         change = columns_on(self._terms, domain, self._domain)
         moments = replace(moments, gram=mapped(moments.gram, change))
-        return fit(dataset, frames, self.options, domain, moments=moments, lattice=lattice)
+        found = fit(dataset, frames, self.options, domain, moments=moments, lattice=lattice)
+        return dataset, found
 
     def state(self) -> CalibrationState:
-        """Return the calibration as the numbers that a corrector is built from."""
-        return calibration_state(self._dataset(self._order()), self.options, self.result())
+        """Return the calibration as the numbers that a corrector is built from.
+
+        Without a network of what second bounces leave (`learned`): `save` trains it.
+        """
+        data, found = self._finished()
+        return calibration_state(data, self.options, found, learned=False)
 
     def save(self, folder: Path | str) -> None:
         """Write `state.pt` and `corrector.ts` into a new folder, whole or not at all.
@@ -476,7 +497,7 @@ class LiveCalibration:
             CalibrationDataError: The frames do not determine the calibration, or the folder cannot
                 be written.
         """
-        state = self.state()
+        state = with_remainder(self.options.runtime, self.state())
         with staged_folder(folder) as staged:
             save_calibration(staged / STATE_FILE, state)
             export_torchscript(DepthCorrector.from_state(state), staged / "corrector.ts", state)
@@ -503,7 +524,8 @@ class LiveCalibration:
         known: Any = None if images["amplitude"] is None else True  # The image itself is not kept.
         self._like = replace(self._like, planes=planes, amplitude=known)
         own = replace(self._like, frames=FrameTable.of([row]), **images)
-        data = usable_pixels(Dataset((own,)), self.options, robust=False)
+        data = Dataset((own,)).without_stray_light(self.options.runtime.stray_light)
+        data = usable_pixels(data, self.options, robust=False)
         # Radial distances were recorded in float32, which holds them without loss.
         exact = self._like.depth_kind == "radial" and data.exclude is None
         dtype = torch.float32 if exact else torch.float64
@@ -515,7 +537,10 @@ class LiveCalibration:
         moments = self._accumulator(batch)
         if planes == "estimated":
             row = self._on_its_wall(row, moments)
-        return row, Sums(self._domain, moments, lattice)
+        if images["mask"] is None:
+            images = images | {"mask": np.ones_like(images["depth"], np.uint8)}
+        kept = {k: v for k, v in images.items() if v is not None and self._keeps_images}
+        return row, Sums(self._domain, moments, lattice, kept)
 
     def _widen(self, domain: Domain) -> None:
         """Let the ranges of all frames hold others."""

@@ -1,7 +1,8 @@
 """What a live calibration keeps of a frame, in memory and on disk, and on which ranges."""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,11 +31,14 @@ class Sums:
         domain: The ranges that scale the columns of its moments.
         moments: Of its pixels; their plane is nobody's.
         lattice: Some of its pixels.
+        images: The images (1, H, W) by name, where what a corrector finds in whole images is
+            looked for; else none.
     """
 
     domain: Domain
     moments: ImageMoments
     lattice: Lattice
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def on(self, domain: Domain, terms: ErrorModelOptions) -> "Sums":
         """Return the same on other ranges, for some terms."""
@@ -179,6 +183,7 @@ def values_of_frame(row: FrameRow, sums: Sums) -> dict[str, Any]:
         if value is not None
     }
     pixels = {"moments": vars(sums.moments), "lattice": vars(sums.lattice)}
+    pixels["images"] = {name: torch.from_numpy(image) for name, image in sums.images.items()}
     return {"row": cells, "domain": _DOMAIN.dump_python(sums.domain, mode="json"), **pixels}
 
 
@@ -186,4 +191,5 @@ def frame_of(values: dict[str, Any]) -> tuple[FrameRow, Sums]:
     """Return the frame that `values_of_frame` wrote."""
     row = {k: v.numpy() if isinstance(v, Tensor) else v for k, v in values["row"].items()}
     pixels = ImageMoments(**values["moments"]), Lattice(**values["lattice"])
-    return FrameRow(**row), Sums(_DOMAIN.validate_python(values["domain"]), *pixels)
+    images = {name: image.numpy() for name, image in values.get("images", {}).items()}
+    return FrameRow(**row), Sums(_DOMAIN.validate_python(values["domain"]), *pixels, images)

@@ -121,7 +121,8 @@ class Dataset:
     def without_second_bounces(self, state: CalibrationState) -> "Dataset":
         """Return the data set without the second bounces that a calibration removes, if it does."""
         removes = state.scene.second_bounces is not None
-        return replace(self, direct=DirectDistance(state)) if removes else self
+        poses = self.column("world_from_tool")
+        return replace(self, direct=DirectDistance(state, poses)) if removes else self
 
     def require(self, name: str, needed_by: str) -> None:
         """Refuse a recording without an array, a column or a header entry, naming it.

@@ -17,9 +17,11 @@ class DirectDistance:
 
     Args:
         state: The calibration, with second bounces.
+        poses: World from tool, one of each frame of the data set (N, 4, 4).
     """
 
-    def __init__(self, state: CalibrationState) -> None:
+    def __init__(self, state: CalibrationState, poses: Tensor) -> None:
+        self._poses = poses @ state.tool_from_camera.cpu()
         plain = state.model_copy(update={"scene": SceneLight()})
         self._correct, self._bounces = DepthCorrector.from_state(plain), state.second_bounces()
         self._taken: dict[int, Tensor] = {}
@@ -32,13 +34,15 @@ class DirectDistance:
             batch.indices.tolist(), batch.radial_distance, batch.amplitude, strict=True
         ):
             if frame not in self._taken:
-                self._taken[frame] = self._off(*(image.float().cpu() for image in images)).half()
+                own = (image.float().cpu() for image in images)
+                self._taken[frame] = self._off(self._poses[frame], *own).half()
         taken = torch.stack([self._taken[frame] for frame in batch.indices.tolist()])
         return batch.radial_distance - taken.to(batch.radial_distance)
 
-    def _off(self, radial: Tensor, light: Tensor) -> Tensor:
+    def _off(self, pose: Tensor, radial: Tensor, light: Tensor) -> Tensor:
         """Return what is taken off one frame (H, W), metres; 0 without a return."""
         assert self._bounces is not None
+        self._bounces.room.set_pose(pose)
         corrected = self._corrected(radial, light)
         direct = self._bounces(corrected, light)
         without = radial - corrected + direct

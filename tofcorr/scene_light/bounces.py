@@ -26,7 +26,7 @@ from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.options import FiniteNumber, NonNegativeNumber, Number, Options, PositiveNumber
 from tofcorr.scene_light.planes import OFF_PLANE, STEEPEST, WIDE_PLANE, CellPlanes
 from tofcorr.scene_light.remainder import Remainder
-from tofcorr.scene_light.room import Face, Room
+from tofcorr.scene_light.room import Faces, Room
 
 _PATCHES = (32, 24)
 """Columns and rows of patches at most, if no size is given. Asked for: 768 of a frame of 4:3."""
@@ -43,8 +43,8 @@ class SecondBouncesOptions(Options):
         light_half_angle_deg: How far off the optical axis light reaches; None: to the image's
             corners.
         continued: Whether planes at the border of the image go on beyond it.
-        room: What stands around and does not move. Beyond the image it is taken where it is met, in
-            place of planes that go on.
+        room: What stands around and does not move: faces, or a `MeshFile`. Beyond the image it is
+            taken where it is met, in place of planes that go on.
         room_in_image: Whether its planes are taken in the image too, wherever nothing stands
             before it: those that a frame shows are bent by second bounces.
         room_axes: Of the corners: the world in which poses are stated, or the camera's. The room of
@@ -55,7 +55,7 @@ class SecondBouncesOptions(Options):
     light_m: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     light_half_angle_deg: Annotated[FiniteNumber, Field(gt=0, le=80)] | None = None
     continued: bool = True
-    room: tuple[Face, ...] = ()
+    room: Faces = ()
     room_in_image: bool = True
     room_axes: Literal["world", "camera"] = "world"
 

@@ -20,6 +20,8 @@ from torch import Tensor
 from tofcorr.errors import CalibrationDataError
 from tofcorr.scene_light.bounces import SecondBounces
 
+Frames = Iterable[tuple[Tensor, Tensor]]
+"""Distances along the ray, metres, and amplitudes, (H, W) each."""
 Functions = Callable[[Tensor, Tensor], Tensor]
 """Of distances (N,), metres, and amplitudes (N,): the base error's functions (K, N)."""
 
@@ -50,27 +52,28 @@ class GainFit(NamedTuple):
 
 @torch.no_grad()
 def fit_gain(
-    bounces: SecondBounces, frames: Iterable[tuple[Tensor, Tensor]], functions: Functions
+    bounces: SecondBounces, frames: Frames, functions: Functions, poses: Tensor
 ) -> GainFit:
     """Fit the gain to frames of planes that light each other.
 
     Args:
         bounces: Camera, frequencies and light; its gain is where the search starts.
-        frames: Distances along the ray, metres, and amplitudes, (H, W) each.
+        frames: That show planes.
         functions: Of the base error that is to be fitted as well.
+        poses: World from camera, one of each frame (B, 4, 4), for a room that stands there.
 
     Raises:
         CalibrationDataError: There are too few planes, or no second bounces bend them.
     """
     from scipy.special import stdtrit  # Slow to import.
 
-    cells = [bounces.cells(radial, amplitude) for radial, amplitude in frames]
+    seen = [(pose, *bounces.cells(*one)) for one, pose in zip(frames, poses, strict=True)]
     started = bounces.gain
     try:
-        found, inverse, parts = _solved(bounces, cells, functions)
+        found, inverse, parts = _solved(bounces, seen, functions)
         for _ in range(_STEPS - 1):
             bounces.gain = max(float(found[-1]), 0.1 * bounces.gain)  # A step may overshoot.
-            found, inverse, parts = _solved(bounces, cells, functions)
+            found, inverse, parts = _solved(bounces, seen, functions)
     finally:
         bounces.gain = started
     unknowns, scores = len(found), torch.stack([x.T @ (y - x @ found) for x, y in parts])
@@ -87,10 +90,10 @@ def fit_gain(
 
 
 def _solved(
-    bounces: SecondBounces, cells: list[tuple[Tensor, Tensor]], functions: Functions
+    bounces: SecondBounces, seen: list[tuple[Tensor, Tensor, Tensor]], functions: Functions
 ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
     """Return coefficients and gain (K + 1,), the inverse normal matrix, and every plane's part."""
-    parts = [part for cell in cells for part in _columns(bounces, *cell, functions)]
+    parts = [part for frame in seen for part in _columns(bounces, *frame, functions)]
     unknowns = parts[0][0].shape[1] if parts else 1
     if len(parts) <= unknowns:
         raise CalibrationDataError(
@@ -103,9 +106,10 @@ def _solved(
 
 
 def _columns(
-    bounces: SecondBounces, radial: Tensor, amplitude: Tensor, functions: Functions
+    bounces: SecondBounces, pose: Tensor, radial: Tensor, amplitude: Tensor, functions: Functions
 ) -> list[tuple[Tensor, Tensor]]:
     """Return columns (M, K + 1) and values (M,) of every plane, free of what moves the plane."""
+    bounces.room.set_pose(pose)
     shift, planes, large = bounces.found(radial, amplitude)
     usable = large & shift.isfinite() & radial.isfinite()
     if not usable.any():

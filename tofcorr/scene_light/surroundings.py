@@ -92,30 +92,44 @@ def surroundings_of(
     seen = (distance > 0) & distance.isfinite()
     ray, origin = ray[seen], origin[seen]
     distance, amplitude = distance[seen].double(), amplitude[seen].double()
-    place, generator = origin + ray * distance[:, None], torch.Generator().manual_seed(0)
-
-    def near(planes: Tensor) -> Tensor:
-        """Return by which share of its distance each point misses planes (J, 4), (N, J)."""
-        return (place @ planes[:, :3].T - planes[:, 3]).abs() / distance[:, None]
-
-    planes, few = known, _LEAST * len(place) + 3
-    free = (near(known) > _OFF_PLANE).all(1)
-    while free.sum() > few:
-        plane = _largest_plane(place[free], distance[free], generator)[None]
-        own = free & (near(plane)[:, 0] < _OFF_PLANE)
-        if own.sum() < few:
-            break
-        free = free & ~own
-        through = (plane[:, 3] - origin @ plane[0, :3]) / (ray @ plane[0, :3])
-        if ((through > 0) & (through < (1 - 2 * _OFF_PLANE) * distance)).sum() <= few:
-            planes = torch.cat([planes, plane])
+    place = origin + ray * distance[:, None]
+    found = large_planes(place, distance, known)
+    through = (found[:, 3] - origin @ found[:, :3].T) / (ray @ found[:, :3].T)
+    hidden = (through > 0) & (through < (1 - 2 * _OFF_PLANE) * distance[:, None])
+    planes = torch.cat([known, found[hidden.sum(0) <= _LEAST * len(place) + 3]])
     if not len(planes):
         return Surroundings(planes[:, :3], planes[:, 3], planes[:, 3])
-    missed, own = near(planes).min(1)
+    own = nearest_plane(place, distance, planes)
     bright = amplitude * distance.square() / (ray * planes[own, :3]).sum(1).abs()
-    bright = torch.where(missed < _OFF_PLANE, bright, math.nan)
     each = [bright[own == number].nanmedian() for number in range(len(planes))]
     return Surroundings(planes[:, :3], planes[:, 3], torch.stack(each).nan_to_num(0.0))
+
+
+def large_planes(place: Tensor, distance: Tensor, known: Tensor) -> Tensor:
+    """Return normal and offset (K, 4) of further large planes through points, largest first.
+
+    Args:
+        place: The points (N, 3), metres.
+        distance: Of each from where it was seen (N,), metres.
+        known: Planes that are known (J, 4).
+    """
+    planes, generator = known[:0], torch.Generator().manual_seed(0)
+    free = nearest_plane(place, distance, known) < 0
+    while free.sum() > (few := _LEAST * len(place) + 3):
+        plane = _largest_plane(place[free], distance[free], generator)[None]
+        own = free & (nearest_plane(place, distance, plane) == 0)
+        if own.sum() < few:
+            break
+        planes, free = torch.cat([planes, plane]), free & ~own
+    return planes
+
+
+def nearest_plane(place: Tensor, distance: Tensor, planes: Tensor) -> Tensor:
+    """Return which of planes (K, 4) each point is on (N,), the nearest; -1: on none."""
+    off = (place @ planes[:, :3].T - planes[:, 3]).abs() / distance[:, None]
+    off = torch.nn.functional.pad(off, (0, 1), value=_OFF_PLANE)
+    own = off.argmin(1)
+    return torch.where(own < len(planes), own, -1)
 
 
 def _largest_plane(place: Tensor, distance: Tensor, generator: torch.Generator) -> Tensor:
@@ -125,10 +139,14 @@ def _largest_plane(place: Tensor, distance: Tensor, generator: torch.Generator) 
     normal = torch.nn.functional.normalize(normal, dim=1)
     missed = (place @ normal.T - (normal * three[:, 0]).sum(1)).abs() / distance[:, None]
     near = (missed < _OFF_PLANE) & (normal.norm(dim=1) > 0.5)  # Three points on a line have none.
-    own = near[:, near.sum(0).argmax()]
-    middle = place[own].mean(0)
-    normal = torch.linalg.svd(place[own] - middle, full_matrices=False).Vh[2]
-    return torch.cat([normal, (normal @ middle)[None]])
+    own, plane = near[:, near.sum(0).argmax()], normal[0]
+    for _ in range(2):
+        middle = place[own].mean(0)
+        plane = torch.linalg.svd(place[own] - middle, full_matrices=False).Vh[2]
+        missed = ((place - middle) @ plane).abs() / distance
+        # Points of another plane beside this one would turn it.
+        own = own & (missed <= 3 * missed[own].median())
+    return torch.cat([plane, (plane @ middle)[None]])
 
 
 def bounced(

@@ -193,6 +193,10 @@ def rig(
                 found = dict(zip(names, joint.together.offsets.tolist(), strict=True))
                 robot = corrected_description(urdf, arm, found)
             report = _report(joint, cameras)
+            if options.runtime.second_bounces is not None:
+                said = "Warning: second bounces were in the frames of this fit, though correctors "
+                said += "remove them; `tofcorr train` fits one camera's error without them."
+                report["warnings"].insert(0, said)
             result = RigResult(report=report, cameras=cameras, fit=joint, robot=robot)
         if out is not None:
             with stage("write"):

@@ -56,9 +56,9 @@ from tofcorr.training.pool import CameraType, load_type
 from tofcorr.training.report import calibration_mapping, hand_eye_accuracy, training_report
 from tofcorr.training.scene import (
     RuntimeOptions,
-    learned_remainder,
     scene_light,
     scene_summary,
+    with_remainder,
 )
 
 if TYPE_CHECKING:
@@ -67,8 +67,17 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 
-def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> CalibrationState:
-    """Return the calibration as the numbers that a corrector is built from."""
+def calibration_state(
+    data: Dataset, options: TrainingOptions, fit: Fit, *, learned: bool = True
+) -> CalibrationState:
+    """Return the calibration as the numbers that a corrector is built from.
+
+    Args:
+        data: The recordings.
+        options: Of the training.
+        fit: The fit.
+        learned: Whether a network of what second bounces leave is trained, if options ask for it.
+    """
     recording, parameters = data.first, fit.solution.parameters
     state = CalibrationState.of(
         fit.model.error,
@@ -88,7 +97,7 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
         residual_variance=fit.residual_variance,
     )
     state = state.model_copy(update={"scene": scene_light(data, options.runtime, state)})
-    return state.model_copy(update={"remainder": learned_remainder(options.runtime, state)})
+    return with_remainder(options.runtime, state) if learned else state
 
 
 def calibration_of(
@@ -111,10 +120,11 @@ def calibration_of(
     wanted = options.runtime.second_bounces
     if wanted is None:
         return found
-    # A network of what their removal leaves is trained once, with the last fit.
-    plain = {"second_bounces": wanted.model_copy(update={"learned": None})}
+    # How fast the corrector is does not matter yet.
+    plain = {"second_bounces": wanted.model_copy(update={"budget_ms": None})}
     plain = {"runtime": options.runtime.model_copy(update=plain)}
-    state = calibration_state(found.data, options.model_copy(update=plain), found.fit)
+    plain = options.model_copy(update=plain)
+    state = calibration_state(found.data, plain, found.fit, learned=False)
     direct = data.without_second_bounces(state)
     return fitted(direct, options, resumed=found.fit.solution.parameters)
 

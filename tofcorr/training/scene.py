@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.torchscript import scripted
 from tofcorr.correction.state import CalibrationState, RemainderState, SceneLight
 from tofcorr.data.recording import valid_pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import fit_noise
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
 from tofcorr.options import Options, PositiveNumber
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, thread_number
 from tofcorr.pixels.passes import FittedModel, held_out_errors
 from tofcorr.pixels.sample import thinned
 from tofcorr.scene_light.bounces import (
@@ -35,14 +36,15 @@ from tofcorr.scene_light.flying import (
     FlyingPixelsState,
     squared_spreads,
 )
-from tofcorr.scene_light.gain import fit_gain
+from tofcorr.scene_light.gain import Frames, fit_gain
 from tofcorr.scene_light.remainder import RemainderOptions
 from tofcorr.scene_light.room import Face
 from tofcorr.scene_light.stray import StrayLightState
+from tofcorr.scene_light.surroundings import large_planes, nearest_plane
 
 _LOG = logging.getLogger(__name__)
 
-Frames = Callable[[], tuple[Tensor, Tensor]]
+ReadFrames = Callable[[], tuple[Tensor, Tensor]]
 """Reads depth, corrected, and amplitude of some frames (B, H, W)."""
 
 _FRAMES = 24
@@ -57,8 +59,8 @@ class SecondBouncesWanted(SecondBouncesOptions):
         frequencies_hz: Modulation frequencies; null: that of the recording.
         gain: One over pi times the amplitude of white paper at 1 m; null: found from the curvature
             that second bounces give to walls.
-        budget_ms: Time of a frame on this machine, the median: patches are made larger until a
-            frame keeps to it.
+        budget_ms: Time of a frame on one thread of this machine, the median: patches are made
+            larger until a frame keeps to it.
         recorded_room: The room is the large planes of the recordings, put together in the world by
             their poses. It is used beyond the image: they are as bent as those of any frame.
         learned: Train a network on drawn scenes for what the removal leaves, and keep it if it
@@ -107,14 +109,12 @@ def scene_light(data: Dataset, options: RuntimeOptions, state: CalibrationState)
 
 
 def _second_bounces(
-    data: Dataset, wanted: SecondBouncesWanted, state: CalibrationState, frames: Frames
+    data: Dataset, wanted: SecondBouncesWanted, state: CalibrationState, frames: ReadFrames
 ) -> SecondBouncesState:
     """Return what removing second bounces takes, with the gain found where none is given."""
     data.require("amplitude", "removing second bounces (runtime.second_bounces)")
-    frequency, values = data.first.modulation_frequency, wanted.to_mapping()
-    for name in ("learned", "budget_ms", "recorded_room"):
-        del values[name]
-    recorded = wanted.recorded_room
+    frequency, recorded = data.first.modulation_frequency, wanted.recorded_room
+    values = wanted.model_dump(mode="json", exclude={"learned", "budget_ms", "recorded_room"})
     if recorded:
         values |= {"room": (), "room_axes": "world", "room_in_image": False}
     if wanted.frequencies_hz is None and frequency is None:
@@ -129,19 +129,20 @@ def _second_bounces(
         values["patch_px"] = patch_within(wanted.budget_ms, values, state, depths, amplitudes)
     radial = depths * DepthCorrector.from_state(state).radial_of_z
     pairs = list(zip(radial, amplitudes, strict=True))
+    poses = data.column("world_from_tool")[thinned(np.arange(data.num_frames), _FRAMES)]
+    poses = poses @ state.tool_from_camera.cpu()
     if wanted.gain is None:
-        values |= _fitted_gain(pairs, values, state)
+        values |= _fitted_gain(pairs, poses, values, state)
     if recorded:
         bounces = SecondBounces(state.camera, SecondBouncesState.model_validate(values))
-        poses = data.column("world_from_tool")[thinned(np.arange(data.num_frames), _FRAMES)]
-        values["room"] = recorded_room(bounces, pairs, poses @ state.tool_from_camera.cpu())
+        values["room"] = recorded_room(bounces, pairs, poses)
     return SecondBouncesState.model_validate(values)
 
 
 def _fitted_gain(
-    frames: list[tuple[Tensor, Tensor]], values: dict[str, Any], state: CalibrationState
+    frames: Frames, poses: Tensor, values: dict[str, Any], state: CalibrationState
 ) -> dict[str, Any]:
-    """Return the gain that is fitted to frames, and its interval."""
+    """Return the gain that is fitted to frames of some poses, and its interval."""
     # Half white, seen straight on, to begin with.
     bright = torch.cat([(d.square() * a).flatten() for d, a in frames]).nanmedian()
     start = values | {"gain": 1 / (2 * math.pi * float(bright))}
@@ -152,96 +153,77 @@ def _fitted_gain(
         found = [distance[None], *(term.basis(distance, amplitude) for term in terms)]  # type: ignore[operator]
         return torch.cat(found)
 
-    fit = fit_gain(bounces, frames, functions)
+    fit = fit_gain(bounces, frames, functions, poses)
     return {"gain": fit.gain, "gain_interval": fit.interval}
 
 
 def patch_within(
     budget_ms: float, values: dict[str, Any], state: CalibrationState, depth: Tensor, light: Tensor
 ) -> int:
-    """Return the smallest side of a patch, from the usual one on, that keeps to a time a frame."""
+    """Return the smallest side of a patch, from the usual one on, that keeps to a time a frame.
+
+    It is what one thread computes: what else the machine does counts for nothing.
+    """
     options, camera = SecondBouncesState.model_validate(values), state.camera
     patch = options.patch_px or 2 * SecondBounces(camera, options).cell
-    taken = [math.inf]
-    while patch <= max(camera.width, camera.height):
+
+    def usual() -> float:
+        """Return the time of a frame, ms, the median."""
         tried = SceneLight(second_bounces=options.model_copy(update={"patch_px": patch}))
-        corrector = DepthCorrector.from_state(state.model_copy(update={"scene": tried}))
-        taken = []
-        for frame in depth.float().split(1)[:5]:
-            begun = time.perf_counter()
-            with torch.no_grad():
-                corrector(frame, light[:1].float())
-            taken.append(1000 * (time.perf_counter() - begun))
-        usual = float(np.median(taken))
-        if usual <= budget_ms:
-            said = "Removing second bounces: %.0f ms a frame (median), patches of %d pixels."
-            _LOG.info(said, usual, patch)
-            return patch
-        # Time goes with the square of the number of patches, at most.
-        patch = max(patch + 2, 2 * int(patch * (usual / budget_ms) ** (1 / 4) / 2))
-    raise CalibrationDataError(
-        f"Second bounces cannot be removed in {budget_ms:g} ms (runtime.second_bounces.budget_ms): "
-        f"the largest patches take {np.median(taken):.0f} ms."
-    )
+        corrector = scripted(DepthCorrector.from_state(state.model_copy(update={"scene": tried})))
+        ends = [time.thread_time()]
+        for frame in zip(depth.float()[:7], light.float()[:7], strict=True):
+            corrector(*frame)
+            ends.append(time.thread_time())
+        return 1000 * float(np.median(np.diff(ends)))
+
+    with torch.no_grad(), thread_number(1):
+        while (taken := usual()) > budget_ms:
+            if patch > max(camera.width, camera.height):
+                said = f"{budget_ms:g} ms (runtime.second_bounces.budget_ms): the largest patches"
+                said = f"Second bounces cannot be removed in {said} take {taken:.0f} ms."
+                raise CalibrationDataError(said)
+            # Time goes with the square of the number of patches, at most.
+            patch = max(patch + 2, 2 * int(patch * (taken / budget_ms) ** (1 / 4) / 2))
+    said = "Removing second bounces: %.0f ms a frame (median), patches of %d pixels."
+    _LOG.info(said, taken, patch)
+    return patch
 
 
-def recorded_room(
-    bounces: SecondBounces, frames: Iterable[tuple[Tensor, Tensor]], poses: Tensor
-) -> tuple[Face, ...]:
+def recorded_room(bounces: SecondBounces, frames: Frames, poses: Tensor) -> tuple[Face, ...]:
     """Put the large planes of frames together in the world.
 
     Args:
         bounces: What finds them.
-        frames: Distances along the ray, metres, and amplitudes, (H, W) each.
+        frames: That show them.
         poses: World from camera, one of each frame (B, 4, 4).
     """
-    ray, found = bounces.cell_rays.double(), list[list[tuple[Tensor, Tensor, Tensor]]]()
-    wide, alike = bounces.constants[2:4]
+    ray, parts = bounces.cell_rays.double(), list[tuple[Tensor, Tensor, Tensor]]()
     for (distance, amplitude), pose in zip(frames, poses, strict=True):
         cells = bounces.cells(distance, amplitude)
         _, planes, large = bounces.found(*cells)
-        place, normal, away, cosine, _ = bounces.surfaces(planes, ray, bounces.solid)
+        place, _, away, cosine, _ = bounces.surfaces(planes, ray, bounces.solid)
         white = math.pi * bounces.gain * cells[1] * away.square() / cosine
-        place, normal = pose[:3, :3] @ place + pose[:3, 3:], pose[:3, :3] @ normal
-        for plane in planes[:, large].unique(dim=1).T:
-            own = large & (planes == plane[:, None]).all(0)
-            part = (place[:, own], normal[:, own].mean(1), white[own])
-            for others in found:
-                off = (part[0].mean(1) - others[0][0].mean(1)) @ others[0][1]
-                if part[1] @ others[0][1] > alike and abs(off) < wide * away[own].mean():
-                    others.append(part)
-                    break
-            else:
-                found.append([part])
-    return tuple(_face(parts) for parts in found)
+        place = place.T @ pose[:3, :3].T + pose[:3, 3]
+        parts.append((place[large], away[large], white[large]))
+    place, away, white = (torch.cat(each) for each in zip(*parts, strict=True))
+    found = large_planes(place, away, place.new_zeros(0, 4))
+    each = [nearest_plane(place, away, found) == number for number in range(len(found))]
+    return tuple(Face.around(place[on], min(float(white[on].median()), 1))[0] for on in each)
 
 
-def _face(parts: list[tuple[Tensor, Tensor, Tensor]]) -> Face:
-    """Return the hull of points on one plane (3, N), with their median reflectivity (N,)."""
-    from scipy.spatial import ConvexHull  # Slow to import.
+def with_remainder(options: RuntimeOptions, state: CalibrationState) -> CalibrationState:
+    """Return a calibration with a network for what the removal of second bounces leaves.
 
-    points, white = (torch.cat([part[k] for part in parts], dim=-1) for k in (0, 2))
-    middle = points.mean(1, keepdim=True)
-    axes = torch.linalg.svd(points - middle, full_matrices=False).U[:, :2]
-    flat = axes.T @ (points - middle)
-    hull = flat[:, ConvexHull(flat.T.numpy()).vertices.copy()]
-    corners = (middle + axes @ hull).T.tolist()
-    return Face.model_validate({"corners": corners, "reflectivity": min(float(white.median()), 1)})
-
-
-def learned_remainder(options: RuntimeOptions, state: CalibrationState) -> RemainderState | None:
-    """Train a network for what the removal of second bounces leaves.
-
-    Returns:
-        None: It was not asked for, or does not help on scenes held out.
+    Without one where it was not asked for, or does not help on scenes held out.
     """
     wanted, bounces = options.second_bounces, state.scene.second_bounces
     if wanted is None or wanted.learned is None or bounces is None:
-        return None
+        return state
     noise, learned = state.noise or (0.0, 0.0, 0.0), wanted.learned
     _LOG.info("Drawing %d scenes to learn what second bounces leave.", learned.scenes)
-    network, found = fit_remainder(state.camera, bounces, noise, learned)
-    left = [round(each, 2) for each in found]
+    network, errors = fit_remainder(state.camera, bounces, noise, learned)
+    left = [round(each, 2) for each in errors]
     helps = left[1] < left[0] and left[3] < left[2]
     _LOG.warning(  # Shown by the commands.
         "Second bounces leave %g mm on scenes held out, with the network %g; "
@@ -249,11 +231,12 @@ def learned_remainder(options: RuntimeOptions, state: CalibrationState) -> Remai
         *(*left, "kept" if helps else "not kept"),
     )
     values = {"left_mm": left[:2], "flat_mm": left[2:], "numbers": network.numbers()}
-    return RemainderState.model_validate({"options": learned, **values}) if helps else None
+    found = RemainderState.model_validate({"options": learned, **values})
+    return state.model_copy(update={"remainder": found}) if helps else state
 
 
 def _flying_pixels(
-    data: Dataset, wanted: FlyingPixelsOptions, state: CalibrationState, frames: Frames
+    data: Dataset, wanted: FlyingPixelsOptions, state: CalibrationState, frames: ReadFrames
 ) -> FlyingPixelsState | None:
     """Measure what finding flying pixels takes; None where there are none."""
     data.require("amplitude", "finding flying pixels (runtime.flying_pixels)")
