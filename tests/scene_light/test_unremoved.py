@@ -217,6 +217,7 @@ def test_the_room_of_a_world_is_there_when_frames_are_freed_of_its_light(
     own = room(room_in_image=False, continued=True)
     plain = DepthCorrector.from_state(state.model_copy(update={"scene": SceneLight()}))
     batch = next(data.batches([0, 11]))
+    assert batch.amplitude is not None
     for k, frame in enumerate((0, 11)):
         radial, light = batch.radial_distance[k].float(), batch.amplitude[k].float()
         corrected = plain(radial / plain.radial_of_z, light)[0] * plain.radial_of_z

@@ -139,7 +139,7 @@ def _largest_plane(place: Tensor, distance: Tensor, generator: torch.Generator) 
     normal = torch.nn.functional.normalize(normal, dim=1)
     missed = (place @ normal.T - (normal * three[:, 0]).sum(1)).abs() / distance[:, None]
     near = (missed < _OFF_PLANE) & (normal.norm(dim=1) > 0.5)  # Three points on a line have none.
-    own, plane = near[:, near.sum(0).argmax()], normal[0]
+    own, plane, middle = near[:, near.sum(0).argmax()], normal[0], place[0]
     for _ in range(2):
         middle = place[own].mean(0)
         plane = torch.linalg.svd(place[own] - middle, full_matrices=False).Vh[2]
