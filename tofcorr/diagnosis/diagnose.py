@@ -50,6 +50,7 @@ from tofcorr.diagnosis.sums.base import (
     filtered_inputs,
     fit_base,
 )
+from tofcorr.diagnosis.sums.linearised import in_best_forms
 from tofcorr.diagnosis.sums.observations import (
     TINY,
     Observations,
@@ -185,7 +186,7 @@ def prepare(
     as_given = None if known is None else known.residual(observations)
     inputs = effect_inputs(observations, fit.tool_from_camera)
     inputs = filtered_inputs(inputs, observations, fit)
-    study = build_study(options, observations, fit, inputs)
+    study = in_best_forms(build_study(options, observations, fit, inputs))
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
     outliers = outliers_of(study)

@@ -21,6 +21,7 @@ from tofcorr.diagnosis.sums.base import (
     fit_base,
     supported_base,
 )
+from tofcorr.diagnosis.sums.linearised import relinearised
 from tofcorr.diagnosis.sums.observations import (
     TINY,
     Observations,
@@ -31,7 +32,6 @@ from tofcorr.diagnosis.sums.study import (
     FittedMap,
     Study,
     build_study,
-    relinearised,
     with_poses_reestimated,
 )
 from tofcorr.simulation.effects import CATALOGUE, MapEffect

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.probability import Evidence, Model, Models, Search
+from tofcorr.diagnosis.sums.linearised import relinearised
 from tofcorr.diagnosis.sums.study import (
     Study,
-    relinearised,
     with_poses_reestimated,
     without_map,
 )
@@ -174,8 +174,7 @@ def _with_names(found: NamedEffects, evidence: Evidence) -> NamedEffects:
     for name, values in maps.items():
         spent = {name, *study.maps[name].contains}
         study = without_map(study, values, spent)
-    columns = found.columns_of(tuple(sets))
-    study = with_poses_reestimated(relinearised(study, columns), columns)
+    study = with_poses_reestimated(study, found.columns_of(tuple(sets)))
     return replace(found, study=study, names=tuple(sets), maps=maps, sets=sets)
 
 
