@@ -54,12 +54,14 @@ def functions(distance: torch.Tensor, amplitude: torch.Tensor) -> torch.Tensor:
     return torch.stack([distance**k for k in range(5)] + [amplitude.log()])
 
 
-def measured(frame: Frame, draw: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance and amplitude (H, W) as the camera gives them."""
+def measured(
+    frame: Frame, draw: np.random.Generator, error: Callable[[Image, Image], Image] = base_error
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance and amplitude (H, W) as a camera gives them that is off besides by an error."""
     amplitude = frame.amplitude * abs(1 + frame.ratio)
     distance = frame.distance + frame.error
     sigma = NOISE * np.sqrt(np.nanmedian(amplitude) / amplitude).clip(0.5, 3)
-    distance = distance + base_error(distance, amplitude) + sigma * draw.normal(size=distance.shape)
+    distance = distance + error(distance, amplitude) + sigma * draw.normal(size=distance.shape)
     return torch.tensor(distance), torch.tensor(amplitude)
 
 

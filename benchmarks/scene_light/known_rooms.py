@@ -14,12 +14,11 @@ import numpy as np
 import torch
 
 from benchmarks.renewed.rendering import start_renderer
-from benchmarks.scene_light.bounces import WALLS, camera, on_planes, share
-from benchmarks.scene_light.rooms import CONE, FREQUENCY, GAIN, SCENES, Frame, rendered
+from benchmarks.scene_light.bounces import WALLS, camera, measured, on_planes, share
+from benchmarks.scene_light.rooms import CONE, FREQUENCY, GAIN, SCENES, rendered
 from tofcorr.scene_light.bounces import SecondBounces, SecondBouncesState
 from tofcorr.training.scene import recorded_room
 
-NOISE = 3.5e-3  # metres, at the median amplitude of a frame
 ROOMS = ("wall_and_floor", "wall_and_side", "cupboard", "boxes")
 KINDS = ("none", "given", "mesh", "off", "recorded")
 OFF = 0.01  # metres in x, y and z by which a room is off: 17 mm
@@ -56,20 +55,15 @@ def bounces(**room: object) -> SecondBounces:
     return SecondBounces(camera(), SecondBouncesState.model_validate(values | room)).double()
 
 
-def measured(frame: Frame, draw: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance and amplitude (H, W) with noise and second bounces."""
-    amplitude = frame.amplitude * abs(1 + frame.ratio)
-    sigma = NOISE * np.sqrt(np.nanmedian(amplitude) / amplitude).clip(0.5, 3)
-    distance = frame.distance + frame.error + sigma * draw.normal(size=sigma.shape)
-    return torch.tensor(distance), torch.tensor(amplitude)
-
-
 def rows_of(name: str, seed: int, views: int) -> dict[str, list[tuple[Image, ...]]]:
     """Errors before and after, plain and after a plane fit, of each frame by kind of room."""
     draw, none = np.random.default_rng(seed + 1), bounces()
     faces, poses = faces_of(name, seed, views)
     frames = rendered(name, seed, views)
-    seen, rows = [measured(one, draw) for one in frames], {kind: [] for kind in KINDS}
+    seen, rows = (
+        [measured(one, draw, lambda distance, _: 0.0 * distance) for one in frames],
+        {kind: [] for kind in KINDS},
+    )
     moved = [{"corners": (np.array(f["corners"]) + OFF).tolist()} for f in faces]
     with tempfile.TemporaryDirectory() as folder:
         mesh = bounces(room=meshed(faces, Path(folder) / "room.ply"))

@@ -21,7 +21,7 @@ from tofcorr.diagnosis.sums.base import (
     fit_base,
     supported_base,
 )
-from tofcorr.diagnosis.sums.linearised import relinearised
+from tofcorr.diagnosis.sums.linearised import in_best_forms, relinearised
 from tofcorr.diagnosis.sums.observations import (
     TINY,
     Observations,
@@ -82,7 +82,7 @@ def simulated_elsewhere(
     kinds = {n: kind for n, kind in CATALOGUE.items() if not kind.missing(here)}
     lacking += [n for n, k in kinds.items() if k.missing(there) and not issubclass(k, MapEffect)]
     every = options.model_copy(update={"catalogue": tuple(kinds), "leave_out": ()})
-    study = build_study(every, frames, fit, there)
+    study = in_best_forms(build_study(every, frames, fit, there))
     error, uncertain, misfit = _carried(study, real, here)
     outside, warnings = torch.zeros_like(error, dtype=torch.bool), []
     if scale != 1.0:

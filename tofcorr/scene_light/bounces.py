@@ -112,7 +112,6 @@ class SecondBounces(nn.Module):
     wave_numbers: list[float]
     weights: list[float]
     pads: list[int]
-    constants: list[float]
 
     def __init__(self, camera: CameraIntrinsics, state: SecondBouncesState) -> None:
         super().__init__()
@@ -127,7 +126,9 @@ class SecondBounces(nn.Module):
         self.wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in state.frequencies_hz]
         total = sum(f * f for f in state.frequencies_hz)
         self.weights = [f * f / total for f in state.frequencies_hz]
-        self.constants = [0.0, 0.0, WIDE_PLANE, 0.0, 0.0, STEEPEST, OFF_PLANE]
+        self.wide_plane: float = WIDE_PLANE
+        self.off_plane: float = OFF_PLANE
+        self.steepest: float = STEEPEST
         self.samples: int = _SAMPLES
         rays = ray_directions(camera)
         slopes = rays[..., :2] / rays[..., 2:]
@@ -338,7 +339,7 @@ class SecondBounces(nn.Module):
             value, off, x, y, z = found.unbind(0)
             off = (radial - off) * (x * rays[0] + y * rays[1] + z * rays[2]) - 1.0
             share = self.shares[i].to(radial.dtype)
-            share = share / (1.0 + (off / self.constants[6]).square())
+            share = share / (1.0 + (off / self.off_plane).square())
             total, weight = total + share * value, weight + share
         return total / weight.clamp(min=1e-12)
 
@@ -349,7 +350,7 @@ class SecondBounces(nn.Module):
             return planes, fits, large
         # A room hides what is behind it: what seems further away, second bounces have shifted.
         room, _ = self.room.met(self.cell_rays.double())
-        met = radial * (room * self.cell_rays).sum(0) > 1.0 - self.constants[2]
+        met = radial * (room * self.cell_rays).sum(0) > 1.0 - self.wide_plane
         return torch.where(met, room, planes), fits | met, large | met
 
     def surfaces(
@@ -362,7 +363,7 @@ class SecondBounces(nn.Module):
         to_light = self.light.double()[:, None] - place
         away = to_light.square().sum(0).sqrt()
         cosine = (normal * to_light).sum(0) / away
-        steep = (-(normal * rays).sum(0)).clamp(min=self.constants[5])
+        steep = (-(normal * rays).sum(0)).clamp(min=self.steepest)
         return place, normal, away, cosine, solid * radial.square() / steep
 
     def indirect(
@@ -388,7 +389,7 @@ class SecondBounces(nn.Module):
         place, normal, away, cosine, area = self.surfaces(
             planes, self.cell_rays.double(), self.solid.double()
         )
-        seen = planes.isfinite().all(0) & amplitude.isfinite() & (cosine > self.constants[5])
+        seen = planes.isfinite().all(0) & amplitude.isfinite() & (cosine > self.steepest)
         sends = seen & fits
         strength = torch.where(sends, amplitude * area, 0.0).nan_to_num()
         middle, facing, whole, _ = self.patches(place, normal, area, turn, sends)
@@ -402,7 +403,7 @@ class SecondBounces(nn.Module):
         shown = bright[start]
         if self.room.corners.shape[0] > 0:
             # As bright as the cell beside it, or as the cells of its face; if none is, as known.
-            on = ((far_planes.T @ place - 1.0).abs() < self.constants[2]) & sends
+            on = ((far_planes.T @ place - 1.0).abs() < self.wide_plane) & sends
             beside, on = on.gather(1, start[:, None])[:, 0], on.to(bright.dtype)
             of_face = on @ torch.where(sends, bright, 0.0) / on.sum(1)
             given = (reflectivity / (math.pi * self.gain)).nan_to_num(0.0, 0.0)
@@ -411,7 +412,7 @@ class SecondBounces(nn.Module):
         if self.continued:
             known = known | (sends & large)[start]
         ahead = ((far_planes * beyond_rays).sum(0) > 0) & known
-        ahead = ahead & (far[3] > self.constants[5])
+        ahead = ahead & (far[3] > self.steepest)
         bright = shown * far[3] / far[2].square() * far[4]
         dtype = self.shares.dtype
         table = torch.where(ahead, torch.cat([far[0], far[1], far[4][None]]), 0.0)

@@ -37,13 +37,15 @@ class CellPlanes(nn.Module):
 
     cell_rays: Tensor
     candidates: Tensor
-    constants: list[float]
 
     def __init__(self, rays: Tensor, rows: int) -> None:
         super().__init__()
         self.rows, self.columns = rows, rays.shape[1] // rows
-        self.constants = [OFF_PLANE / 3, _ODD, WIDE_PLANE, _ALIKE]
-        self.constants += [_LEAST_FACE, 0.0, OFF_PLANE]
+        self.noise: float = OFF_PLANE / 3
+        self.odd: float = _ODD
+        self.wide_plane: float = WIDE_PLANE
+        self.alike: float = _ALIKE
+        self.least_face: float = _LEAST_FACE
         self.faces_sought: int = _FACES
         self.register_buffer("cell_rays", rays)
         # As many cells are tried as the smallest of large planes would go into the image.
@@ -62,7 +64,7 @@ class CellPlanes(nn.Module):
         small, small_misfit = self.windows(near, 1)
         scale = radial.square().square()
         some = torch.where(small_misfit.isfinite(), small_misfit * scale, math.nan)
-        level = self.constants[1] * some.nanmedian() + (self.constants[0] * radial).square()
+        level = self.odd * some.nanmedian() + (self.noise * radial).square()
         flat = wide_misfit * scale < level
         fits = flat | (small_misfit * scale < level)
         planes = torch.where(fits, torch.where(flat, wide, small), math.nan)
@@ -108,14 +110,14 @@ class CellPlanes(nn.Module):
         self, near: Tensor, own: Tensor, fits: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Give cells that lie on one large plane that plane: the largest first."""
-        ray, size = self.cell_rays.double(), self.constants[4] * near.shape[0]
+        ray, size = self.cell_rays.double(), self.least_face * near.shape[0]
         normal = own / own.square().sum(0).sqrt()
         free, best = fits & own.isfinite().all(0), own
         left = torch.full_like(near, math.inf)
         seeds = own[:, self.candidates]
         tried, toward = seeds.float(), normal[:, self.candidates].float()
-        alike = ((tried.T @ ray.float()) / near.float() - 1.0).abs() < self.constants[2]
-        alike = (alike & (toward.T @ normal.float() > self.constants[3])).float()
+        alike = ((tried.T @ ray.float()) / near.float() - 1.0).abs() < self.wide_plane
+        alike = (alike & (toward.T @ normal.float() > self.alike)).float()
         for _ in range(self.faces_sought):
             most = (alike @ free.to(alike.dtype)).argmax()
             member, plane, off = (alike[most] > 0) & free, seeds[:, most], left
@@ -126,12 +128,12 @@ class CellPlanes(nn.Module):
                 plane = solved((rows @ rows.T)[:, :, None], right[:, None])[:, 0]
                 facing = plane / plane.square().sum().sqrt()
                 off = ((plane @ ray) / near - 1.0).abs()
-                member = free & (off < self.constants[2]) & (facing @ normal > self.constants[3])
+                member = free & (off < self.wide_plane) & (facing @ normal > self.alike)
             member = member & (member.sum() > size)
             spread = nn.functional.max_pool2d(
                 member.to(near.dtype).reshape(1, self.rows, self.columns), 5, 1, 2
             )
-            beside = (spread.reshape(-1) > 0) & (off < self.constants[2]) & (off < left)
+            beside = (spread.reshape(-1) > 0) & (off < self.wide_plane) & (off < left)
             chosen = member | (beside & ~fits)
             best = torch.where(chosen, plane[:, None], best)
             left = torch.where(chosen, off, left)

@@ -149,11 +149,14 @@ def _largest_plane(place: Tensor, distance: Tensor, generator: torch.Generator) 
     return torch.cat([plane, (plane @ middle)[None]])
 
 
+def _met(surroundings: Surroundings, origin: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how far rays (N, 3) go from a place (3,) to the first plane, and which it is (N,)."""
+    met = (surroundings.offset - surroundings.normal @ origin) / (ray @ surroundings.normal.T)
+    return torch.where(met > 0, met, math.inf).min(1)
+
+
 def bounced(
-    surroundings: Surroundings,
-    light: CameraLight,
-    place: Tensor,
-    normal: Tensor,
+    surroundings: Surroundings, light: CameraLight, place: Tensor, normal: Tensor
 ) -> Tensor:
     """Return the second bounces at points over the direct light there, complex (N,).
 
@@ -171,8 +174,7 @@ def bounced(
     ray = torch.nn.functional.normalize(torch.nn.functional.pad(slope, (0, 1), value=1.0))
     solid, ahead = torch.cartesian_prod(width, width).prod(1) * ray[:, 2] ** 3, ray[:, 2]
     ray = ray @ rotation.T
-    met = (surroundings.offset - surroundings.normal @ origin) / (ray @ surroundings.normal.T)
-    away, plane = torch.where(met > 0, met, math.inf).min(1)
+    away, plane = _met(surroundings, origin, ray)
     there = away.isfinite()
     ray, solid, away, plane, ahead = (x[there] for x in (ray, solid, away, plane, ahead))
     facing = surroundings.normal[plane]
@@ -230,11 +232,9 @@ def added_around(
     planes, fits, large = bounces.planes(cells)
     rotation, origin = world_from_camera[:3, :3], world_from_camera[:3, 3]
     ray = bounces.cell_rays.double().T @ rotation.T
-    met = (surroundings.offset - surroundings.normal @ origin) / (ray @ surroundings.normal.T)
-    met, plane = torch.where(met > 0, met, math.inf).min(1)
+    met, plane = _met(surroundings, origin, ray)
     # What is not before the planes is on them: measured, it seems farther by second bounces.
-    alone = cells < (1 - 2 * _OFF_PLANE) * met
-    alone = alone | ~met.isfinite()
+    alone = (cells < (1 - 2 * _OFF_PLANE) * met) | ~met.isfinite()
     at = torch.where(alone, cells, met)
     normal = -torch.nn.functional.normalize(planes.double(), dim=0).T @ rotation.T
     flat = surroundings.normal[plane]

@@ -83,7 +83,7 @@ class UnremovedBounces(nn.Module):
         place, normal, away, cosine, area = bounces.surfaces(
             planes, bounces.cell_rays.double(), bounces.solid.double()
         )
-        seen = planes.isfinite().all(0) & amplitude.isfinite() & (cosine > bounces.constants[5])
+        seen = planes.isfinite().all(0) & amplitude.isfinite() & (cosine > bounces.steepest)
         grey = torch.where(seen, bounces.gain * amplitude * away.square() / cosine, 0.0)
         light = torch.zeros(2, len(waves), place.shape[1]).to(place)
         light[0] = light[0] + torch.where(seen, amplitude * area, 0.0)

@@ -110,15 +110,14 @@ def relinearised(study: Study, names: Sequence[str]) -> Study:
     names = [name for name in names if name in study.effects]
     bent = not all(study.effects[name].linear for name in names)
 
-    def loss(left: Tensor) -> float:
+    def loss(study: Study) -> float:
         """Return the weighted sum of squares of the model fitted to all poses, m^2."""
-        return float((study.fit.share * left**2).sum())
+        return float((study.fit.share * study.residual_of(names) ** 2).sum())
 
-    best, least, current = study, loss(study.residual_of(names)), study
+    best, least, current = study, loss(study), study
     for _ in range(3 if bent else 0):  # The second or third changes nothing any more.
         current = _linearised_at(study, current.sums.ols.solve(names), current, names)
-        now = loss(current.residual_of(names))
-        if not now < least:
+        if not (now := loss(current)) < least:
             break
         best, least = current, now
     return best

@@ -136,8 +136,7 @@ class MultipathShape(AreaShape):
     def around(self) -> Surroundings:
         """Return the surfaces and their brightness."""
         planes = torch.tensor(self.surfaces, dtype=torch.float64)
-        bright = self.amplitude_at_1m * planes[:, 4]
-        return Surroundings(planes[:, :3], planes[:, 3], bright)
+        return Surroundings(planes[:, :3], planes[:, 3], self.amplitude_at_1m * planes[:, 4])
 
     def gain(self, coefficient: float) -> float:
         """Return the gain of second bounces, as in `SecondBouncesState`, of their coefficient."""
@@ -282,7 +281,6 @@ def _seen(
     rays = ray_directions(inputs.camera).reshape(-1, 3)
     pixel, poses = sampled(rays), facts.world_from_tool @ inputs.tool_from_camera
     distance = known(inputs, "distance_images").flatten(1)[:, pixel].double()
-    amplitude = inputs.amplitude_images.flatten(1)[:, pixel].double()
     if error is not None and effect is not None:
         frame = torch.arange(len(poses)).repeat_interleave(len(pixel))
         own = error(frame, pixel.repeat(len(poses))).reshape(distance.shape)
@@ -296,7 +294,7 @@ def _seen(
         distance = torch.where(off.isnan() | (distance <= 0), distance, distance - off)
     found = surroundings_of(
         distance,
-        amplitude / (white * exposure[:, None]),
+        inputs.amplitude_images.flatten(1)[:, pixel] / (white * exposure[:, None]),
         rays[pixel],
         poses,
         targets,
