@@ -70,12 +70,14 @@ class Calibration(NamedTuple):
 
     bounces: SecondBounces
     coefficients: torch.Tensor
+    ranges: list[tuple[float, float]]  # of distance and amplitude that it saw
     gain: float  # in true gains
     interval: tuple[float, float]
 
     def without_base_error(self, distance: torch.Tensor, light: torch.Tensor) -> torch.Tensor:
-        """Distance (H, W), metres."""
-        of = functions(distance.reshape(-1), light.reshape(-1))
+        """Distance (H, W), metres; beyond the ranges what is off at their ends, as a corrector."""
+        seen = zip((distance, light), self.ranges, strict=True)
+        of = functions(*(values.reshape(-1).clamp(*ends) for values, ends in seen))
         return distance - (self.coefficients @ of).reshape(distance.shape)
 
 
@@ -94,13 +96,16 @@ def calibrate(seed: int, views: int, light: tuple[float, float, float]) -> Calib
     lone = rendered("lone_wall", seed, views, light[0])
     seen = [measured(frame, draw) for frame in walls + lone]
     fit = fit_gain(bounces, seen, functions, torch.eye(4).expand(len(seen), 4, 4))
-    known = [(own, frame) for own, frame in zip(seen[len(walls) :], lone, strict=True)]
-    columns = torch.cat([functions(d.reshape(-1), a.reshape(-1)) for (d, a), _ in known], dim=1)
-    off = torch.cat([(d - torch.tensor(f.distance)).reshape(-1) for (d, _), f in known])
-    coefficients = torch.linalg.lstsq(columns.T, off[:, None]).solution[:, 0]
+    shown = (torch.stack(each).flatten() for each in zip(*seen[len(walls) :], strict=True))
+    true = torch.tensor(np.stack([frame.distance for frame in lone])).flatten()
+    there = true.isfinite()  # A ray may slip through, between two triangles.
+    distance, light = (each[there] for each in shown)
+    off = (distance - true[there])[:, None]
+    coefficients = torch.linalg.lstsq(functions(distance, light).T, off).solution[:, 0]
+    ranges = [(float(each.min()), float(each.max())) for each in (distance, light)]
     bounces.gain = fit.gain
     low, high = (GAIN * end for end in fit.interval)
-    return Calibration(bounces, coefficients, GAIN * fit.gain, (low, high))
+    return Calibration(bounces, coefficients, ranges, GAIN * fit.gain, (low, high))
 
 
 def on_planes(frame: Frame, error: Image, used: Image) -> Image:

@@ -140,6 +140,20 @@ def test_walls_that_nobody_measured_are_estimated(wall: Dataset) -> None:
     same(live.result(), tofcorr.train(recording, CONFIG).fit, most=1e-7)
 
 
+def test_a_camera_that_stands_still_determines_no_hand_eye_transform(wall: Dataset) -> None:
+    live = LiveCalibration(wall.first, CONFIG | {"model": {"terms": []}})
+    for k in range(4):
+        row = wall.first.frames.row(k)
+        depth, amplitude = (wall.first.read(name, np.array([k])) for name in ("depth", "amplitude"))
+        assert depth is not None
+        assert amplitude is not None
+        camera = row.world_from_tool @ wall.first.tool_from_camera
+        normal, offset = row.normal_world @ camera[:3, :3], row.normal_world @ camera[:3, 3]
+        plane = np.append(normal, row.offset + offset)
+        known = live.add(depth[0], amplitude[0], np.eye(4), plane=plane)
+    assert not known.is_determined
+
+
 def test_a_removed_frame_was_never_there(wall: Dataset) -> None:
     one, other = LiveCalibration(wall.first, CONFIG), LiveCalibration(wall.first, CONFIG)
     for k in range(10):

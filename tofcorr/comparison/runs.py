@@ -46,8 +46,10 @@ class HandEyeDifference:
     def __str__(self) -> str:
         """Return the difference in one sentence."""
         differ = "differ significantly" if self.significant else "do not differ significantly"
-        size = f"{self.shift_mm:.2f} mm and {self.turn_deg:.3f} deg, p = {self.p_value:.2g}"
-        return f"The hand-eyes of {self.first} and {self.second} {differ}: {size}."
+        # A probability below the smallest number is not zero.
+        chance = f"p = {self.p_value:.2g}" if self.p_value else f"p < {np.finfo(float).tiny:.0g}"
+        size = f"{self.shift_mm:.2f} mm and {self.turn_deg:.3f} deg"
+        return f"The hand-eyes of {self.first} and {self.second} {differ}: {size}, {chance}."
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

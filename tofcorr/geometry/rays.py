@@ -27,7 +27,7 @@ _ITERATIONS = 20
 # number: far below any calibration and far above rounding, and twice the steps that the lenses of
 # the tests need. With a pincushion of k1 = 0.8 the iterations swing to and fro at the border.
 _MISSED, _NEWTON_STEPS = 1e-9, 20
-_AT_ONCE = 1 << 14
+AT_ONCE = 1 << 14
 """Pixels undistorted at once. Their coordinates fit into the cache of a core: half the time for
 512 x 424 pixels, a tenth for ten million (measured), and the same rays to the last bit."""
 
@@ -45,7 +45,7 @@ def ray_directions(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {
         lens = camera.matrix_tensor()[None], torch.tensor([camera.distortion], dtype=torch.float64)
         parts = [
             undistort_points(part[None], *lens, num_iters=_ITERATIONS)[0]
-            for part in wanted.split(_AT_ONCE)
+            for part in wanted.split(AT_ONCE)
         ]
         pixels = _improved(torch.cat(parts), wanted, camera)
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)

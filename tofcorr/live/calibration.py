@@ -109,7 +109,7 @@ class Known:
         poses: How many poses there are.
         odd: What is odd about the newest frame, a sentence each.
         translation_mm: Half the 95 % interval of the hand-eye transform along its worst axis, mm;
-            infinite while it is not determined.
+            infinite while it is not determined, or not estimated.
         rotation_deg: The same of the rotation, degrees.
         terms_mm: Standard error of each coefficient of the scaled variables, mm.
         weakest: The direction known least, in words.
@@ -665,11 +665,13 @@ class LiveCalibration:
         """
         found = now.fit
         assert found is not None
-        # Of few poses the scatter between them may be small by chance, but not what they determine.
-        expected = posterior_covariance(found.observability.precision)[:6, :6]
-        both = zip(worst_axes(found.hand_eye_covariance), worst_axes(expected), strict=True)
-        quantile = student_quantile(39 / 40, found.covariance.degrees_of_freedom) * share**0.5
-        shift, turn = (quantile * max(pair) for pair in both)
+        shift = turn = math.inf
+        if found.optimum.hand_eye_is_free:
+            # Few poses may scatter little by chance, but that is not what they determine.
+            expected = posterior_covariance(found.observability.precision)[:6, :6]
+            both = zip(worst_axes(found.hand_eye_covariance), worst_axes(expected), strict=True)
+            quantile = student_quantile(39 / 40, found.covariance.degrees_of_freedom) * share**0.5
+            shift, turn = (quantile * max(pair) for pair in both)
         free = {name for one in found.observability.undetermined for name in one.shares}
         # No less is known of a mount that nobody has measured.
         if free & {*HAND_EYE_SYMBOLS} or max(shift, turn) > PRIOR_SIGMA:
@@ -684,7 +686,7 @@ class LiveCalibration:
             translation_mm=shift,
             rotation_deg=turn,
             terms_mm=dict(zip(found.moments.symbols, (1e3 * spread).tolist(), strict=True)),
-            weakest=found.directions[0].in_words(),
+            weakest=next((one.in_words() for one in found.directions), ""),
             gained=gained,
             enough=shift <= self.wanted_mm and turn <= self.wanted_deg,
         )

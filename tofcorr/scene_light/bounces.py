@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.options import FiniteNumber, NonNegativeNumber, Number, Options, PositiveNumber
-from tofcorr.scene_light.planes import OFF_PLANE, STEEPEST, WIDE_PLANE, CellPlanes
+from tofcorr.scene_light.planes import OFF_PLANE, STEEPEST, CellPlanes
 from tofcorr.scene_light.remainder import Remainder
 from tofcorr.scene_light.room import Faces, Room
 
@@ -126,7 +126,6 @@ class SecondBounces(nn.Module):
         self.wave_numbers = [2 * math.pi * f / SPEED_OF_LIGHT for f in state.frequencies_hz]
         total = sum(f * f for f in state.frequencies_hz)
         self.weights = [f * f / total for f in state.frequencies_hz]
-        self.wide_plane: float = WIDE_PLANE
         self.off_plane: float = OFF_PLANE
         self.steepest: float = STEEPEST
         self.samples: int = _SAMPLES
@@ -160,16 +159,16 @@ class SecondBounces(nn.Module):
         cosine = corner if half is None else math.cos(math.radians(half))
         further = state.continued or bool(state.room)
         reach = math.sqrt(1 / cosine**2 - 1) if further else 0.0
-        width = [4 * self.cell * each for each in pitch]
+        border = self.cell * torch.tensor(pitch, dtype=torch.float64)
+        width = (4 * border).tolist()
         lines = []
         for axis in (0, 1):
             more = max(0, math.ceil((reach - float(torch.maximum(-low, high)[axis])) / width[axis]))
-            inside = max(1, round(float(high[axis] - low[axis]) / width[axis] + 0.25))
+            inside = max(1, round(float(high[axis] - low[axis] + border[axis]) / width[axis]))
             places = torch.arange(-more, inside + more, dtype=torch.float64) - (inside - 1) / 2
             lines.append((low + high)[axis] / 2 + places * width[axis])
         y, x = torch.meshgrid(lines[1], lines[0], indexing="ij")
         place = torch.stack([x.reshape(-1), y.reshape(-1)])
-        border = torch.tensor(width, dtype=torch.float64) / 4
         outside = ((place < (low - border)[:, None]) | (place > (high + border)[:, None])).any(0)
         ray = nn.functional.normalize(nn.functional.pad(place, (0, 0, 0, 1), value=1.0), dim=0)
         kept = outside & (ray[2] >= cosine) & further
@@ -185,7 +184,7 @@ class SecondBounces(nn.Module):
         slopes = (rays[:2] / rays[2]).reshape(2, -1)
         low, high = slopes.amin(1), slopes.amax(1)
         count = torch.tensor([self.columns, self.rows])
-        step = (high - low) / (count - 2).clamp(min=1)
+        step = ((high - low) / (count - 2).clamp(min=1)).clamp(min=2.0**-23)
         at = [
             low[i] + (torch.arange(int(count[i]), dtype=torch.float64) - 0.5) * step[i]
             for i in (0, 1)
@@ -194,7 +193,7 @@ class SecondBounces(nn.Module):
         places = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
         nearest = torch.cdist(places, slopes.T.contiguous()).argmin(1)
         self.register_buffer("table", nearest.reshape(self.rows, self.columns))
-        self.table_at: list[float] = [*(low - step).tolist(), *step.clamp(min=1e-9).tolist()]
+        self.table_at: list[float] = [*(low - step).tolist(), *step.tolist()]
 
     def _share_cells(self, size: tuple[int, int]) -> None:
         """Say which four cells are around a pixel, and their shares in bilinear interpolation."""
@@ -311,9 +310,8 @@ class SecondBounces(nn.Module):
     def cells(self, radial: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         """Return distance and amplitude of the cells (N,), float64; NaN where most are missing."""
         seen = radial.isfinite() & (radial > 0) & amplitude.isfinite()
-        none = torch.zeros_like(radial)
-        images = [torch.where(seen, 1.0 / radial, none), torch.where(seen, amplitude, none)]
-        images = torch.stack([images[0], images[1], seen.to(radial.dtype)])
+        images = torch.stack([1.0 / radial, amplitude, torch.ones_like(radial)])
+        images = torch.where(seen, images, 0.0)
         means = nn.functional.avg_pool2d(nn.functional.pad(images, self.pads), self.cell)
         near, strength, share = means.double().reshape(3, -1).unbind(0)
         share = torch.where(share > 0.5, share, torch.full_like(share, math.nan))
@@ -339,9 +337,9 @@ class SecondBounces(nn.Module):
             value, off, x, y, z = found.unbind(0)
             off = (radial - off) * (x * rays[0] + y * rays[1] + z * rays[2]) - 1.0
             share = self.shares[i].to(radial.dtype)
-            share = share / (1.0 + (off / self.off_plane).square())
+            share = share / (1.0 + (3.0 * off / self.off_plane).square())
             total, weight = total + share * value, weight + share
-        return total / weight.clamp(min=1e-12)
+        return torch.where(weight > 0, total / weight, total)
 
     def planes(self, radial: Tensor) -> Planes:
         """Return g of 1 / r = g . ray of every cell (3, N), which fit a plane, and a large one."""
@@ -350,7 +348,7 @@ class SecondBounces(nn.Module):
             return planes, fits, large
         # A room hides what is behind it: what seems further away, second bounces have shifted.
         room, _ = self.room.met(self.cell_rays.double())
-        met = radial * (room * self.cell_rays).sum(0) > 1.0 - self.wide_plane
+        met = radial * (room * self.cell_rays).sum(0) > 1.0 - self.off_plane
         return torch.where(met, room, planes), fits | met, large | met
 
     def surfaces(
@@ -403,7 +401,7 @@ class SecondBounces(nn.Module):
         shown = bright[start]
         if self.room.corners.shape[0] > 0:
             # As bright as the cell beside it, or as the cells of its face; if none is, as known.
-            on = ((far_planes.T @ place - 1.0).abs() < self.wide_plane) & sends
+            on = ((far_planes.T @ place - 1.0).abs() < self.off_plane) & sends
             beside, on = on.gather(1, start[:, None])[:, 0], on.to(bright.dtype)
             of_face = on @ torch.where(sends, bright, 0.0) / on.sum(1)
             given = (reflectivity / (math.pi * self.gain)).nan_to_num(0.0, 0.0)
@@ -446,8 +444,8 @@ class SecondBounces(nn.Module):
         """
         table = torch.where(sends, torch.cat([place * area, normal * area, area[None]]), 0.0)
         table = self.summed(table)
-        facing = table[3:6] / table[3:6].square().sum(0).sqrt().clamp(min=1e-12)
-        middle = table[:3] / table[6].clamp(min=1e-12)
+        facing = (table[3:6] / table[3:6].square().sum(0).sqrt()).nan_to_num()
+        middle = (table[:3] / table[6]).nan_to_num()
         return middle, facing, table[6], self.summed(torch.where(sends, light, 0.0))
 
     def summed(self, values: Tensor) -> Tensor:
@@ -469,7 +467,7 @@ class SecondBounces(nn.Module):
             for sample in range(self.samples):  # On the nearer half of the way from i to j.
                 t = (sample + 0.5) / (2 * self.samples)
                 at_x, at_y = torch.lerp(own[0], x, t), torch.lerp(own[1], y, t)
-                at_z = torch.lerp(own[2], z, t).clamp(min=1e-3)
+                at_z = torch.lerp(own[2], z, t).clamp(min=2.0**-23)
                 column = ((at_x / at_z - low_x) / step_x).int().clamp(0, self.columns - 1)
                 row = ((at_y / at_z - low_y) / step_y).int().clamp(0, self.rows - 1)
                 met = self.table.reshape(-1).index_select(
@@ -499,15 +497,8 @@ class SecondBounces(nn.Module):
         found = torch.jit.annotate(list[Tensor], [])
         # Row by row of patches: what fits a cache takes half the time.
         for row in range(self.rows // 2):
-            at, up = (
-                here[:3, row * wide : (row + 1) * wide],
-                here[3:, row * wide : (row + 1) * wide],
-            )
-            square = at.square().sum(0)[:, None] + place.square().sum(0) - 2.0 * (at.T @ place)
-            square = square.clamp(min=1e-6)
-            facing = (up.T @ place - (up * at).sum(0)[:, None]).clamp(min=0)
-            facing = facing * (at.T @ normal - (place * normal).sum(0)).clamp(min=0)
-            kernel, ways = facing / (square * (square + area / math.pi)), square.sqrt()
+            at, up = here[:, row * wide : (row + 1) * wide].chunk(2)
+            kernel, ways = transfer(at, up, place, normal, area)
             seen = free[row * wide // 4 : (row + 1) * wide // 4].repeat_interleave(2, 0)
             kernel[:, :count] *= seen.repeat(2, 1)
             sums = []
@@ -517,6 +508,25 @@ class SecondBounces(nn.Module):
                 sums.append(torch.stack([c @ real - s @ imaginary, c @ imaginary + s @ real]))
             found.append(torch.stack(sums, dim=1))
         return torch.cat(found, dim=2)
+
+
+def transfer(
+    at: Tensor, up: Tensor, place: Tensor, normal: Tensor, area: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return which share of its light a patch sends to a point, 1/m^2, and how far it is, (N, P).
+
+    Args:
+        at: The points (3, N), metres.
+        up: Unit normals there (3, N).
+        place: Middles of the patches (3, P).
+        normal: Unit normals there (3, P).
+        area: Of the patches (P,).
+    """
+    square = at.square().sum(0)[:, None] + place.square().sum(0) - 2.0 * (at.T @ place)
+    square = square.clamp(min=2.0**-23)  # What single precision leaves of one.
+    facing = (up.T @ place - (up * at).sum(0)[:, None]).clamp(min=0)
+    facing = facing * (at.T @ normal - (place * normal).sum(0)).clamp(min=0)
+    return facing / (square * (square + area / math.pi)), square.sqrt()
 
 
 def turned(phasors: Tensor, wave_numbers: list[float], ways: Tensor) -> Tensor:

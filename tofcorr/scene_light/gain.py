@@ -11,6 +11,7 @@ with the coefficients of the base error's functions f:
 anew with every s.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
@@ -25,11 +26,8 @@ Frames = Iterable[tuple[Tensor, Tensor]]
 Functions = Callable[[Tensor, Tensor], Tensor]
 """Of distances (N,), metres, and amplitudes (N,): the base error's functions (K, N)."""
 
-_STEPS = 4
-"""How often the gain is put into its own columns. On the benchmark the last changes it by less than
-a tenth of its standard error."""
-_CELLS = 30
-"""Fewest cells of a plane that is used: ten for each of its unknowns. Chosen."""
+CONFIDENCE = 0.95
+"""Probability of the interval of the gain."""
 
 
 class GainFit(NamedTuple):
@@ -68,31 +66,31 @@ def fit_gain(
     from scipy.special import stdtrit  # Slow to import.
 
     seen = [(pose, *bounces.cells(*one)) for one, pose in zip(frames, poses, strict=True)]
-    started = bounces.gain
+    started, last = bounces.gain, math.inf
     try:
-        found, inverse, parts = _solved(bounces, seen, functions)
-        for _ in range(_STEPS - 1):
-            bounces.gain = max(float(found[-1]), 0.1 * bounces.gain)  # A step may overshoot.
-            found, inverse, parts = _solved(bounces, seen, functions)
+        while True:
+            found, error, planes = _solved(bounces, seen, functions)
+            gain = float(found[-1])
+            step = max(gain, bounces.gain / 2) - bounces.gain  # It may overshoot.
+            # Until it is within its own uncertainty, or comes no nearer.
+            if not error < abs(step) < last:
+                break
+            last, bounces.gain = abs(step), bounces.gain + step
     finally:
         bounces.gain = started
-    unknowns, scores = len(found), torch.stack([x.T @ (y - x @ found) for x, y in parts])
-    freedom = len(parts) - unknowns
-    covariance = inverse @ (scores.T @ scores) @ inverse * (len(parts) / freedom)
-    gain, error = float(found[-1]), float(covariance[-1, -1].sqrt())
-    reach = float(stdtrit(freedom, 0.975)) * error
+    reach = float(stdtrit(planes - len(found), (1 + CONFIDENCE) / 2)) * error
     if not gain > reach:
         raise CalibrationDataError(
             f"The gain of second bounces is not determined: {gain:.2g} +- {reach:.2g}. "
             "Record walls with bright floor or side walls in view."
         )
-    return GainFit(gain, error, (gain - reach, gain + reach), found[:-1], len(parts))
+    return GainFit(gain, error, (gain - reach, gain + reach), found[:-1], planes)
 
 
 def _solved(
     bounces: SecondBounces, seen: list[tuple[Tensor, Tensor, Tensor]], functions: Functions
-) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-    """Return coefficients and gain (K + 1,), the inverse normal matrix, and every plane's part."""
+) -> tuple[Tensor, float, int]:
+    """Return coefficients and gain (K + 1,), the gain's standard error, and how many planes."""
     parts = [part for frame in seen for part in _columns(bounces, *frame, functions)]
     unknowns = parts[0][0].shape[1] if parts else 1
     if len(parts) <= unknowns:
@@ -102,7 +100,10 @@ def _solved(
         )
     normal = torch.stack([x.T @ x for x, _ in parts]).sum(0)
     inverse = torch.linalg.pinv(normal, hermitian=True)
-    return inverse @ torch.stack([x.T @ y for x, y in parts]).sum(0), inverse, parts
+    found = inverse @ torch.stack([x.T @ y for x, y in parts]).sum(0)
+    scores = torch.stack([x.T @ (y - x @ found) for x, y in parts])
+    covariance = inverse @ (scores.T @ scores) @ inverse * (len(parts) / (len(parts) - unknowns))
+    return found, float(covariance[-1, -1].sqrt()), len(parts)
 
 
 def _columns(
@@ -124,7 +125,7 @@ def _columns(
     _, plane = planes.unique(dim=1, return_inverse=True)
     for number in range(int(plane.max()) + 1):
         own = plane == number
-        if own.sum() >= _CELLS:
+        if own.sum() > bounces.cell_planes.side**2:
             base = torch.linalg.qr(moves[own]).Q
             held = torch.cat([columns[own], values[own, None]], dim=1)
             held = held - base @ (base.T @ held)

@@ -8,27 +8,23 @@ import math
 import torch
 from torch import Tensor, nn
 
-_ODD = 9.0
-"""Variance above which a window is no plane, in those of the noise: three deviations. Chosen."""
-WIDE_PLANE = 0.03
-"""Share of the distance by which cells of one large plane may miss it: second bounces bend a wall
-by that much before they are removed. Set on `benchmarks/scene_light/bounces.py`, building seed."""
-_ALIKE = 0.8
-"""Least cosine between the normals of cells of one large plane. Set there."""
-_LEAST_FACE = 0.005
-"""Share of all cells that makes a large plane. Chosen: 15 of 64 x 48."""
-_FACES = 12
-"""Large planes that are looked for. Chosen."""
+OFF_PLANE = 0.03
+"""Share of its distance by which something may miss its plane, three standard deviations. Second
+bounces bend a wall by that much before they are removed. Set on building seeds of
+`benchmarks/scene_light/bounces.py`."""
+WINDOW = 5
+"""Cells on a side of the windows that planes are sought in; where those fit none, 3. Chosen."""
 STEEPEST = 0.05
 """Least cosine of incidence of what counts as a surface: 87 degrees. Chosen: with 80, twice as much
 is left of second bounces in a cupboard, and more pixels of surfaces count as flying."""
-OFF_PLANE = 0.01
-"""Share of its distance by which a pixel may miss the plane of a cell whose light it gets. Chosen:
-three deviations of the noise of cameras."""
 
 
 class CellPlanes(nn.Module):
     """Finds the planes of the cells of a frame.
+
+    A cell takes the best window that contains it: of 5 x 5 cells, or of 3 x 3 if those fit no
+    plane. Cells on a plane that is larger than the small window take that plane: the largest that
+    they are on. Their normal is nearer to that of the plane than to one at a right angle to it.
 
     Args:
         rays: Unit directions of the cells (3, N).
@@ -41,43 +37,45 @@ class CellPlanes(nn.Module):
     def __init__(self, rays: Tensor, rows: int) -> None:
         super().__init__()
         self.rows, self.columns = rows, rays.shape[1] // rows
-        self.noise: float = OFF_PLANE / 3
-        self.odd: float = _ODD
-        self.wide_plane: float = WIDE_PLANE
-        self.alike: float = _ALIKE
-        self.least_face: float = _LEAST_FACE
-        self.faces_sought: int = _FACES
+        self.off_plane: float = OFF_PLANE
+        self.side: int = WINDOW
+        self.least: int = 3**2
         self.register_buffer("cell_rays", rays)
-        # As many cells are tried as the smallest of large planes would go into the image.
-        spaced = torch.linspace(0, rays.shape[1] - 1, min(round(1 / _LEAST_FACE), rays.shape[1]))
+        # As many cells are tried as small windows go into the image.
+        spaced = torch.linspace(0, rays.shape[1] - 1, max(1, rays.shape[1] // self.least))
         self.register_buffer("candidates", spaced.long())
 
     def forward(self, radial: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return g of 1 / r = g . ray of every cell (3, N), which fit a plane, and a large one.
+        """Return g of every cell (3, N), which are on a plane, and on a large one (N,).
 
-        A cell takes the best window that contains it: of 5 x 5 cells, or of 3 x 3 if those fit no
-        plane. If neither does, it takes the normal of a neighbour. Cells on one large plane take
-        that plane.
+        Args:
+            radial: Distances of the cells (N,), metres.
         """
-        near = 1.0 / radial
-        wide, wide_misfit = self.windows(near, 2)
+        near, ray = 1.0 / radial, self.cell_rays.double()
+        wide, wide_misfit = self.windows(near, self.side // 2)
         small, small_misfit = self.windows(near, 1)
         scale = radial.square().square()
         some = torch.where(small_misfit.isfinite(), small_misfit * scale, math.nan)
-        level = self.odd * some.nanmedian() + (self.noise * radial).square()
+        level = some.nanmedian() + (self.off_plane / 3 * radial).square()
         flat = wide_misfit * scale < level
         fits = flat | (small_misfit * scale < level)
         planes = torch.where(fits, torch.where(flat, wide, small), math.nan)
-        image = nn.functional.pad(
-            planes.reshape(3, self.rows, self.columns), [2] * 4, value=math.nan
-        )
-        around = image.unfold(1, self.rows, 1).unfold(2, self.columns, 1).reshape(3, 25, -1)
-        met = (around * self.cell_rays[:, None]).sum(0)
-        off = (near / met - 1.0).abs().nan_to_num(math.inf, math.inf)
-        nearest = off.argmin(0)[None, None].expand(3, 1, -1)
-        beside = around.gather(1, nearest)[:, 0]
-        beside = beside * (near / (beside * self.cell_rays).sum(0))
-        return self.large_planes(near, torch.where(fits, planes, beside), fits)
+        shared = self.large_planes(near, planes)
+        large = shared[0].isfinite()
+        # Other cells take the plane beside them that comes nearest, moved to where they are unless
+        # they are on it.
+        planes = torch.where(large, shared, planes)
+        image = torch.cat([planes, large.to(near.dtype)[None]]).reshape(4, self.rows, -1)
+        image = nn.functional.pad(image, [self.side // 2] * 4, value=math.nan)
+        around = image.unfold(1, self.rows, 1).unfold(2, self.columns, 1)
+        around = around.reshape(4, self.side * self.side, -1)
+        off = ((around[:3] * ray[:, None]).sum(0) / near - 1.0).abs()
+        least, nearest = off.nan_to_num(math.inf, math.inf).min(0)
+        beside = around.gather(1, nearest[None, None].expand(4, 1, -1))[:, 0]
+        joins = ~fits & (beside[3] > 0) & (least < self.off_plane)
+        moved = beside[:3] * (near / (beside[:3] * ray).sum(0))
+        others = torch.where(joins, beside[:3], moved)
+        return torch.where(fits, planes, others), fits | joins, large | joins
 
     def windows(self, near: Tensor, half: int) -> tuple[Tensor, Tensor]:
         """Return g of the best of nine windows that contain a cell, and its variance (of 1 / r)."""
@@ -91,7 +89,7 @@ class CellPlanes(nn.Module):
         plane = solved(means[:9].reshape(3, 3, -1), means[9:12])
         count = means[13] * size**2
         misfit = (means[12] - (plane * means[9:12]).sum(0)).clamp(min=0) * size**2 / (count - 3.0)
-        misfit = torch.where(count > 3.0 * half + 2.5, misfit, math.inf)  # Twice its unknowns.
+        misfit = torch.where(means[13] > 0.5, misfit, math.inf)  # Of most of its cells.
         image = torch.cat([plane, misfit[None]]).reshape(4, self.rows, self.columns)
         # Not around the border's cells: any two rows of cells across an edge are on one plane.
         image = nn.functional.pad(image[:, 1:-1, 1:-1], [half + 1] * 4, value=math.inf)
@@ -106,39 +104,38 @@ class CellPlanes(nn.Module):
                 least = torch.where(better, off, least)
         return best, torch.where(seen, least, math.inf)
 
-    def large_planes(
-        self, near: Tensor, own: Tensor, fits: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Give cells that lie on one large plane that plane: the largest first."""
-        ray, size = self.cell_rays.double(), self.least_face * near.shape[0]
-        normal = own / own.square().sum(0).sqrt()
-        free, best = fits & own.isfinite().all(0), own
-        left = torch.full_like(near, math.inf)
-        seeds = own[:, self.candidates]
-        tried, toward = seeds.float(), normal[:, self.candidates].float()
-        alike = ((tried.T @ ray.float()) / near.float() - 1.0).abs() < self.wide_plane
-        alike = (alike & (toward.T @ normal.float() > self.alike)).float()
-        for _ in range(self.faces_sought):
-            most = (alike @ free.to(alike.dtype)).argmax()
-            member, plane, off = (alike[most] > 0) & free, seeds[:, most], left
-            for _again in range(2):
+    def large_planes(self, near: Tensor, own: Tensor) -> Tensor:
+        """Return the plane of cells that lie on one with many others (3, N); NaN elsewhere.
+
+        Args:
+            near: One over the distance of the cells (N,).
+            own: g of the cells, NaN where they fit none (3, N).
+        """
+        ray, tried = self.cell_rays.double(), own[:, self.candidates]
+        best, free = torch.full_like(own, math.nan), own[0].isfinite()
+        alike = self.on(tried, near, own).float()
+        votes = alike @ free.float()
+        while bool(votes.max() > self.least):  # The largest first; each is tried once.
+            most = votes.argmax()
+            member, plane = (alike[most] > 0) & free, tried[:, most]
+            for _ in range(2):
                 weight = torch.where(member, near.square().reciprocal(), 0.0)
                 rows = ray * weight
                 right = rows @ torch.where(member, near * weight, 0.0)
                 plane = solved((rows @ rows.T)[:, :, None], right[:, None])[:, 0]
-                facing = plane / plane.square().sum().sqrt()
-                off = ((plane @ ray) / near - 1.0).abs()
-                member = free & (off < self.wide_plane) & (facing @ normal > self.alike)
-            member = member & (member.sum() > size)
-            spread = nn.functional.max_pool2d(
-                member.to(near.dtype).reshape(1, self.rows, self.columns), 5, 1, 2
-            )
-            beside = (spread.reshape(-1) > 0) & (off < self.wide_plane) & (off < left)
-            chosen = member | (beside & ~fits)
-            best = torch.where(chosen, plane[:, None], best)
-            left = torch.where(chosen, off, left)
-            free = free & ~member
-        return best, fits | left.isfinite(), left.isfinite()
+                member = free & self.on(plane[:, None], near, own)[0]
+            member = member & (member.sum() > self.least)
+            best, free = torch.where(member, plane[:, None], best), free & ~member
+            alike[most] = 0.0
+            votes = alike @ free.float()
+        return best
+
+    def on(self, planes: Tensor, near: Tensor, own: Tensor) -> Tensor:
+        """Return which cells, of planes `own` (3, N), are on planes (3, C): (C, N)."""
+        met = (planes.T @ self.cell_rays.double() / near - 1.0).abs() < self.off_plane
+        normal = own / own.square().sum(0).sqrt()
+        facing = planes / planes.square().sum(0).sqrt()
+        return met & (facing.T @ normal > 0.5**0.5)
 
 
 def solved(matrix: Tensor, right: Tensor) -> Tensor:

@@ -16,9 +16,6 @@ from tofcorr.options import Number, Options, PositiveNumber, one_line
 
 _LOG = logging.getLogger(__name__)
 
-_FLAT = 0.001
-"""Share of its area by which what is flat and convex may differ from its hull: an arc of 9 degrees.
-Chosen: it is off its plane by 2 % of its length."""
 _SIZES = 0.1, 300.0
 """Least and largest size of a room, metres. Chosen: a cupboard stated in millimetres and read as
 metres is larger, a hall is not; and a hall that is scaled for nothing is smaller."""
@@ -108,8 +105,8 @@ class MeshFile(Options):
         found, alone = list[tuple[float, Tensor]](), torch.ones_like(areas, dtype=torch.bool)
         for facet in mesh.facets:
             points, area = corners[facet].reshape(-1, 3), float(areas[facet].sum())
-            # Of what is bent, or not convex, the triangles stay.
-            if abs(Face.around(points)[1] - area) < _FLAT * area:
+            # Of what is bent, or not convex, the triangles stay. Files hold single precision.
+            if abs(Face.around(points)[1] - area) < torch.finfo(torch.float32).eps ** 0.5 * area:
                 found.append((area, points))
                 alone[facet] = False
         found += zip(areas[alone].tolist(), corners[alone], strict=True)

@@ -3,9 +3,9 @@ r"""Second bounces by walls that other frames of a recording show.
 One frame shows a part of a room. Frames of known poses show more of it: large planes, each with a
 brightness, which is its amplitude times the squared distance over the cosine of incidence. What
 the camera would see beside its image is the nearest plane on each ray. The light is then that of
-`tofcorr.scene_light.bounces`, from patches at even angles from the optical axis. Those beyond the
-cone of the camera's light send on what the others send them: without them a sixth is missing in
-front of a wall and a floor.
+`tofcorr.scene_light.bounces`, from patches of even solid angles before the camera. Those beyond the
+cone of its light send on what the others send them: without them a sixth is missing in front of a
+wall and a floor.
 """
 
 import math
@@ -15,24 +15,14 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.rays import SPEED_OF_LIGHT
-from tofcorr.scene_light.bounces import SecondBounces
+from tofcorr.scene_light.bounces import SecondBounces, transfer
+from tofcorr.scene_light.planes import OFF_PLANE
 
-_OFF_PLANE = 0.03
-"""Share of its distance by which a point may miss its plane, as of large planes in one frame."""
 _LEAST = 0.02
 """Least share of all points that makes a plane, and most that one may hide. Chosen."""
-_TRIES = 200
-"""Planes through three points that are tried. Chosen: one of half of the points is met surely."""
-_SIDE = 36
-"""Patches on either side of what is before the camera. Set on rendered walls: 48 change the light
-by 1 %, 24 by 4 %."""
-_POINTS = 144
-"""Of a frame that planes are found from. Chosen."""
-_WIDEST = math.radians(70)
-"""How far off the optical axis patches are laid, to each side. Set there: 80 degrees change the
+_PATCHES = 1296
+"""Patches of the half sphere before the camera. Set on rendered walls: twice as many change the
 light by 1 %."""
-_BOUNCES = 4
-"""Bounces that are followed between patches. Set there: six change the light by 1 %."""
 
 
 class Surroundings(NamedTuple):
@@ -70,7 +60,8 @@ class CameraLight(NamedTuple):
 def sampled(rays: Tensor) -> Tensor:
     """Return the pixels of rays (P, 3) that surroundings are found from, (Q,), int64."""
     generator = torch.Generator().manual_seed(0)
-    return torch.randint(len(rays), (_POINTS,), generator=generator)
+    # Of a plane of the least share every frame shows three.
+    return torch.randint(len(rays), (round(3 / _LEAST),), generator=generator)
 
 
 def surroundings_of(
@@ -95,7 +86,7 @@ def surroundings_of(
     place = origin + ray * distance[:, None]
     found = large_planes(place, distance, known)
     through = (found[:, 3] - origin @ found[:, :3].T) / (ray @ found[:, :3].T)
-    hidden = (through > 0) & (through < (1 - 2 * _OFF_PLANE) * distance[:, None])
+    hidden = (through > 0) & (through < (1 - 2 * OFF_PLANE) * distance[:, None])
     planes = torch.cat([known, found[hidden.sum(0) <= _LEAST * len(place) + 3]])
     if not len(planes):
         return Surroundings(planes[:, :3], planes[:, 3], planes[:, 3])
@@ -127,18 +118,20 @@ def large_planes(place: Tensor, distance: Tensor, known: Tensor) -> Tensor:
 def nearest_plane(place: Tensor, distance: Tensor, planes: Tensor) -> Tensor:
     """Return which of planes (K, 4) each point is on (N,), the nearest; -1: on none."""
     off = (place @ planes[:, :3].T - planes[:, 3]).abs() / distance[:, None]
-    off = torch.nn.functional.pad(off, (0, 1), value=_OFF_PLANE)
+    off = torch.nn.functional.pad(off, (0, 1), value=OFF_PLANE)
     own = off.argmin(1)
     return torch.where(own < len(planes), own, -1)
 
 
 def _largest_plane(place: Tensor, distance: Tensor, generator: torch.Generator) -> Tensor:
     """Return normal and offset (4,) of the plane that most points (N, 3) are on."""
-    three = place[torch.randint(len(place), (_TRIES, 3), generator=generator)]
+    # So often that no three are on a plane of half of the points is as rare as rounding is small.
+    tries = math.ceil(math.log(torch.finfo(torch.float64).eps) / math.log(1 - 0.5**3))
+    three = place[torch.randint(len(place), (tries, 3), generator=generator)]
     normal = torch.linalg.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=1)
     missed = (place @ normal.T - (normal * three[:, 0]).sum(1)).abs() / distance[:, None]
-    near = (missed < _OFF_PLANE) & (normal.norm(dim=1) > 0.5)  # Three points on a line have none.
+    near = (missed < OFF_PLANE) & (normal.norm(dim=1) > 0.5)  # Three points on a line have none.
     own, plane, middle = near[:, near.sum(0).argmax()], normal[0], place[0]
     for _ in range(2):
         middle = place[own].mean(0)
@@ -167,46 +160,44 @@ def bounced(
         normal: Unit normals there, towards the camera (N, 3).
     """
     rotation, origin = light.world_from_camera[:3, :3], light.world_from_camera[:3, 3]
-    step = 2 * _WIDEST / _SIDE
-    turned = (torch.arange(_SIDE, dtype=torch.float64) - (_SIDE - 1) / 2) * step
-    slope = torch.cartesian_prod(turned.tan(), turned.tan())
-    width = (turned + step / 2).tan() - (turned - step / 2).tan()
-    ray = torch.nn.functional.normalize(torch.nn.functional.pad(slope, (0, 1), value=1.0))
-    solid, ahead = torch.cartesian_prod(width, width).prod(1) * ray[:, 2] ** 3, ray[:, 2]
-    ray = ray @ rotation.T
+    # Even steps along the axis are even solid angles; the golden ratio spreads them around it.
+    number = torch.arange(_PATCHES, dtype=torch.float64)
+    ahead, around = (1 - (number + 0.5) / _PATCHES).sqrt(), torch.pi * (5**0.5 - 1) * number
+    across, solid = (1 - ahead.square()).sqrt(), torch.pi / (_PATCHES * ahead)
+    ray = torch.stack([across * around.cos(), across * around.sin(), ahead], dim=1) @ rotation.T
     away, plane = _met(surroundings, origin, ray)
     there = away.isfinite()
-    ray, solid, away, plane, ahead = (x[there] for x in (ray, solid, away, plane, ahead))
+    ray, away, plane, ahead, solid = (x[there] for x in (ray, away, plane, ahead, solid))
     facing = surroundings.normal[plane]
-    cosine = (facing * ray).sum(1, keepdim=True)
-    area = (solid * away.square() / cosine[:, 0].abs()).float()
-    strength = (light.gain * surroundings.brightness[plane] * solid).float()
+    cosine = (facing * ray).sum(1)
     # Places from the camera: single precision is a tenth of the time of double.
-    patch, facing, length = (ray * away[:, None]).float(), (-facing * cosine.sign()).float(), away
-    length, per_metre = length.float(), 2 * math.pi * light.frequency / SPEED_OF_LIGHT
+    area = (solid * away.square() / cosine.abs()).float()
+    strength = (light.gain * surroundings.brightness[plane] * solid).float()
+    patch, facing = (ray.T * away).float(), (-facing.T * cosine.sign()).float()
+    length, per_metre = away.float(), 2 * torch.pi * light.frequency / SPEED_OF_LIGHT
 
     def received(at: Tensor, up: Tensor) -> Tensor:
         """Return what points get of each patch if all are lit, over direct light, (N, P)."""
-        own, height = at.norm(dim=1, keepdim=True), -(at * up).sum(1, keepdim=True)
-        square = (own.square() + length.square() - 2 * (at @ patch.T)).clamp(min=1e-6)
-        kernel = (up @ patch.T + height).clamp(min=0)
-        kernel = kernel * (at @ facing.T - (patch * facing).sum(1)).clamp(min=0)
-        kernel = kernel * strength / (square * (square + area / math.pi))
-        direct = own**3 / height.clamp(min=1e-6)
-        return torch.polar(kernel * direct, per_metre * (length + square.sqrt() - own))
+        own, height = at.norm(dim=0)[:, None], -(at * up).sum(0)[:, None]
+        share, way = transfer(at, up, patch, facing, area)
+        share = share * strength * torch.where(height > 0, own**3 / height, 0.0)
+        return torch.polar(share, per_metre * (length + way - own))
 
     # What is not lit sends light on as well.
     lit = (ahead >= math.cos(light.half_angle)).to(torch.complex64)
-    between, turn, brighter = received(patch, facing), lit, torch.ones_like(length)
-    of_plane = torch.nn.functional.one_hot(plane, len(surroundings.offset)).float()
+    between, brighter = received(patch, facing), torch.ones_like(length)
     # As a camera sees them: solid angles, of what is lit.
+    of_plane = torch.nn.functional.one_hot(plane, len(surroundings.offset)).float()
     weight = of_plane * (lit.real * solid.float())[:, None]
-    for _ in range(_BOUNCES):
-        turn = lit + between @ (turn / brighter)
+    turn, before = lit, torch.zeros_like(lit)
+    # Until a bounce changes less than patches of their size do.
+    while (turn / brighter - before).abs().amax() > torch.pi / _PATCHES:
+        before = turn / brighter
+        turn = lit + between @ before
         if not surroundings.direct:
-            mean = turn.abs() @ weight / weight.sum(0).clamp(min=1e-9)
+            mean = turn.abs() @ weight / weight.sum(0)
             brighter = torch.where(mean > 0, mean, 1.0)[plane]
-    light_there = received((place - origin).float(), normal.float()) @ (turn / brighter)
+    light_there = received((place - origin).T.float(), normal.T.float()) @ (turn / brighter)
     return light_there.to(torch.complex128)
 
 
@@ -234,7 +225,7 @@ def added_around(
     ray = bounces.cell_rays.double().T @ rotation.T
     met, plane = _met(surroundings, origin, ray)
     # What is not before the planes is on them: measured, it seems farther by second bounces.
-    alone = (cells < (1 - 2 * _OFF_PLANE) * met) | ~met.isfinite()
+    alone = (cells < (1 - 2 * OFF_PLANE) * met) | ~met.isfinite()
     at = torch.where(alone, cells, met)
     normal = -torch.nn.functional.normalize(planes.double(), dim=0).T @ rotation.T
     flat = surroundings.normal[plane]

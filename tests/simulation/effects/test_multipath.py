@@ -28,13 +28,13 @@ def test_light_by_a_floor_is_the_sum_over_its_patches() -> None:
     distance = float(np.linalg.norm(ray))
     cosine = -ray[2] / distance
     total = 0.0j
-    for up, depth in ((0.1, 0.2), (0.3, 0.3), (0.8, 0.7)):
-        for aside in (-0.5, 0.0, 0.5):
+    for up, depth in ((0.1, 0.2), (0.4, 0.4), (1.0, 0.8)):
+        for aside in (-1.4 / 3, 0.0, 1.4 / 3):
             patch = np.array([point[0] + aside, -1.1, up])
             lit, seen = patch - camera, point - patch
             first, second = np.linalg.norm(lit), np.linalg.norm(seen)
             irradiance = -lit[1] / first / first**2
-            arriving = irradiance / np.pi * (0.5 * depth) * (seen[1] / second) / second**2
+            arriving = irradiance / np.pi * (1.4 / 3 * depth) * (seen[1] / second) / second**2
             arriving *= -seen[2] / second
             late = np.exp(1j * turn * (first + second - distance) / 2)
             total += arriving * late / (cosine / distance**2)

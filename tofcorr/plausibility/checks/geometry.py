@@ -237,7 +237,8 @@ def _target(look: Look, shape: dict[str, Estimate]) -> Iterator[Finding]:
     typical = float(np.median((problem.distance**2 / np.abs(problem.cosine))[problem.used]))
     if ((rising > SPOILS) & (rising > SIGMAS * rim.error)).any():
         where = f"{1e3 * float(rising.max()):.0f} mm off at one end, from wherever it is seen"
-        yield doubtful(f"The target lies {where}: a second reflection? Mask it.", check="rim")
+        advice = "a second reflection? Mask it, unless runtime.second_bounces removes it"
+        yield doubtful(f"The target lies {where}: {advice}.", check="rim")
     elif ((sag > SPOILS) & (sag > SIGMAS * curved.error * half_width**2)).any():
         where = f"{1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of its middle"
         said = f"The target is bent by {where}, from wherever it is seen"

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tofcorr.geometry import se3
 from tofcorr.geometry.polynomials import exponents, products
-from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
+from tofcorr.geometry.rays import AT_ONCE, SPEED_OF_LIGHT, ray_directions
 from tofcorr.options import Number, PositiveNumber
 from tofcorr.scene_light.bounces import SecondBouncesState
 from tofcorr.scene_light.surroundings import (
@@ -36,26 +36,21 @@ from tofcorr.simulation.effects.surface import LEAST_COSINE
 from tofcorr.simulation.effects.target_shape import AreaShape
 from tofcorr.simulation.hooks import FrameState
 
-SIDES = (("left", 0, -1.0), ("right", 0, 1.0), ("below", 1, -1.0), ("above", 1, 1.0))
-"""Where surfaces stand: name, axis of the target, and sign."""
+SIDES = ("left", "right", "below", "above")
+"""Where surfaces stand: before and after the target along its first axis, and its second."""
 BEYOND = {"near": 0.05, "far": 0.4}
 """Distance of a surface from the edge of the field of view on the target, in widths of that field.
 Set by hand: a surface close by, and one farther away."""
-# Patches of a surface: distances from the target, their depths, and positions along the edge
-# relative to the point of the target, in widths of the field; all of one width. Set by hand: nine
-# patches sum up to a smooth surface where it matters, near the target.
-_BEFORE, _DEPTH = (0.05, 0.15, 0.4), (0.1, 0.15, 0.35)
-_ASIDE = (-0.25, 0.0, 0.25)
-_WIDTH = 0.25
+# Rows of patches of a surface end at these distances from the target, in widths of the field. Each
+# has three patches along the edge, as wide together as the rows are deep. Set by hand: nine patches
+# sum up to a smooth surface where it matters, near the target.
+_ROWS = (0.0, 0.1, 0.3, 0.7)
 
 SECOND_BOUNCES = "second_bounces"
 """Name of the coefficient of second bounces by surfaces that the frames show."""
 _CONES = (1.0, 1.2, 1.4)
 """Half angles of the light that are tried, over that of the image's corners. Chosen: light beyond
 the image is lost, so that no camera sends much of it."""
-
-# Pixels evaluated at once. Chosen: what is computed of them stays in a processor's cache.
-_AT_ONCE = 10_000
 
 
 def light_by_surfaces(
@@ -78,11 +73,13 @@ def light_by_surfaces(
     extent = max(high[0] - low[0], high[1] - low[1])
     # Along the last axes: where a patch lies along the edge, and how high. A patch nearer than the
     # lowest is high is no point source.
-    up, depth, aside = (extent * xy.new_tensor(row) for row in (_BEFORE, _DEPTH, _ASIDE))
-    aside, height = aside[:, None], camera[:, 2, None, None] - up
+    ends = extent * xy.new_tensor(_ROWS)
+    up, depth, width = (ends[1:] + ends[:-1]) / 2, ends.diff(), ends[-1] / 3
+    aside, height = width * xy.new_tensor([[-1], [0], [1]]), camera[:, 2, None, None] - up
     direct = (distance**2 / cosine.clamp(min=LEAST_COSINE))[:, None, None]
     surfaces = []
-    for (_, axis, sign), beyond in itertools.product(SIDES, BEYOND.values()):
+    for number, beyond in itertools.product(range(len(SIDES)), BEYOND.values()):
+        axis, sign = number // 2, 2 * (number % 2) - 1
         wall = (high[axis] if sign > 0 else -low[axis]) + beyond * extent
         lit = (wall - sign * camera[:, axis]).clamp(min=0.0)[:, None, None]
         away = (wall - sign * xy[:, axis])[:, None, None]
@@ -91,7 +88,7 @@ def light_by_surfaces(
         second = (away**2 + aside**2 + up**2).sqrt()
         # Three cosines, and the fall of the light on both parts of the path.
         cosines = depth * up * lit * away
-        strength = (_WIDTH * extent / torch.pi) * cosines / (first**3 * second.square().square())
+        strength = (width / torch.pi) * cosines / (first**3 * second.square().square())
         extra = first + second - distance[:, None, None]
         surfaces.append(torch.polar(strength * direct, turn / 2 * extra).sum((-1, -2)))
     return torch.stack(surfaces, dim=-1)
@@ -176,7 +173,7 @@ class MultipathEffect(SignalEffect, shape=MultipathShape):
     remedy = "move the target within the room, or cover the floor with something black"
     needs = (FREQUENCY, FIXED_TARGET)
     _of_unseen = (
-        *(Coefficient(f"{side}_{place}", "1", 0.5) for side, _, _ in SIDES for place in BEYOND),
+        *(Coefficient(f"{side}_{place}", "1", 0.5) for side in SIDES for place in BEYOND),
         *(
             Coefficient(f"room_x{i}_y{j}{suffix}", "m", 0.03 / (1 + i + j))
             for suffix in ("", "_distance")
@@ -334,7 +331,7 @@ def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor
     camera = camera_over_target(inputs)
     parts = [
         light_by_surfaces(inputs.target_xy[k], camera[k], distance[k], cosine[k], shape, turn)
-        for k in torch.arange(len(distance)).split(_AT_ONCE)
+        for k in torch.arange(len(distance)).split(AT_ONCE)
     ]
     light = torch.cat(parts)
     light = light.masked_fill(light.isnan(), 0.0)  # Beside the target.
