@@ -67,15 +67,15 @@ def fit_gain(
 
     seen = [(pose, *bounces.cells(*one)) for one, pose in zip(frames, poses, strict=True)]
     started, last = bounces.gain, math.inf
+    gain = started
     try:
         while True:
             found, error, planes = _solved(bounces, seen, functions)
-            gain = float(found[-1])
-            step = max(gain, bounces.gain / 2) - bounces.gain  # It may overshoot.
-            # Until it is within its own uncertainty, or comes no nearer.
-            if not error < abs(step) < last:
+            change, gain = abs(float(found[-1]) - gain), float(found[-1])
+            # Until it changes by less than its own uncertainty, or by no less than before.
+            if not error < change < last:
                 break
-            last, bounces.gain = abs(step), bounces.gain + step
+            last, bounces.gain = change, max(gain, bounces.gain / 2)  # A step may overshoot.
     finally:
         bounces.gain = started
     reach = float(stdtrit(planes - len(found), (1 + CONFIDENCE) / 2)) * error
