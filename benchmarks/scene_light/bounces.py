@@ -99,10 +99,10 @@ def calibrate(seed: int, views: int, light: tuple[float, float, float]) -> Calib
     shown = (torch.stack(each).flatten() for each in zip(*seen[len(walls) :], strict=True))
     true = torch.tensor(np.stack([frame.distance for frame in lone])).flatten()
     there = true.isfinite()  # A ray may slip through, between two triangles.
-    distance, light = (each[there] for each in shown)
-    off = (distance - true[there])[:, None]
-    coefficients = torch.linalg.lstsq(functions(distance, light).T, off).solution[:, 0]
-    ranges = [(float(each.min()), float(each.max())) for each in (distance, light)]
+    radial, strength = (each[there] for each in shown)
+    off = (radial - true[there])[:, None]
+    coefficients = torch.linalg.lstsq(functions(radial, strength).T, off).solution[:, 0]
+    ranges = [(float(each.min()), float(each.max())) for each in (radial, strength)]
     bounces.gain = fit.gain
     low, high = (GAIN * end for end in fit.interval)
     return Calibration(bounces, coefficients, ranges, GAIN * fit.gain, (low, high))

@@ -150,8 +150,10 @@ def test_a_camera_that_stands_still_determines_no_hand_eye_transform(wall: Datas
         camera = row.world_from_tool @ wall.first.tool_from_camera
         normal, offset = row.normal_world @ camera[:3, :3], row.normal_world @ camera[:3, 3]
         plane = np.append(normal, row.offset + offset)
-        known = live.add(depth[0], amplitude[0], np.eye(4), plane=plane)
-    assert not known.is_determined
+        live.add(depth[0], amplitude[0], np.eye(4), plane=plane)
+    assert live.known is not None
+    assert live.known.fit is not None
+    assert not live.known.is_determined
 
 
 def test_a_removed_frame_was_never_there(wall: Dataset) -> None:
