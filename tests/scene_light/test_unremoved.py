@@ -100,7 +100,9 @@ def test_a_bend_that_the_calibration_explains_is_no_light(generator: Generator) 
     own = unremoved(**CONE)
     measured, strength = own.bounces.cells(*walls(WALL))
     known, nothing = own.bounces.planes(measured), torch.zeros(2, 1, 24 * 32).double()
-    bend = own.columns_beyond(known, strength, nothing, known[2])[-4]  # Of a floor just below.
+    bend = own.columns_beyond(known, strength, nothing, known[0][:, 0])[
+        -4
+    ]  # Of a floor just below.
     noisy = measured + 0.5 * bend + 1e-3 * torch.randn(24 * 32, generator=generator).double()
 
     def light_of(explained: Tensor) -> float:
@@ -117,7 +119,7 @@ def test_only_where_light_reaches_surfaces_outside_of_the_image_add_some() -> No
         radial, light = own.bounces.cells(*walls(WALL))
         nothing = torch.zeros(2, 1, radial.shape[0]).double()
         known = own.bounces.planes(radial)
-        return float(own.columns_beyond(known, light, nothing, known[2]).amax())
+        return float(own.columns_beyond(known, light, nothing, known[0][:, 0]).amax())
 
     assert most(20.0) == 0
     assert 0 < most(40.0) < most(50.0)

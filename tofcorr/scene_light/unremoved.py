@@ -151,16 +151,14 @@ class UnremovedBounces(nn.Module):
             Square metres (N,), and metres (N,).
         """
         left, moves = here - smooth, smooth.square() * self.bounces.cell_rays.double()
-        used = known[2] & left.isfinite() & strength.isfinite()
-        free, largest, faces = used, used & False, torch.jit.annotate(list[Tensor], [])
+        planes, used = known[0], known[2] & left.isfinite() & strength.isfinite()
+        if not bool(used.any()):
+            return torch.zeros_like(left), left
+        light = self.columns_beyond(known, strength, ratio, planes[:, used].mode(1)[0])
+        shown, free = torch.cat([left[None], light, explained]), used
         while bool(free.any()):
-            faces.append(free & (known[0] == known[0][:, free][:, :1]).all(0))
-            free = free & ~faces[-1]
-            if faces[-1].sum() > largest.sum():
-                largest = faces[-1]
-        light = self.columns_beyond(known, strength, ratio, largest)
-        shown = torch.cat([left[None], light, explained])
-        for face in faces:
+            face = free & (planes == planes[:, free][:, :1]).all(0)
+            free = free & ~face
             base = torch.linalg.qr(moves[:, face].T)[0]
             shown[:, face] = shown[:, face] - (shown[:, face] @ base) @ base.T
         values, others = shown[0, used], shown[1 + len(light) :, used]
@@ -196,7 +194,9 @@ class UnremovedBounces(nn.Module):
         inside = (means[1:] - means[:1].square()).clamp(min=0)
         return nn.functional.avg_pool2d(inside, 2, 1).reshape(-1)
 
-    def columns_beyond(self, known: Planes, strength: Tensor, ratio: Tensor, own: Tensor) -> Tensor:
+    def columns_beyond(
+        self, known: Planes, strength: Tensor, ratio: Tensor, plane: Tensor
+    ) -> Tensor:
         """Return what white surfaces at right angles to a plane add to distances (S, N), metres.
 
         They begin where the rays `toward` meet the plane, and hide what stands behind them.
@@ -205,7 +205,7 @@ class UnremovedBounces(nn.Module):
             known: As in `outside`.
             strength: As in `outside`.
             ratio: As in `outside`.
-            own: Which cells are on the plane (N,).
+            plane: Its g (3,).
         """
         bounces, waves, planes = self.bounces, self.bounces.wave_numbers, known[0]
         place, normal, away, cosine, area = bounces.surfaces(
@@ -220,7 +220,7 @@ class UnremovedBounces(nn.Module):
         shown = torch.cat([middle, facing, whole[None]])
         far, there = bounces.around(planes, seen & known[1], known[2], strength)
         edge = turn[:, :, bounces.out_from]
-        here, plane = torch.cat([place, normal]).nan_to_num(), planes[:, own].mean(1)
+        here = torch.cat([place, normal]).nan_to_num()
         white = math.pi * bounces.gain  # The reflectivity of what sends an amplitude of one.
         out, found = bounces.out_rays.double(), torch.jit.annotate(list[Tensor], [])
         for i in range(self.toward.shape[2]):
