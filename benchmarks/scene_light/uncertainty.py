@@ -3,98 +3,48 @@
     python -m benchmarks.scene_light.uncertainty --seed 1
 
 `corrector.uncertainty` gives the standard deviation of each pixel of the scenes of
-`benchmarks.scene_light.bounces`, with noise and a base error that was calibrated on lone walls, and
+`benchmarks.scene_light.bounces`, with noise, after a calibration on walls of other seeds, and
 of `benchmarks.scene_light.edges` with flying pixels. The error over it should be below 1 in 68.3
 and below 2 in 95.4 percent of the pixels. Pixels that are not valid are left out.
 """
 
 import argparse
+import tempfile
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+import tofcorr
 from benchmarks.scene_light import edges, rooms
-from benchmarks.scene_light.bounces import OTHER_SEED, Image, base_error, calibrate, camera
+from benchmarks.scene_light.bounces import OTHER_SEED, WALLS, Image
+from benchmarks.scene_light.walls import QUIET, RUNTIME, recorded, seen
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.state import CalibrationState
+from tofcorr.correction.state import CalibrationState, SceneLight
 from tofcorr.error_terms.base import Domain, Interval
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.scene_light.flying import FlyingPixelsOptions
 from tofcorr.training.scene import shown_by
 
-VARIANCE = 3.5e-3**2 * 300  # square metres times counts: 3.5 mm at 300 counts
+LONE, LIT = 12, 2  # seeds of the walls of a calibration, one frame of each; two of each
 NEAR = 0.15  # metres to another surface
 STEP = 0.06  # from a pixel to the next, as a share of the distance: an edge
 CLASSES = ("elsewhere", "near a corner", "edge")
-LOG = {"kind": "amplitude_polynomial", "variable": "log_amplitude", "degree": 1}
-TERMS = [{"kind": "distance_polynomial", "degree": 5}, LOG]
 
 
-def seen(
-    frame: rooms.Frame, draw: np.random.Generator | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance and amplitude (H, W) as the camera gives them; None: without noise."""
-    amplitude = frame.amplitude * abs(1 + frame.ratio)
-    noise = np.sqrt(VARIANCE / amplitude) * (draw.normal(size=amplitude.shape) if draw else 0.0)
-    distance = frame.distance + frame.error + base_error(frame.distance + frame.error, amplitude)
-    return torch.tensor(distance + noise).float(), torch.tensor(amplitude).float()
-
-
-def built(view: CameraIntrinsics, terms: list[Any], domain: Domain, **known: Any) -> DepthCorrector:  # noqa: ANN401
-    """A corrector of radial distances."""
-    options = ErrorModelOptions.from_mapping({"terms": terms}, "benchmark")
-    fixed = {"tool_from_camera": torch.eye(4).double(), "hand_eye_estimated": False}
-    values = fixed | {"camera": view, "depth_kind": "radial", "name": "walls", "domain": domain}
-    return DepthCorrector.from_state(CalibrationState(error_model=options, **values, **known))
-
-
-def calibrated(seed: int, views: int) -> DepthCorrector:
-    """Calibrate on walls: the gain by their curvature, the base error on lone ones."""
-    known, draw = calibrate(seed, views, (0.0, 0.0, 0.0)), np.random.default_rng(seed)
-    lone = rooms.rendered("lone_wall", seed, views)
-    noisy = torch.stack([seen(frame, draw)[0] for frame in lone]).double()
-    # The functions are taken where there is no noise: beside the amplitude, which has none here,
-    # a distance tells its own noise.
-    distance, light = (
-        torch.stack(images).double() for images in zip(*map(seen, lone), strict=True)
-    )
-    ends = [
-        Interval(float(image.min()), float(image.max()))
-        for image in (distance, light, light * distance**2)
-    ]
-    domain = Domain(
-        height=rooms.HEIGHT,
-        width=rooms.WIDTH,
-        radial_distance=ends[0],
-        amplitude=ends[1],
-        normalised_amplitude=ends[2],
-    )
-    model = ErrorModel(ErrorModelOptions.from_mapping({"terms": TERMS}, "benchmark"), domain)
-    columns = []
-    for unit in torch.eye(len(model.symbols())).double():
-        model.set_coefficient_vector(unit)
-        columns.append(model(distance, light).detach().reshape(-1))
-    weight = light.sqrt().reshape(-1)  # Of noise whose variance falls with one over the light.
-    design = torch.stack(columns, dim=1) * weight[:, None]
-    truth = torch.tensor(np.stack([frame.distance for frame in lone]))
-    off = (noisy - truth).reshape(-1) * weight
-    inverse = torch.linalg.inv(design.T @ design)
-    found = inverse @ (design.T @ off)
-    bounces = known.bounces
-    state = {"frequencies_hz": (rooms.FREQUENCY,), "light_half_angle_deg": rooms.CONE}
-    state |= {"gain": bounces.gain, "gain_interval": [x / rooms.GAIN for x in known.interval]}
-    return built(
-        camera(),
-        TERMS,
-        domain,
-        coefficients=found,
-        covariance=inverse * (off - design @ found).square().mean(),
-        noise=(0.0, VARIANCE, 0.0),
-        scene={"second_bounces": state},
-    )
+def calibrated(seed: int) -> DepthCorrector:
+    """Calibrate as a user does: on lone walls, and a few with a floor or a side wall in view."""
+    first = LONE * seed  # No other seed has any of these walls.
+    frames = [frame for k in range(LONE) for frame in rooms.rendered("lone_wall", first + k, 1)]
+    for name in WALLS:
+        frames += [frame for k in range(LIT) for frame in rooms.rendered(name, first + k, 2)]
+    config = QUIET | {"runtime": RUNTIME, "split": {"test_fraction": 0.0}}
+    with tempfile.TemporaryDirectory() as folder:
+        recording = recorded(frames, seed, Path(folder) / "walls")
+        return tofcorr.train(recording, config, force=True).corrector()
 
 
 def class_of(frame: rooms.Frame) -> Image:
@@ -145,10 +95,20 @@ def of_edges(seed: int, count: int) -> None:
     shown = shown_by(depth, light, view, "radial", FlyingPixelsOptions())
     assert shown is not None, "the frames show flying pixels"
     domain = Domain(height=view.height, width=view.width, radial_distance=Interval(0.1, 7.0))
-    nothing = {"coefficients": torch.zeros(1), "covariance": torch.zeros(1, 1)}
-    known: dict[str, Any] = {name: value.double() for name, value in nothing.items()}
-    scene = {"flying_pixels": shown}
-    correct = built(view, [], domain, noise=shown.noise, scene=scene, **known)
+    state = CalibrationState(
+        name="edges",
+        camera=view,
+        depth_kind="radial",
+        domain=domain,
+        error_model=ErrorModelOptions(terms=()),
+        coefficients=torch.zeros(1).double(),
+        covariance=torch.zeros(1, 1).double(),
+        noise=shown.noise,
+        tool_from_camera=torch.eye(4).double(),
+        hand_eye_estimated=False,
+        scene=SceneLight(flying_pixels=shown),
+    )
+    correct = DepthCorrector.from_state(state)
     for kind, own in frames.items():
         parts: dict[str, list[Image]] = {"beside flagged": [], "elsewhere": []}
         for frame in own:
@@ -172,7 +132,7 @@ def main() -> None:
     torch.set_num_threads(1)
     kinds: dict[str, list[Image]] = {name: [] for name in (*rooms.SCENES, *CLASSES)}
     for seed in given.seed:
-        correct = calibrated(seed + OTHER_SEED, given.views)
+        correct = calibrated(seed + OTHER_SEED)
         for name in rooms.SCENES:
             draw = np.random.default_rng(seed + 1)
             for frame in rooms.rendered(name, seed, given.views):

@@ -2,28 +2,44 @@
 
     python -m benchmarks.scene_light.walls --seed 1
 
-The camera and the scenes are those of `benchmarks.scene_light.uncertainty`. A recording holds walls
-with the floor mostly outside of the image. It is fitted with second bounces in the frames, and
-without. Both correct walls of another seed; second bounces are removed with the same gain.
+A recording holds walls with the floor mostly outside of the image. It is fitted with second bounces
+in the frames, and without. Both correct walls of another seed; second bounces are removed with the
+same gain.
 """
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 import tofcorr
 from benchmarks.scene_light import rooms
-from benchmarks.scene_light.bounces import Image, camera
-from benchmarks.scene_light.uncertainty import TERMS, seen
+from benchmarks.scene_light.bounces import Image, base_error, camera
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
 from tofcorr.training.run import calibration_state
 
 HELD_OUT = 7  # what is added for the seed of the walls that are corrected
+VARIANCE = 3.5e-3**2 * 300  # square metres times counts: 3.5 mm at 300 counts
+LOG = {"kind": "amplitude_polynomial", "variable": "log_amplitude", "degree": 1}
+TERMS = [{"kind": "distance_polynomial", "degree": 5}, LOG]
+QUIET: dict[str, Any] = {"name": "walls", "model": {"terms": TERMS}, "figures": False, "advice": 0}
+RUNTIME = {"second_bounces": {"light_half_angle_deg": rooms.CONE}}
+
+
+def seen(
+    frame: rooms.Frame, draw: np.random.Generator | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance and amplitude (H, W) as the camera gives them; None: without noise."""
+    amplitude = frame.amplitude * abs(1 + frame.ratio)
+    noise = np.sqrt(VARIANCE / amplitude) * (draw.normal(size=amplitude.shape) if draw else 0.0)
+    distance = frame.distance + frame.error + base_error(frame.distance + frame.error, amplitude)
+    return torch.tensor(distance + noise).float(), torch.tensor(amplitude).float()
 
 
 def wall_of(frame: rooms.Frame) -> Image:
@@ -31,10 +47,10 @@ def wall_of(frame: rooms.Frame) -> Image:
     return frame.shape == np.bincount(frame.shape[frame.shape >= 0]).argmax()
 
 
-def recorded(seed: int, frames: int, folder: Path) -> Path:
-    """Write the walls, whose planes are known."""
+def recorded(frames: Sequence[rooms.Frame], seed: int, folder: Path) -> Path:
+    """Write frames of walls, whose planes are known, with noise."""
     draw, rows, images = np.random.default_rng(seed), [], []
-    for frame in rooms.rendered("wall_and_floor", seed, frames):
+    for frame in frames:
         wall = wall_of(frame)
         normal = np.median(frame.normal[wall], axis=0)
         normal /= np.linalg.norm(normal)
@@ -83,12 +99,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=16)
     given = parser.parse_args()
     torch.set_num_threads(1)
-    quiet = {"name": "walls", "model": {"terms": TERMS}, "figures": False, "advice": 0}
-    runtime = {"second_bounces": {"light_half_angle_deg": rooms.CONE}}
     with tempfile.TemporaryDirectory() as folder:
-        recording = recorded(given.seed, given.frames, Path(folder) / "walls")
-        with_them = tofcorr.train(recording, quiet, force=True)
-        without = tofcorr.train(recording, quiet | {"runtime": runtime}, force=True)
+        walls = rooms.rendered("wall_and_floor", given.seed, given.frames)
+        recording = recorded(walls, given.seed, Path(folder) / "walls")
+        with_them = tofcorr.train(recording, QUIET, force=True)
+        without = tofcorr.train(recording, QUIET | {"runtime": RUNTIME}, force=True)
         states = [calibration_state(x.data, x.options, x.fit) for x in (with_them, without)]
         scene = states[1].scene
         assert scene.second_bounces is not None

@@ -35,9 +35,11 @@ def bounces(**changed: object) -> SecondBounces:
     return SecondBounces(CAMERA, STATE.model_copy(update=changed)).double()
 
 
-def walls(*planes: tuple[tuple[float, float, float], float]) -> tuple[Tensor, Tensor]:
-    """The nearest of planes n . x + d = 0 along each ray, and its light at a reflectivity of pi."""
-    rays, near, light = ray_directions(CAMERA), torch.tensor(math.inf), torch.tensor(0.0)
+def walls(
+    *planes: tuple[tuple[float, float, float], float], camera: CameraIntrinsics = CAMERA
+) -> tuple[Tensor, Tensor]:
+    """The nearest of planes n . x + d = 0 along each ray, lit, half white."""
+    rays, near, light = ray_directions(camera), torch.tensor(math.inf), torch.tensor(0.0)
     for normal, offset in planes:
         cosine = -(rays @ torch.tensor(normal, dtype=torch.float64))
         distance = torch.where(cosine > 0, offset / cosine, math.inf)

@@ -99,7 +99,8 @@ class DepthCorrector(nn.Module):
         self.bounces: SecondBounces | None = state.second_bounces()
         self.unremoved: UnremovedBounces | None = None
         if self.bounces is not None and state.scene.second_bounces is not None:
-            self.unremoved = UnremovedBounces(self.bounces, state.scene.second_bounces)
+            own = self.known_sigma if self.known_sigma.knows_calibration else None
+            self.unremoved = UnremovedBounces(self.bounces, state.scene.second_bounces, own)
         self.flying: FlyingPixels | None = state.flying_pixels()
         scale = geometry.radial_of_depth if self.is_z else geometry.radial_of_depth[:1, :1]
         points = geometry.points(torch.ones_like(geometry.radial_of_depth))
@@ -218,9 +219,9 @@ class DepthCorrector(nn.Module):
         """
         noise, calibration = self.sigma(depth, amplitude)
         variance = noise.square() + calibration.square()
-        corrected, light, _ = self.without_own_error(depth, amplitude)
+        corrected, light, valid = self.without_own_error(depth, amplitude)
         if self.unremoved is not None:
-            added = self.unremoved(corrected * self.radial_of_z, light) / self.radial_of_z
+            added = self.unremoved(corrected * self.radial_of_z, light, valid) / self.radial_of_z
             variance = variance + added.square()
         if self.flying is not None:
             if self.bounces is not None:

@@ -65,23 +65,32 @@ class RuntimeSigma(nn.Module):
             variance = self.noise[0] + weakness * (self.noise[1] + self.noise[2] * weakness)
             noise = torch.where(seen, variance.sqrt(), unknown)
         if self.knows_calibration:
-            distance = radial_distance.clamp(self.nearest, self.farthest)
-            strength = amplitude.clamp(self.weakest, self.strongest)
-            ones = torch.ones_like(distance)
-            functions = [ones.unsqueeze(0)]
-            for term in self.signal_terms:
-                basis = term.basis(distance, strength)  # pyright: ignore[reportCallIssue]
-                functions.append(basis)
-            for place in self.pixel_terms:
-                u, v = torch.broadcast_tensors(rows, columns)
-                found = place.basis(u, v)  # pyright: ignore[reportCallIssue]
-                shape = [found.shape[0]] + list(distance.shape)  # noqa: RUF005
-                if distance.dim() == 3:
-                    found = found.unsqueeze(1)
-                functions.append(found.expand(shape))
-            spread = torch.tensordot(self.factor, torch.cat(functions), dims=1)
+            spread = self.spread(radial_distance, amplitude, rows, columns)
             calibration = torch.where(seen, spread.square().sum(0).sqrt(), unknown)
         return noise, calibration
+
+    def spread(
+        self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
+    ) -> Tensor:
+        """Return independent errors of the calibration (K, ..., H, W), one standard deviation each.
+
+        The arguments are those of `forward`. The squares add up to that of `calibration`.
+        """
+        distance = radial_distance.clamp(self.nearest, self.farthest)
+        strength = amplitude.clamp(self.weakest, self.strongest)
+        ones = torch.ones_like(distance)
+        functions = [ones.unsqueeze(0)]
+        for term in self.signal_terms:
+            basis = term.basis(distance, strength)  # pyright: ignore[reportCallIssue]
+            functions.append(basis)
+        for place in self.pixel_terms:
+            u, v = torch.broadcast_tensors(rows, columns)
+            found = place.basis(u, v)  # pyright: ignore[reportCallIssue]
+            shape = [found.shape[0]] + list(distance.shape)  # noqa: RUF005
+            if distance.dim() == 3:
+                found = found.unsqueeze(1)
+            functions.append(found.expand(shape))
+        return torch.tensordot(self.factor, torch.cat(functions), dims=1)
 
 
 def frozen(terms: Iterable[nn.Module], dtype: torch.dtype = torch.float32) -> nn.ModuleList:

@@ -235,11 +235,17 @@ class SecondBounces(nn.Module):
         """
         measured, strength = self.cells(radial, amplitude)
         shift, planes, large = self.found(measured, strength, rounds)
-        if self.remainder is not None:
-            read = self.remainder.inputs(*self.read(measured, strength, shift, planes, large))
-            left = self.remainder(read[None])[0].reshape(-1)
-            shift = shift + left * (measured - shift)
+        shift = shift + self.learned(measured, strength, shift, planes, large)
         return radial - self.in_pixels(shift, radial, shift, planes)
+
+    def learned(
+        self, measured: Tensor, strength: Tensor, shift: Tensor, planes: Tensor, large: Tensor
+    ) -> Tensor:
+        """Return what the remainder takes off besides what `found` returned, metres (N,)."""
+        if self.remainder is None:
+            return torch.zeros_like(shift)
+        read = self.remainder.inputs(*self.read(measured, strength, shift, planes, large))
+        return self.remainder(read[None])[0].reshape(-1) * (measured - shift)
 
     def read(
         self, measured: Tensor, strength: Tensor, shift: Tensor, planes: Tensor, large: Tensor
@@ -393,27 +399,8 @@ class SecondBounces(nn.Module):
         middle, facing, whole, _ = self.patches(place, normal, area, turn, sends)
         free = self.unhidden(middle, facing, whole)
         start = self.out_from
-        beyond_rays, bright = self.out_rays.double(), amplitude * away.square() / cosine
-        far_planes, reflectivity = self.room.met(beyond_rays)
-        known = reflectivity.isfinite()
-        far_planes = torch.where(known, far_planes, planes[:, start])
-        far = self.surfaces(far_planes, beyond_rays, self.out_solid.double())
-        shown = bright[start]
-        if self.room.corners.shape[0] > 0:
-            # As bright as the cell beside it, or as the cells of its face; if none is, as known.
-            on = ((far_planes.T @ place - 1.0).abs() < self.off_plane) & sends
-            beside, on = on.gather(1, start[:, None])[:, 0], on.to(bright.dtype)
-            of_face = on @ torch.where(sends, bright, 0.0) / on.sum(1)
-            given = (reflectivity / (math.pi * self.gain)).nan_to_num(0.0, 0.0)
-            of_face = torch.where(of_face.isnan(), given, of_face)
-            shown = torch.where(beside | ~known, shown, of_face)
-        if self.continued:
-            known = known | (sends & large)[start]
-        ahead = ((far_planes * beyond_rays).sum(0) > 0) & known
-        ahead = ahead & (far[3] > self.steepest)
-        bright = shown * far[3] / far[2].square() * far[4]
+        table, bright = self.beyond(*self.around(planes, sends, large, amplitude))
         dtype = self.shares.dtype
-        table = torch.where(ahead, torch.cat([far[0], far[1], far[4][None]]), 0.0)
         here = torch.cat([place, normal]).nan_to_num().to(dtype)
         middle = torch.cat([middle, table[:3]], dim=1).to(dtype)
         facing = torch.cat([facing, table[3:6]], dim=1).to(dtype)
@@ -421,14 +408,61 @@ class SecondBounces(nn.Module):
         q = torch.zeros_like(turn)
         for _order in range(rounds):
             light = turned(turn.nan_to_num() * strength, self.wave_numbers, away.nan_to_num())
-            beyond = turned(turn[:, :, start] * bright, self.wave_numbers, far[2])
-            beyond = torch.where(ahead, beyond, 0.0)
+            beyond = turned(turn[:, :, start].nan_to_num() * bright, self.wave_numbers, table[7])
             light = torch.cat([self.summed(light), beyond], dim=2).to(dtype)
             q = self.gathered(here, middle, facing, whole, light, free).to(place.dtype)
             q = turned(q, [-k for k in self.wave_numbers], away)
             q = torch.where(seen, q * (self.gain * away.square() / cosine), 0.0)
             turn = self.direct_and(q)
         return q
+
+    def around(
+        self, planes: Tensor, sends: Tensor, large: Tensor, amplitude: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return g (3, M) of what stands beyond the image, and its brightness (M,); 0: nothing.
+
+        Args:
+            planes: As in `indirect`.
+            sends: Which cells send light (N,).
+            large: As in `indirect`.
+            amplitude: As in `indirect`.
+        """
+        place, _, away, cosine, _ = self.surfaces(
+            planes, self.cell_rays.double(), self.solid.double()
+        )
+        start, bright = self.out_from, amplitude * away.square() / cosine
+        far, reflectivity = self.room.met(self.out_rays.double())
+        known = reflectivity.isfinite()
+        far, shown = torch.where(known, far, planes[:, start]), bright[start]
+        if self.room.corners.shape[0] > 0:
+            # As bright as the cell beside it, or as the cells of its face; if none is, as known.
+            on = ((far.T @ place - 1.0).abs() < self.off_plane) & sends
+            beside, on = on.gather(1, start[:, None])[:, 0], on.to(bright.dtype)
+            of_face = on @ torch.where(sends, bright, 0.0) / on.sum(1)
+            given = (reflectivity / (math.pi * self.gain)).nan_to_num(0.0, 0.0)
+            of_face = torch.where(of_face.isnan(), given, of_face)
+            shown = torch.where(beside | ~known, shown, of_face)
+        if self.continued:
+            known = known | (sends & large)[start]
+        return far, torch.where(known, shown, 0.0)
+
+    def beyond(self, planes: Tensor, brightness: Tensor) -> tuple[Tensor, Tensor]:
+        """Return patches beyond the image, and the amplitudes they send, times their areas (M,).
+
+        Args:
+            planes: g of 1 / r = g . ray on each of the rays out there (3, M).
+            brightness: Amplitudes at 1 m, seen straight on (M,).
+
+        Returns:
+            Place, normal, area and distance from the light, one after the other (8, M); zero where
+            no light is sent.
+        """
+        rays = self.out_rays.double()
+        place, normal, away, cosine, area = self.surfaces(planes, rays, self.out_solid.double())
+        ahead = ((planes * rays).sum(0) > 0) & (cosine > self.steepest) & (brightness != 0)
+        table = torch.cat([place, normal, area[None], away[None]])
+        sent = brightness * cosine / away.square() * area
+        return torch.where(ahead, table, 0.0), torch.where(ahead, sent, 0.0)
 
     def patches(
         self, place: Tensor, normal: Tensor, area: Tensor, light: Tensor, sends: Tensor
@@ -483,24 +517,25 @@ class SecondBounces(nn.Module):
     def gathered(
         self, here: Tensor, place: Tensor, normal: Tensor, area: Tensor, light: Tensor, free: Tensor
     ) -> Tensor:
-        """Return the light of patches j that cells i get, (2, F, N).
+        """Return the light of patches that cells get, (2, F, N).
 
         Args:
-            here: Place and normal of the cells (6, N).
+            here: Place and normal of what gets it (6, N), of the cells if some patches are hidden.
             place: Of the patches (3, P), the image's first, then those beyond it.
             normal: Of the patches (3, P).
             area: Of the patches (P,).
             light: That they send, times their area, (2, F, P).
-            free: Which patches of the image see each other (P', P').
+            free: Which patches of the image see each other (P', P'); (0, 0): nothing is hidden.
         """
-        count, wide = free.shape[0], 2 * self.columns
-        found = torch.jit.annotate(list[Tensor], [])
+        count, wide = free.shape[1], 2 * self.columns
+        found = [torch.zeros(2, len(self.wave_numbers), 0).to(here)]
         # Row by row of patches: what fits a cache takes half the time.
-        for row in range(self.rows // 2):
-            at, up = here[:, row * wide : (row + 1) * wide].chunk(2)
+        for first in range(0, here.shape[1], wide):
+            at, up = here[:, first : first + wide].chunk(2)
             kernel, ways = transfer(at, up, place, normal, area)
-            seen = free[row * wide // 4 : (row + 1) * wide // 4].repeat_interleave(2, 0)
-            kernel[:, :count] *= seen.repeat(2, 1)
+            if count > 0:
+                seen = free[first // 4 : (first + wide) // 4].repeat_interleave(2, 0)
+                kernel[:, :count] *= seen.repeat(2, 1)
             sums = []
             for f, k in enumerate(self.wave_numbers):
                 c, s = kernel * torch.cos(k * ways), kernel * torch.sin(k * ways)
