@@ -228,3 +228,18 @@ def test_a_camera_that_counts_beyond_float16_measures_in_it() -> None:
     measured = camera(depth, amplitude, noise=False)
     assert measured.depth.dtype == torch.float16
     assert bool(torch.isfinite(present(measured.amplitude)).all())
+
+
+def test_true_distances_are_held_to_their_own_range() -> None:
+    """Second bounces of 60 mm once put the nearest pixels out of the range of what was measured."""
+    ranges = {"radial_distance_m": [1.0, 2.0], "true_radial_distance_m": [0.5, 2.5]}
+    terms = [{"kind": "distance_polynomial", "degree": 1}]
+    error = {"terms": terms, "coefficients": {"distance": {"c0": 0.0, "c1": 0.004}}}
+    base = sensor(error=error, validity=sensor_values()["validity"] | ranges).base
+    like = plane_scene()[0]
+    distances = (0.4, 0.5, 1.5, 2.5, 2.6)
+    found = [base(torch.full_like(like, at), like, None).mean() for at in distances]
+    assert found[0] == found[1]
+    assert found[3] == found[4]
+    assert abs(found[1] - found[2]) > 0.001
+    torch.testing.assert_close(found[1] + found[3], 2 * found[2])

@@ -38,6 +38,7 @@ class BaseError(nn.Module):
     Args:
         section: Terms and coefficients.
         domain: Image size and ranges.
+        true: Range of true distances, metres; None: those whose measured ones fill the range.
 
     Attributes:
         model: The terms; their coefficients are the parameters.
@@ -46,7 +47,7 @@ class BaseError(nn.Module):
 
     mean_conditions: Tensor
 
-    def __init__(self, section: ErrorSection, domain: Domain) -> None:
+    def __init__(self, section: ErrorSection, domain: Domain, true: Interval | None) -> None:
         super().__init__()
         self.reads_measured = section.reads == "measured_distance"
         self.model = error_model_of(section, domain)
@@ -54,7 +55,8 @@ class BaseError(nn.Module):
         self.domain = domain
         self.limits = self.model.limits(domain)
         if not self.reads_measured:
-            self.limits = replace(self.limits, radial_distance=self._true_range(domain))
+            true = true or self._true_range(domain)
+            self.limits = replace(self.limits, radial_distance=true)
         means = torch.tensor(domain.mean_conditions(), dtype=torch.float64)
         self.register_buffer("mean_conditions", means)
 
@@ -255,7 +257,8 @@ class SensorModel(DescribedModule):
         self.sensor = sensor
         camera = sensor.intrinsics()
         self.eye = Eye(sensor)
-        self.base = BaseError(sensor.error, sensor.domain())
+        true = sensor.validity.true_radial_distance_m
+        self.base = BaseError(sensor.error, sensor.domain(), true and Interval(*true))
         self.effects = ImageEffects(camera, sensor.effects, sensor.modulation_frequency_hz)
         size = (camera.height, camera.width)
         self.noise = None if sensor.noise is None else SensorNoise(sensor.noise, size)

@@ -80,13 +80,16 @@ class ValiditySection(Options):
     """The ranges that the camera was measured in; beyond them the error at the edge is used.
 
     Attributes:
-        radial_distance_m: Distances along the ray.
+        radial_distance_m: Measured distances along the ray.
+        true_radial_distance_m: True distances of the same pixels; null: those whose measured ones,
+            by the error terms alone, fill that range.
         amplitude: Null: not recorded.
         normalised_amplitude: Amplitude times squared distance.
         conditions: By the name of their column in `frames.csv`.
     """
 
     radial_distance_m: Range
+    true_radial_distance_m: Range | None = None
     amplitude: Range | None = None
     normalised_amplitude: Range | None = None
     conditions: dict[_Column, ConditionRange] = Field(default_factory=dict)

@@ -174,7 +174,8 @@ def _with_names(found: NamedEffects, evidence: Evidence) -> NamedEffects:
     for name, values in maps.items():
         spent = {name, *study.maps[name].contains}
         study = without_map(study, values, spent)
-    study = with_poses_reestimated(study, found.columns_of(tuple(sets)))
+    columns = found.columns_of(tuple(sets))
+    study = relinearised(with_poses_reestimated(study, columns), columns)
     return replace(found, study=study, names=tuple(sets), maps=maps, sets=sets)
 
 

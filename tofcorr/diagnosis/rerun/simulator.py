@@ -416,6 +416,9 @@ def sensor_of(found: Evidence, observables: Observables | None) -> SensorFile:
     error, remainder = given_error(found)
     terms, error_model = model.options.with_columns().terms, copy.deepcopy(model.error_model)
     error_model.set_coefficient_vector(found.coefficients + error)
+    # Effects and further light move what is measured, but not what the terms are functions of.
+    distance = predicted_distance(found.observations, found.tool_from_camera)
+    true = {"true_radial_distance_m": tuple(torch.stack(distance.aminmax()).tolist())}
     sentences = [
         f"{study.observations.num_units} poses, {recording.num_frames} frames.",
         *([] if found.named.names else ["No effect beyond the error terms was found."]),
@@ -437,7 +440,7 @@ def sensor_of(found: Evidence, observables: Observables | None) -> SensorFile:
         error=section_of(error_model, ErrorSection(reads="true_distance", terms=terms)),
         effects=(*_given_effects(found), *entries),
         **({} if observables is None else _sections(study, observables, own)),
-        validity=validity_of(model.domain),
+        validity=validity_of(model.domain).model_copy(update=true),
         second_bounces=next(filter(None, states), None),
     )
 

@@ -22,6 +22,11 @@ from tofcorr.simulation.effects import CatalogueEffect
 _SETTLED = 4
 # Pixels that are enough for that: a hundred or so of each pose. Chosen.
 _FEW_PIXELS = 5_000
+# A step that promises to lower the squares by less than this share changes nothing. Chosen.
+_NOTHING = 1e-3
+# By how much the camera is moved to see what depends on its pose, metres and radians: so far that
+# the patches of surfaces, which meet one plane or another, change evenly. Chosen.
+_MOVED = 0.003
 
 
 def in_best_forms(study: Study) -> Study:
@@ -44,53 +49,62 @@ def _in_best_form(study: Study, name: str, others: Sequence[CatalogueEffect]) ->
     """
     if not others:
         return study
-    layout = study.sums.layout
-    prior = layout.prior_of(torch.arange(layout.base))
-    few = slice(None, None, max(1, len(study.residual) // _FEW_PIXELS))
-    fit, some = study.fit, study.observations.at(few)
-    base = {BASE: study.columns[BASE][few]}
-    residual = study.residual[few]
-    fit_of_few = replace(
-        fit,
-        model=fit.model.on(some),
-        residual=residual,
-        sigma=fit.sigma[few],
-        trust=fit.trust[few],
-        known=fit.known and fit.known.at(few),
-    )
-    inputs = filtered_inputs(effect_inputs(some, fit.tool_from_camera), some, fit_of_few)
-    sparse = replace(
-        study,
-        observations=some,
-        fit=fit_of_few,
-        inputs=inputs,
-        pose=study.pose[few],
-        residual=residual,
-        straight=residual,
-    )
+    few = _of_few(study)
+    bare = replace(few, columns={BASE: few.columns[BASE]}, effects={})
 
-    def in_form(form: CatalogueEffect) -> Study:
-        columns = {**base, name: form.scaled_columns(inputs)}
-        sums = pose_sums(some, columns, sparse.pose, fit_of_few, prior)
-        return replace(sparse, effects={name: form}, columns=columns, sums=sums)
+    def in_form(study: Study, form: CatalogueEffect) -> Study:
+        columns = {**study.columns, name: form.scaled_columns(study.inputs)}
+        return _summed(replace(study, effects={**study.effects, name: form}, columns=columns))
+
+    def solved(study: Study) -> Tensor:
+        return study.sums.ols.solve((name,))
 
     def left_out(study: Study) -> float:
         gls = study.sums.with_pose_uncertainty((name,)).gls
         return float(gls.squares_at((name,), gls.left_out_coefficients((name,))).sum())
 
-    least, best = left_out(in_form(study.effects[name])), study
+    least, best = left_out(in_form(bare, study.effects[name])), study
     for form in others:
-        tried, theta = in_form(form), fit.coefficients
+        tried = in_form(bare, form)
         for _ in range(_SETTLED):
-            theta = tried.sums.ols.solve((name,))
-            tried = _linearised_at(tried, theta, tried, (name,), again=True)
+            tried = _linearised_at(tried, solved(tried), tried, (name,), again=True)
         if (left := left_out(tried)) < least:
-            own, least = tried.effects[name], left
-            columns = {**study.columns, name: own.scaled_columns(study.inputs)}
-            best = replace(study, columns=columns, effects={**study.effects, name: own})
-            sums = pose_sums(study.observations, columns, study.pose, study.fit, prior)
-            best = _linearised_at(best, theta, replace(best, sums=sums), (name,))
+            least, best = left, in_form(study, tried.effects[name])
+            best = _linearised_at(best, solved(tried), best, (name,))
     return replace(best, sums=best.sums.with_pose_uncertainty())
+
+
+def _of_few(study: Study) -> Study:
+    """Return the study of few pixels, at no effect; its sums are still those of all."""
+    few = slice(None, None, max(1, len(study.residual) // _FEW_PIXELS))
+    fit, some = study.fit, study.observations.at(few)
+    fit = replace(
+        fit,
+        model=fit.model.on(some),
+        residual=fit.residual[few],
+        sigma=fit.sigma[few],
+        trust=fit.trust[few],
+        known=fit.known and fit.known.at(few),
+    )
+    return replace(
+        study,
+        observations=some,
+        fit=fit,
+        inputs=filtered_inputs(effect_inputs(some, fit.tool_from_camera), some, fit),
+        columns={name: columns[few] for name, columns in study.columns.items()},
+        pose=study.pose[few],
+        residual=study.residual[few],
+        straight=study.straight[few],
+    )
+
+
+def _summed(study: Study) -> Study:
+    """Return the study with the sums of its columns."""
+    base = torch.arange(study.sums.layout.base)
+    prior = study.sums.layout.prior_of(base)
+    fit = replace(study.fit, residual=study.residual)
+    sums = pose_sums(study.observations, study.columns, study.pose, fit, prior)
+    return replace(study, sums=sums)
 
 
 def relinearised(study: Study, names: Sequence[str]) -> Study:
@@ -100,27 +114,42 @@ def relinearised(study: Study, names: Sequence[str]) -> Study:
     linear in their strength, and an effect that the base fit took for its own moves the geometry
     that both depend on. With J the derivative at the fitted coefficients c, the residual
     r = y - (f(c) - J c) and the columns J replace those of the base model and of the effects
-    `names`, where one of these is not linear. A linearisation is kept if it lowers the sum of
-    squares.
+    `names`, where one of these is not linear. Steps are those of Gauss and Newton; one after which
+    the model leaves more than before is halved.
 
     Args:
         study: The recording.
         names: Effects of the model.
     """
     names = [name for name in names if name in study.effects]
-    bent = not all(study.effects[name].linear for name in names)
+    if all(study.effects[name].linear for name in names):
+        return study
+    # What other surfaces send takes long to compute: a few pixels say where that is.
+    costly = any(study.effects[name].depends_on_pose for name in names)
+    start = _summed(_of_few(study)) if costly else study
+    prior = start.sums.layout.only(names).prior
 
-    def loss(study: Study) -> float:
-        """Return the weighted sum of squares of the model fitted to all poses, m^2."""
-        return float((study.fit.share * study.residual_of(names) ** 2).sum())
+    def loss(left: Tensor, theta: Tensor) -> float:
+        """Return the squares of what is left and of the coefficients, each over its variance."""
+        squares = start.sums.scale * (start.fit.share * left**2).sum()
+        return float(squares + theta @ prior @ theta)
 
-    best, least, current = study, loss(study), study
-    for _ in range(3 if bent else 0):  # The second or third changes nothing any more.
-        current = _linearised_at(study, current.sums.ols.solve(names), current, names)
-        if not (now := loss(current)) < least:
+    best, theta = start, torch.zeros(len(prior)).double()
+    least = loss(start.straight, theta)  # Of the base fit.
+    for _ in range(_SETTLED):
+        goal = best.sums.ols.solve(names)
+        if loss(best.residual - best.times(names, goal), goal) > (1 - _NOTHING) * least:
             break
-        best, least = current, now
-    return best
+        for part in (1.0, 0.5, 0.25):
+            there = torch.lerp(theta, goal, part)
+            tried = _linearised_at(start, there, best, names)
+            # With its derivatives taken off, what the model itself leaves there.
+            if (now := loss(tried.residual - tried.times(names, there), there)) < least:
+                best, least, theta = tried, now, there
+                break
+        else:
+            break
+    return _linearised_at(study, theta, study, names) if costly else best
 
 
 def _linearised_at(
@@ -142,12 +171,7 @@ def _linearised_at(
         pose = pose @ se3.exp(step[:6])
     observations = model.observations
     distance, columns = model.linearised(pose)
-    left = observations.measured - distance - columns[:, count:] @ coefficients
-    # What was known, or taken off before, stays as it is.
-    known = 0.0 if fit.known is None else fit.known.error
-    residual = study.straight - fit.residual + left - known + columns @ step
-    further = study.columns[BASE][:, model.num_columns :]
-    changed = {BASE: torch.cat([columns, further], dim=1)}
+    predicted = distance + columns[:, count:] @ coefficients
     inputs = filtered_inputs(effect_inputs(observations, pose), observations, fit)
 
     def error(frame: Tensor, pixel: Tensor) -> Tensor:
@@ -157,12 +181,24 @@ def _linearised_at(
         return torch.where(on_target, torch.nan, found)
 
     places, effects = before.sums.layout.only(names).effects, dict(study.effects)
+    changed, added = dict[str, Tensor](), torch.zeros_like(predicted)
     for name in (name for name in names if not effects[name].linear):
         sd = effects[name].prior_sd()
         own = theta[slice(*places[name])] * sd
         effect = effects[name].with_coefficients(own)
         effects[name] = effect = effect.again(inputs, error) if again else effect
-        slope = effect.slope(inputs, own)
-        residual = residual - (effect.shift(inputs, own) - slope @ own)
-        changed[name] = slope * sd
+        slope, here = effect.slope(inputs, own), effect.shift(inputs, own)
+        changed[name], predicted = slope * sd, predicted + here
+        added = added + slope @ own
+        if model.hand_eye_free and effect.depends_on_pose:
+            for k, moved in enumerate(_MOVED * torch.eye(6).double()):
+                there = effect_inputs(observations, pose @ se3.exp(moved))
+                there = filtered_inputs(there, observations, fit)
+                columns[:, k] += (effect.shift(there, own) - here) / _MOVED
+    # What was known, or taken off before, stays as it is.
+    known = 0.0 if fit.known is None else fit.known.error
+    left = observations.measured - predicted
+    residual = study.straight - fit.residual + left - known + columns @ step + added
+    further = study.columns[BASE][:, model.num_columns :]
+    changed[BASE] = torch.cat([columns, further], dim=1)
     return replace(with_residual(before, residual, names, changed), effects=effects)

@@ -394,6 +394,11 @@ class CatalogueEffect(Effect, ABC):
         """Return the effect in each form that it may have in a recording, all coefficients zero."""
         return (cls.for_recording(inputs),)
 
+    @property
+    def depends_on_pose(self) -> bool:
+        """Whether it changes with the camera's pose by much more than with distances alone."""
+        return False
+
     def again(self, inputs: EffectInputs, error: ErrorElsewhere) -> Self:
         """Return the same form with the constants that a better fit shows.
 

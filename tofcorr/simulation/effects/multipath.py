@@ -218,6 +218,11 @@ class MultipathEffect(SignalEffect, shape=MultipathShape):
         return type(self)(shape.model_copy(update=seen), self.coefficients)
 
     @property
+    def depends_on_pose(self) -> bool:
+        """Whether it changes with the camera's pose by much more than with distances alone."""
+        return bool(self.shape.surfaces)
+
+    @property
     def said(self) -> str:
         """What it is in this form, in one line."""
         count = len(self.shape.surfaces) - self.shape.targets
