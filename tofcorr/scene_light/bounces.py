@@ -399,7 +399,8 @@ class SecondBounces(nn.Module):
         middle, facing, whole, _ = self.patches(place, normal, area, turn, sends)
         free = self.unhidden(middle, facing, whole)
         start = self.out_from
-        table, bright = self.beyond(*self.around(planes, sends, large, amplitude))
+        shown = amplitude * away.square() / cosine
+        table, bright = self.beyond(*self.around(planes, place, shown, sends, large))
         dtype = self.shares.dtype
         here = torch.cat([place, normal]).nan_to_num().to(dtype)
         middle = torch.cat([middle, table[:3]], dim=1).to(dtype)
@@ -417,20 +418,18 @@ class SecondBounces(nn.Module):
         return q
 
     def around(
-        self, planes: Tensor, sends: Tensor, large: Tensor, amplitude: Tensor
+        self, planes: Tensor, place: Tensor, bright: Tensor, sends: Tensor, large: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return g (3, M) of what stands beyond the image, and its brightness (M,); 0: nothing.
 
         Args:
             planes: As in `indirect`.
-            sends: Which cells send light (N,).
+            place: Of the cells (3, N).
+            bright: Their amplitudes at 1 m, seen straight on (N,).
+            sends: Which of them send light (N,).
             large: As in `indirect`.
-            amplitude: As in `indirect`.
         """
-        place, _, away, cosine, _ = self.surfaces(
-            planes, self.cell_rays.double(), self.solid.double()
-        )
-        start, bright = self.out_from, amplitude * away.square() / cosine
+        start = self.out_from
         far, reflectivity = self.room.met(self.out_rays.double())
         known = reflectivity.isfinite()
         far, shown = torch.where(known, far, planes[:, start]), bright[start]

@@ -27,14 +27,14 @@ removed: that would do harm wherever something else bends planes.
 """
 
 import math
+from statistics import NormalDist
 
 import torch
 from torch import Tensor, nn
 
 from tofcorr.scene_light.bounces import Planes, SecondBounces, SecondBouncesState, turned
+from tofcorr.scene_light.gain import CONFIDENCE
 
-_NORMAL_95 = 3.92
-"""Width of an interval of 95 % in standard deviations."""
 _PLACES = 4
 """Places beyond a side of the image of which light is computed. Chosen: between them it is
 interpolated; 8 change the shares of building seeds by half a percent."""
@@ -63,7 +63,8 @@ class UnremovedBounces(nn.Module):
         self.gain_error: float = 0.0
         if state.gain_interval is not None and state.gain > 0:
             low, high = state.gain_interval
-            self.gain_error = (high - low) / (_NORMAL_95 * state.gain)
+            reach = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
+            self.gain_error = (high - low) / (2 * reach * state.gain)
         inside, out = (rays[:2] / rays[2] for rays in (bounces.cell_rays, bounces.out_rays))
         # Left, above, right, below: rays beyond the border, and their direction in the image.
         outward = torch.cat([-torch.eye(3), torch.eye(3)])[[0, 1, 3, 4]].to(inside).T
@@ -180,10 +181,11 @@ class UnremovedBounces(nn.Module):
         return (chance * shares.square()).sum(1) @ (self.between.to(light) @ light).square(), left
 
     def means(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means of values (N,) of 5 x 5 cells, of those that are known, and their number."""
+        """Return means of known values (N,) in windows around each cell, and how many these are."""
         image = torch.stack([values.nan_to_num(), values.isfinite().to(values.dtype)])
-        image = image.reshape(1, 2, self.bounces.rows, self.bounces.columns)
-        sums = nn.functional.avg_pool2d(image, 5, 1, 2, divisor_override=1).reshape(2, -1)
+        image = image.reshape(2, self.bounces.rows, self.bounces.columns)
+        side = self.bounces.cell_planes.side
+        sums = nn.functional.avg_pool2d(image, side, 1, side // 2, divisor_override=1).flatten(1)
         return sums[0] / sums[1].clamp(min=1.0), sums[1]
 
     def within_patches(self, shift: Tensor) -> Tensor:
@@ -218,7 +220,8 @@ class UnremovedBounces(nn.Module):
         light = turned(turn * light, waves, away.nan_to_num())
         middle, facing, whole, fronts = bounces.patches(place, normal, area, light, seen & known[1])
         shown = torch.cat([middle, facing, whole[None]])
-        far, there = bounces.around(planes, seen & known[1], known[2], strength)
+        bright = strength * away.square() / cosine
+        far, there = bounces.around(planes, place, bright, seen & known[1], known[2])
         edge = turn[:, :, bounces.out_from]
         here = torch.cat([place, normal]).nan_to_num()
         white = math.pi * bounces.gain  # The reflectivity of what sends an amplitude of one.

@@ -17,10 +17,10 @@ from tofcorr.diagnosis.sums.study import Study, with_residual
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CatalogueEffect
 
-# How often an effect in another form than the usual one is fitted together with the base model. Set
-# on rendered walls: after that the strength of second bounces changes by 1 % at most.
+# Steps of a fit of base model and effects that are not linear. Set on rendered walls: after that
+# the strength of second bounces changes by 1 % at most.
 _SETTLED = 4
-# Pixels that are enough for that: a hundred or so of each pose. Chosen.
+# Pixels that are enough to find where that ends: a hundred or so of each pose. Chosen.
 _FEW_PIXELS = 5_000
 # A step that promises to lower the squares by less than this share changes nothing. Chosen.
 _NOTHING = 1e-3
@@ -75,7 +75,7 @@ def _in_best_form(study: Study, name: str, others: Sequence[CatalogueEffect]) ->
 
 
 def _of_few(study: Study) -> Study:
-    """Return the study of few pixels, at no effect; its sums are still those of all."""
+    """Return the study of few pixels; its sums are still those of all."""
     few = slice(None, None, max(1, len(study.residual) // _FEW_PIXELS))
     fit, some = study.fit, study.observations.at(few)
     fit = replace(

@@ -263,10 +263,10 @@ def build_study(
     wanted = options.catalogue if options.catalogue is not None else tuple(CATALOGUE)
     kinds = {name: CATALOGUE[name] for name in wanted if name not in options.leave_out}
     missing = {name: wants for name, kind in kinds.items() if (wants := kind.missing(inputs))}
-    known = {n: kind.forms(inputs) for n, kind in kinds.items() if n not in missing}
-    maps = {n: each for n, (each, *_) in known.items() if isinstance(each, MapEffect)}
+    known = {n: kind.for_recording(inputs) for n, kind in kinds.items() if n not in missing}
+    maps = {name: each for name, each in known.items() if isinstance(each, MapEffect)}
     probes, pose = probes_for(inputs), pose_columns(inputs)
-    sources = [(name, forms[0]) for name, forms in known.items() if name not in maps]
+    sources = [(name, each) for name, each in known.items() if name not in maps]
     sources += list(probes.items())
     found = in_threads(lambda source: source[1].scaled_columns(inputs), sources)
     effects = {name: form for name, form in sources if isinstance(form, CatalogueEffect)}
