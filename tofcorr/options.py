@@ -63,6 +63,13 @@ def among(names: Collection[str], what: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    """Refuse a range whose upper end comes first."""
+    if ends[0] > ends[1]:
+        raise ValueError("expected the lower end first")
+    return ends
+
+
 # Text is passed on to the number parser: YAML 1.1 reads 20.0e6 (no sign) as text.
 FiniteNumber = Annotated[float, BeforeValidator(not_a_truth_value), Field(allow_inf_nan=False)]
 Number = Annotated[FiniteNumber, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
@@ -70,7 +77,7 @@ PositiveNumber = Annotated[FiniteNumber, Field(ge=SMALLEST_POSITIVE, le=LARGEST_
 NonNegativeNumber = Annotated[Number, Field(ge=0)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]
-Range = tuple[Number, Number]
+Range = Annotated[tuple[Number, Number], AfterValidator(_ascending)]
 Vector3 = tuple[Number, Number, Number]
 Degree = Annotated[PositiveInt, Field(le=LARGEST_DEGREE)]
 Size = Annotated[int, BeforeValidator(not_a_truth_value), Field(gt=0, le=LARGEST_SIDE)]

@@ -68,6 +68,7 @@ def test_a_state_of_another_sensor_is_refused() -> None:
         ({"noise": {"floor_m": -0.1}}, "floor_m"),
         ({"dropouts": {"base_share": 1.4}}, "base_share"),
         ({"validity": {"radial_distance_m": [0.5]}}, "radial_distance_m"),
+        ({"validity": {"radial_distance_m": [3, 1]}}, "radial_distance_m.*lower end first"),
         ({"depth_kind": "slant"}, "depth_kind"),
         # Found by fuzzing: maps of its size took 20 s.
         ({"camera": CAMERA.section() | {"height": 10**6}}, "16 x 1000000 pixels is larger"),
